@@ -5,6 +5,7 @@ Modules with a long import time are imported inside the commands.
 
 from __future__ import annotations
 
+import inspect
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from time import perf_counter
@@ -33,18 +34,20 @@ app = program.new_app(cls=_Program)
 
 Out = Annotated[Path, typer.Option(metavar="DIR", help="Output folder; created if it does not exist.")]
 Seeds = Annotated[int, typer.Option(metavar="N", min=1, help="Number of random seeds, 0 to N - 1.")]
-Workers = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N", min=1, help="Worker processes on this machine.", show_default="one per four cores"
-    ),
-]
-Dask = Annotated[
-    str | None,
-    typer.Option(
-        metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786."
-    ),
-]
+WORKERS = typer.Option(
+    metavar="N", min=1, help="Worker processes on this machine.", show_default="one per four cores"
+)
+DASK = typer.Option(
+    metavar="ADDRESS", help="Run on the Dask cluster of this scheduler, such as tcp://host:8786."
+)
+#: options of all studies with jobs: type and default
+JOBS: dict[str, tuple[Any, Any]] = {
+    "workers": (Annotated[int | None, WORKERS], None),
+    "dask": (Annotated[str | None, DASK], None),
+    "progress": (Progress, None),
+}
+#: function that runs a study, and facts on it
+Study = tuple[Callable[[], Any], dict[str, Any]]
 
 
 def _quick(text: str) -> Any:
@@ -115,19 +118,41 @@ def _loads(options: Sequence[str]) -> dict[str, float]:
     return masses
 
 
-def _run(
-    rerun: Callable[..., Report],
-    out: Path,
-    *settings: Any,
-    facts: dict[str, Any],
-    as_json: bool,
-    **named: Any,
-) -> None:
+def _study(*examples: str, name: str | None = None) -> Callable[[Callable[..., Study]], None]:
+    """Return a decorator that makes a command of a study, with the options and the output of all studies.
+
+    A study with the arguments `how` has jobs, and the options of `JOBS`.
+    """
+
+    def register(study: Callable[..., Study]) -> None:
+        signature = inspect.signature(study, eval_str=True)
+        own = [each for each in signature.parameters.values() if each.kind is not each.VAR_KEYWORD]
+        with_jobs = len(own) < len(signature.parameters)
+        more = (JOBS if with_jobs else {}) | {"as_json": (Json, False)}
+
+        def command(**given: Any) -> None:
+            as_json, out = given.pop("as_json"), given["out"]
+            _prepare(out, given.get("workers"), given.get("dask"))
+            if with_jobs:
+                given["progress"] = shows_progress(given["progress"])
+            _report(*study(**given), out, as_json)
+
+        own += [
+            inspect.Parameter(key, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind)
+            for key, (kind, default) in more.items()
+        ]
+        command.__signature__ = inspect.Signature(own)  # type: ignore[attr-defined]
+        command.__annotations__ = {each.name: each.annotation for each in own}
+        command.__name__, command.__doc__ = study.__name__, study.__doc__
+        app.command(name, epilog=_examples(*examples))(command)
+
+    return register
+
+
+def _report(run: Callable[[], Report], facts: dict[str, Any], out: Path, as_json: bool) -> None:
     """Run a study; print its table, the files written and the computing time."""
-    if "progress" in named:
-        named["progress"] = shows_progress(named["progress"])
     began = perf_counter()
-    report = rerun(out, *settings, **named)
+    report = run()
     seconds = perf_counter() - began
     failed = sum("failed" in cell for cell in report.cells)
     facts |= {
@@ -146,140 +171,97 @@ def _run(
     write_output(as_json, facts, lines, out=out if as_json else None)
 
 
-@app.command(
-    epilog=_examples(
-        "simulation --out results",
-        "simulation --out results --methods baseline,best --seeds 1",
-        "simulation --out results --dask tcp://scheduler:8786",
-    )
+@_study(
+    "simulation --out results",
+    "simulation --out results --methods baseline,best --seeds 1",
+    "simulation --out results --dask tcp://scheduler:8786",
 )
 def simulation(
     out: Out,
     seeds: Seeds = 5,
     methods: Annotated[str | None, _subset("baseline, paper, calibrated, best")] = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    **how: Any,
+) -> Study:
     """Repeat the paper's simulation study, Table I.
 
     Four imperfect models are each trained on two short sines. Writes Table I with the paper's published
     values (table1.md, .csv, .json), figures, trajectories and models. Resumes an earlier run in the same
     folder.
     """
-    _prepare(out, workers, dask)
     from studies.methods import METHODS
     from studies.simulation import rerun
 
     chosen = _selected("methods", methods, METHODS)
-    _run(
-        rerun, out, seeds=range(seeds), methods=chosen, workers=workers, dask=dask, progress=progress,
-        facts={"methods": chosen, "seeds": seeds}, as_json=as_json,
-    )  # fmt: skip
+    facts = {"methods": chosen, "seeds": seeds}
+    return lambda: rerun(out, seeds=range(seeds), methods=chosen, **how), facts
 
 
-@app.command("control", epilog=_examples("control --out results", "control --quick --out results"))
+@_study("control --out results", "control --quick --out results", name="control")
 def closed_loop(
-    out: Out,
-    quick: Annotated[bool, _quick("Fewer and shorter runs: about 10 min.")] = False,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    out: Out, quick: Annotated[bool, _quick("Fewer and shorter runs: about 10 min.")] = False, **how: Any
+) -> Study:
     """Compare controllers in closed loop, with exact and with wrong models.
 
     Writes tracking errors of predictive control and of its baselines, and checks of limits, observers,
     adaptation and times (control.md; control.json: check, value, limit, ok). Times are those of this machine.
     Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.control import rerun
 
-    _run(
-        rerun, out, quick, workers=workers, dask=dask, progress=progress, facts={"quick": quick},
-        as_json=as_json,
-    )  # fmt: skip
+    return lambda: rerun(out, quick, **how), {"quick": quick}
 
 
-@app.command(epilog=_examples("environments --quick --out results"))
+@_study("environments --quick --out results")
 def environments(
     out: Out,
     quick: Annotated[bool, _quick("Shorter trainings and sweeps: less than 10 min.")] = False,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    **how: Any,
+) -> Study:
     """Measure environments and sweeps: rates, checks, predictive control, and a policy that PPO learns.
 
     Writes environments.md and environments.json (check, value, limit, ok), and the policies. It needs the
     extras rl, sweep and studies. Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.environments import rerun
 
-    _run(
-        rerun, out, quick, workers=workers, dask=dask, progress=progress, facts={"quick": quick},
-        as_json=as_json,
-    )  # fmt: skip
+    return lambda: rerun(out, quick, **how), {"quick": quick}
 
 
-@app.command(epilog=_examples("hardware --quick --out results"))
+@_study("hardware --quick --out results")
 def hardware(
-    out: Out,
-    quick: Annotated[bool, _quick("Shorter runs: less than 10 min.")] = False,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    out: Out, quick: Annotated[bool, _quick("Shorter runs: less than 10 min.")] = False, **how: Any
+) -> Study:
     """Try the firmware on an emulated board: tensions, faults, fuzzing, and the whole closed loop.
 
     Writes hardware.md and hardware.json (check, value, limit, ok). It needs the firmware's tools, as
     firmware/README.md lists them. Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.hardware import rerun
 
-    _run(
-        rerun, out, quick, workers=workers, dask=dask, progress=progress, facts={"quick": quick},
-        as_json=as_json,
-    )  # fmt: skip
+    return lambda: rerun(out, quick, **how), {"quick": quick}
 
 
-@app.command(
-    epilog=_examples(
-        "imperfections --out results", "imperfections --out results --only 'damping,tip mass' --seeds 1"
-    )
-)
+@_study("imperfections --out results", "imperfections --out results --only 'damping,tip mass' --seeds 1")
 def imperfections(
     out: Out,
     seeds: Seeds = 1,
     only: Annotated[str | None, _subset("the imperfections, such as damping, tip mass, stiffening")] = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    **how: Any,
+) -> Study:
     """Measure errors for robots that differ from the model.
 
     The robots differ by more than a parameter. Each model is learned with the preset best. It is trained on
     two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with twice the tension.
     Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.imperfections import IMPERFECTIONS, rerun
 
     chosen = _selected("only", only, IMPERFECTIONS)
-    _run(
-        rerun, out, seeds=range(seeds), names=chosen, workers=workers, dask=dask, progress=progress,
-        facts={"imperfections": chosen, "seeds": seeds}, as_json=as_json,
-    )  # fmt: skip
+    facts = {"imperfections": chosen, "seeds": seeds}
+    return lambda: rerun(out, seeds=range(seeds), names=chosen, **how), facts
 
 
-@app.command(epilog=_examples("data --out results", "data --out results --methods baseline,best --seeds 1"))
+@_study("data --out results", "data --out results --methods baseline,best --seeds 1")
 def data(
     out: Out,
     seeds: Seeds = 3,
@@ -287,46 +269,37 @@ def data(
         str | None,
         _subset("baseline, best, paper; 'paper, no knowledge', 'network, no knowledge', 'linear (DMDc)'"),
     ] = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    **how: Any,
+) -> Study:
     """Measure errors against the amount of training data.
 
     Trains on 5 to 30 rows of one sine, and of two. Compares the paper's imperfect models with predictors
     without a physical model: networks of the same size and a linear predictor (needs the extra `studies`).
     Writes data.md, .json and figures. Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.data_efficiency import ALL, rerun
 
     chosen = _selected("methods", methods, ALL)
-    _run(
-        rerun, out, seeds=range(seeds), methods=chosen, workers=workers, dask=dask, progress=progress,
-        facts={"methods": chosen, "seeds": seeds}, as_json=as_json,
-    )  # fmt: skip
+    facts = {"methods": chosen, "seeds": seeds}
+    return lambda: rerun(out, seeds=range(seeds), methods=chosen, **how), facts
 
 
-@app.command(epilog=_examples("estimation --out results"))
-def estimation(out: Out, as_json: Json = False) -> None:
+@_study("estimation --out results")
+def estimation(out: Out) -> Study:
     """Measure the error of state estimation.
 
     Compares the paper's method and the best one. Records the virtual robot (simulated, so its true states are
     known). Writes the errors of all quantities (estimation.md, .json), a figure, and the bags.
     """
-    _prepare(out)
     from studies.estimation import rerun
 
-    _run(rerun, out, facts={}, as_json=as_json)
+    return lambda: rerun(out), {}
 
 
-@app.command(
-    epilog=_examples(
-        "recordings bags/",
-        "recordings bags/ --train sine_1p0,sine_3p0,rand_0 --out results",
-        "recordings bags/ --robot my-robot.yaml --config my-recordings.yaml --train first,second",
-    )
+@_study(
+    "recordings bags/",
+    "recordings bags/ --train sine_1p0,sine_3p0,rand_0 --out results",
+    "recordings bags/ --robot my-robot.yaml --config my-recordings.yaml --train first,second",
 )
 def recordings(
     bags: Annotated[Path, typer.Argument(metavar="BAGDIR", help="Folder with bags or tables.")],
@@ -384,11 +357,8 @@ def recordings(
             show_default="stated by the recordings",
         ),
     ] = None,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    **how: Any,
+) -> Study:
     """Learn a robot from recordings, as in the paper's Table II.
 
     Predicts the recordings that are not used for training. Estimates states, trains the paper's model without
@@ -396,7 +366,6 @@ def recordings(
     Files robot.yaml and recording.yaml in BAGDIR are the defaults of --robot and --config. Writes table2.md,
     .json, figures and models. Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.recordings import METHODS, ROBOT, RecordingsOptions, described_in
     from studies.recordings_report import rerun
 
@@ -414,18 +383,14 @@ def recordings(
     nominal = files.get("robot", ROBOT) if robot is None else robot
     columns = files.get("config") if config is None else str(config)
     options = RecordingsOptions(nominal, columns, start, seconds, seeds)
-    _run(
-        rerun, out, bags, train=names, methods=chosen, options=options, simulated=simulated, workers=workers,
-        dask=dask, progress=progress, facts={"methods": chosen, "seeds": seeds}, as_json=as_json,
-    )  # fmt: skip
+    choices: dict[str, Any] = {"train": names, "methods": chosen, "options": options, "simulated": simulated}
+    return lambda: rerun(out, bags, **choices, **how), {"methods": chosen, "seeds": seeds}
 
 
-@app.command(
-    epilog=_examples(
-        "beam recordings/ --out results",
-        "beam recordings/ --train beam_gravity_V2_b,beam_load52_V2_a --out results",
-        "beam recordings/ --load beam_run3=30 --out results",
-    )
+@_study(
+    "beam recordings/ --out results",
+    "beam recordings/ --train beam_gravity_V2_b,beam_load52_V2_a --out results",
+    "beam recordings/ --load beam_run3=30 --out results",
 )
 def beam(
     folder: Annotated[
@@ -448,15 +413,13 @@ def beam(
         ),
     ] = None,
     progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+) -> Study:
     """Identify a silicone beam from recordings.
 
     The beam is real and released by hand; recordings not used for training are predicted. Detects the release
     in each recording, and identifies stiffness, damping and creep by least squares over whole rollouts of the
     training recordings. Writes the errors of the tip markers (beam.md, .json) and a figure.
     """
-    _prepare(out)
     from studies.beam import rerun
 
     names = _names(train)
@@ -465,10 +428,11 @@ def beam(
         if shows_progress(progress):
             typer.echo(line, err=True)
 
-    _run(rerun, out, folder, names, _loads(load or []), tell=tell, facts={"train": names}, as_json=as_json)
+    loads = _loads(load or [])
+    return lambda: rerun(out, folder, names, loads, tell=tell), {"train": names}
 
 
-@app.command(epilog=_examples("cables data_set/ --out results", "cables data_set/DLO1 --train 5 --json"))
+@_study("cables data_set/ --out results", "cables data_set/DLO1 --train 5 --json")
 def cables(
     folder: Annotated[
         Path,
@@ -483,46 +447,38 @@ def cables(
     seconds: Annotated[
         float, typer.Option(metavar="S", min=0.0, help="CPU time of the search for each cable (s).")
     ] = 400.0,
-    as_json: Json = False,
-) -> None:
+) -> Study:
     """Identify cables held by two grippers.
 
     Predicts the motions in `eval` open loop. Reads marker positions at 100 Hz in the format of the DEFORM
     data set; pickle files are read without running code from them. Writes cables.json, cables.md, a figure,
     and a 3-D scene of prediction and measurement for each cable.
     """
-    _prepare(out)
     from studies.cables.study import CableOptions, rerun
 
     options = CableOptions(nodes=nodes, space=space, train=train, seconds=seconds)
-    _run(
-        rerun, out, folder, options=options, tell=lambda line: typer.echo(line, err=True),
-        facts={"train": train}, as_json=as_json,
-    )  # fmt: skip
+
+    def tell(line: str) -> None:
+        typer.echo(line, err=True)
+
+    return lambda: rerun(out, folder, options=options, tell=tell), {"train": train}
 
 
-@app.command("virtual-robots", epilog=_examples("virtual-robots --robots 20 --out results"))
+@_study("virtual-robots --robots 20 --out results", name="virtual-robots")
 def virtual_robots(
     out: Out = Path("virtual-robots-study"),
     robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots: seeds 0 to N - 1.")] = 20,
-    workers: Workers = None,
-    dask: Dask = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+    **how: Any,
+) -> Study:
     """Identify virtual robots with random, known imperfections.
 
     Each robot is recorded with noise, identified from three recordings, and evaluated on two others. Writes
     the improvement over the nominal robot, missed and false effects, and the coverage of confidence intervals
     (virtual_robots.md, .json). A robot takes some minutes. Resumes an earlier run in the same folder.
     """
-    _prepare(out, workers, dask)
     from studies.virtual_robots import rerun
 
-    _run(
-        rerun, out, range(robots), workers=workers, dask=dask, progress=progress, facts={"robots": robots},
-        as_json=as_json,
-    )  # fmt: skip
+    return lambda: rerun(out, range(robots), **how), {"robots": robots}
 
 
 # a loop around another simulator's robot

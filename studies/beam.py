@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.comparison import REFERENCE
+from knode_cosserat.evaluation.comparison import REFERENCE, legend_below
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.recordings.findings import RecordingError
@@ -211,6 +211,5 @@ def drops(
             row[1].set_xlim(-0.1, float(time[-1]))
         for axes in grid[-1]:
             axes.set_xlabel("time from the release [s]")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        legend_below(figure, grid[:1, 0])
     return figure

@@ -15,11 +15,11 @@ from typing import NamedTuple
 import numpy as np
 import scipy.optimize
 from jaxtyping import Float
+from scipy.spatial.transform import Rotation
 
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
-from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
@@ -142,14 +142,9 @@ def step_count(recordings: list[BeamRecording], dt: float) -> int:
 def markers_of(motion: Trajectory) -> Float[np.ndarray, "T 3 3"]:
     """Return the displacements (m) of the markers from the first row."""
     p, h = np.asarray(motion.tip_position), np.asarray(motion.quaternion)[:, -1]
-    positions = p[:, None] + np.einsum("tij,kj->tki", _matrices(h), MARKERS)
+    turned = Rotation.from_quat(h, scalar_first=True).as_matrix()
+    positions = p[:, None] + np.einsum("tij,kj->tki", turned, MARKERS)
     return positions - positions[0]
-
-
-def _matrices(h: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 3 3"]:
-    import jax
-
-    return np.asarray(jax.vmap(rotation_matrix)(h))
 
 
 def predict_markers(

@@ -13,6 +13,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat import controls
+from knode_cosserat.evaluation.comparison import legend_below
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.style import PALETTE, style
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.training.runs import FitError
@@ -209,9 +212,6 @@ def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    from knode_cosserat.evaluation.drawing import new_figure
-    from knode_cosserat.evaluation.style import style
-
     imperfections = [name for name in dict.fromkeys(cell["imperfection"] for cell in cells) if name != ANY]
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
     with style():
@@ -230,13 +230,7 @@ def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
             axes.set_xlabel("rows of each sine")
         for axes in grid[:, 0]:
             axes.set_ylabel(MEASURES[measure])
-        labelled: dict[str, Any] = {}
-        for axes in grid.ravel():
-            for handle, label in zip(*axes.get_legend_handles_labels(), strict=True):
-                labelled.setdefault(label, handle)
-        whole.legend(
-            labelled.values(), labelled.keys(), loc="outside lower center", ncols=4, handlelength=3.0
-        )
+        legend_below(whole, grid.ravel(), columns=4)
     return whole
 
 
@@ -248,18 +242,11 @@ def _draw_panel(axes: Any, cells: Sequence[Any], measure: str) -> None:
         axes.axhline(np.median(known), color="#BBBBBB", linewidth=3.0, zorder=0, label="baseline")
     for method in COLOURS:
         for sines in sorted({cell["sines"] for cell in cells} - {0}):
-            _draw_curve(
-                axes,
-                [c for c in cells if (c["method"], c["sines"]) == (method, sines)],
-                measure,
-                method,
-                sines,
-            )
+            own = [c for c in cells if (c["method"], c["sines"]) == (method, sines)]
+            _draw_curve(axes, own, measure, method, sines)
 
 
 def _draw_curve(axes: Any, cells: Sequence[Any], measure: str, method: str, sines: int) -> None:
-    from knode_cosserat.evaluation.style import PALETTE
-
     rows = sorted({cell["rows"] for cell in cells})
     values = {row: [c[measure] for c in cells if c["rows"] == row and c[measure] is not None] for row in rows}
     known = {row: some for row, some in values.items() if some}

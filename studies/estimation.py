@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat.evaluation.comparison import METHODS as LINES
-from knode_cosserat.evaluation.comparison import REFERENCE
+from knode_cosserat.evaluation.comparison import REFERENCE, legend_below
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.state_errors import state_errors
 from knode_cosserat.evaluation.style import TWO_COLUMNS, style
@@ -163,6 +163,5 @@ def estimated_states(
             below.set(ylabel="error", ylim=(-1.5 * room, 1.5 * room))
         for axes in grid[-1]:
             axes.set_xlabel("time [s]")
-        handles, labels = grid[0, 0].get_legend_handles_labels()
-        figure.legend(handles, labels, loc="outside lower center", ncols=len(labels))
+        legend_below(figure, grid[:1, 0])
     return figure

@@ -15,6 +15,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat import controls
+from knode_cosserat.evaluation.comparison import legend_below
+from knode_cosserat.evaluation.drawing import new_figure
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robot import TendonRobot
@@ -344,9 +347,6 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
     Raises:
         ImportError: matplotlib is not installed.
     """
-    from knode_cosserat.evaluation.drawing import new_figure
-    from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
-
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
     with style():
         whole = new_figure(TWO_COLUMNS, 0.19 * len(names) + 1.4)
@@ -369,6 +369,5 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
             axes.set_xlim(LEAST / 3.0, 10.0 * max([1.0, *(r for r in left.values() if r is not None)]))
         panels[0].set_yticks(np.arange(len(names)), names)
         panels[0].invert_yaxis()
-        handles, labels = panels[0].get_legend_handles_labels()
-        whole.legend(handles, labels, loc="outside lower center", ncols=7, columnspacing=1.2)
+        legend_below(whole, panels[:1], columns=7)
     return whole

@@ -93,13 +93,15 @@ def draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Traj
     column[-1].set_xlabel("time [s]")
 
 
-def legend_below(figure: Any, axes: Any) -> None:
+def legend_below(figure: Any, axes: Any, columns: int = 6) -> None:
     """Add one legend for all axes, each label once."""
     handles: dict[str, Any] = {}
     for each in axes:
         for handle, label in zip(*each.get_legend_handles_labels(), strict=True):
             handles.setdefault(label, handle)
-    figure.legend(handles.values(), handles.keys(), loc="outside lower center", ncols=6, handlelength=2.4)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=columns, handlelength=2.4
+    )
 
 
 def require_some(given: Mapping[str, Any]) -> None:
