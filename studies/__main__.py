@@ -220,7 +220,7 @@ def environments(
     """Measure environments and sweeps: rates, checks, predictive control, and a policy that PPO learns.
 
     Writes environments.md and environments.json (check, value, limit, ok), and the policies. It needs the
-    extras rl, sweep and studies. Resumes an earlier run in the same folder.
+    extras rl and sweep. Resumes an earlier run in the same folder.
     """
     from studies.environments import rerun
 

@@ -1,6 +1,6 @@
 """Model of a released clamped silicone beam: its rod, its parameters, and the motion of its markers.
 
-The frame is the recordings' (`recordings.beam`): x upwards, z along the beam. The held beam is the
+The frame is the recordings' (`beam_recordings`): x upwards, z along the beam. The held beam is the
 equilibrium under a vertical force of the hand at the tip that reproduces the measured height of the tip. At
 the release this force vanishes.
 """
