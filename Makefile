@@ -79,7 +79,7 @@ lock: ## write requirements.lock anew from both pyproject.toml (UPGRADE=1: with 
 
 clean: ## remove outputs and caches
 	rm -rf demo build dist hardware/dist .pytest_cache .ruff_cache .mypy_cache .hypothesis
-	find src hardware tests examples benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
+	find src hardware studies tests examples benchmarks tools -name __pycache__ -type d -prune -exec rm -rf {} + 2>/dev/null || true
 
 distclean: clean ## remove the virtual environment too
 	rm -rf .venv

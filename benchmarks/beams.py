@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from benchmarks import closed_forms
 from benchmarks.buckling import critical_load
+from benchmarks.shapes import resting
 from knode_cosserat.rods.section import Differences, FunctionSection
-from knode_cosserat.studies.shapes import resting
 
 #: so thin that its rotary inertia does not show
 LENGTH, RADIUS, YOUNGS_MODULUS, DENSITY = 1.0, 1e-4, 3e9, 1200.0

@@ -12,9 +12,8 @@ import time
 from typing import Any
 
 import numpy as np
-
-from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Grips
-from knode_cosserat.studies.cables.rollouts import Rollouts
+from studies.cables.model import DT, CableModel, CableParameters, Grips
+from studies.cables.rollouts import Rollouts
 
 #: frames of a motion, motions of the batch, measurements whose median counts, nodes of the finer grid
 FRAMES, MOTIONS, REPEATS, GRID = 502, 14, 5, 121

@@ -37,6 +37,7 @@ def costs() -> dict[str, Any]:
     """A prediction over the horizon, and its derivatives by the tangents of the steps and by JAX."""
     import jax
     import numpy as np
+    from studies.control_cases import DT, nominal_robot, predictive
 
     from knode_cosserat.control import circle
     from knode_cosserat.control.prediction import linearised_prediction
@@ -44,7 +45,6 @@ def costs() -> dict[str, Any]:
     from knode_cosserat.estimation.online import Spread, errors_of
     from knode_cosserat.solvers.rollout import rollout
     from knode_cosserat.solvers.run import TimeIntegration
-    from knode_cosserat.studies.control_cases import DT, nominal_robot, predictive
 
     controller = predictive(nominal_robot())
     observer = controller.observer
@@ -82,7 +82,7 @@ def costs() -> dict[str, Any]:
 
 def table(found: Mapping[str, Any]) -> str:
     """Return the tables in Markdown."""
-    from knode_cosserat.evaluation.tables import markdown_table
+    from studies.tables import markdown_table
 
     cost = found["costs"]
     rows = [
@@ -97,7 +97,7 @@ def table(found: Mapping[str, Any]) -> str:
 
 def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
     """Return the tracking errors of all controllers; the worst of robots of one kind."""
-    from knode_cosserat.evaluation.tables import markdown_table
+    from studies.tables import markdown_table
 
     def kind(robot: str) -> str:
         if robot.startswith("stiffness"):
@@ -120,7 +120,7 @@ def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
 
 def checks_table(checks: Sequence[Mapping[str, Any]]) -> str:
     """Return the checks with their limits."""
-    from knode_cosserat.evaluation.tables import markdown_table
+    from studies.tables import markdown_table
 
     rows = [
         [each["check"], f"{each['value']:.2g}", f"{each['limit']:g}", "met" if each["ok"] else "**missed**"]
@@ -135,7 +135,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--full", action="store_true", help="the full study, some hours")
     given = parser.parse_args()
-    from knode_cosserat.studies.control import rerun
+    from studies.control import rerun
 
     timed = costs()
     with tempfile.TemporaryDirectory() as folder:

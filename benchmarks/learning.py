@@ -80,8 +80,8 @@ def learned_steps() -> dict[str, Any]:
 
 def study() -> dict[str, Any]:
     """The whole simulation study, from nothing compiled to table and figures."""
-    from knode_cosserat.studies.methods import METHODS
-    from knode_cosserat.studies.simulation_report import rerun
+    from studies.methods import METHODS
+    from studies.simulation import rerun
 
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)

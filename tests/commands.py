@@ -4,13 +4,13 @@ import json
 
 import pytest
 import typer.testing
+from studies.__main__ import app as studies
 
 from knode_cosserat.cli import app
 
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",
-            "inspect", "sweep", "study simulation", "study imperfections", "study data", "study estimation",
-            "study beam", "record-virtual", "schema", "doctor", "view",
+            "inspect", "sweep", "record-virtual", "schema", "doctor", "view",
             "robot connect", "robot reset", "robot tare", "robot calibrate", "robot jog", "robot record",
             "robot run", "robot steer", "robot commission")  # fmt: skip
 
@@ -18,6 +18,11 @@ COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "eva
 def run(*arguments):
     """What the program prints and exits with, in this process."""
     return typer.testing.CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+def run_study(*arguments):
+    """The same of `python -m studies`."""
+    return typer.testing.CliRunner().invoke(studies, [str(argument) for argument in arguments])
 
 
 def succeeded(*arguments):

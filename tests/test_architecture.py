@@ -39,9 +39,10 @@ LAYERS = (
     ("viewer", "diagnosis", "sweeps", "envs"),
     # the public names: `import knode_cosserat`
     ("",),
-    ("studies",),
     ("cli",),
 )
+#: folders of the repository beside the package
+REPOSITORY = ("knode_cosserat_hardware", "studies", "benchmarks", "examples", "tools", "tests")
 
 
 def name_of(file: Path) -> str:
@@ -123,16 +124,10 @@ def test_packages_depend_in_one_direction() -> None:
     assert not upwards
 
 
-def test_the_library_does_not_import_the_hardware_distribution() -> None:
-    importers = [
-        name
-        for name, file in MODULES.items()
-        for statement in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
-        if isinstance(statement, ast.Import | ast.ImportFrom)
-        and "knode_cosserat_hardware" in ast.unparse(statement)
-    ]
-    # the studies are no part of the library
-    assert not [name for name in importers if not name.startswith("studies.")]
+def test_the_library_imports_no_study_and_no_benchmark() -> None:
+    pattern = re.compile(rf"^\s*(?:from|import) (?:{'|'.join(REPOSITORY)})\b.*", re.MULTILINE)
+    found = {name: pattern.findall(file.read_text(encoding="utf-8")) for name, file in MODULES.items()}
+    assert not {name: lines for name, lines in found.items() if lines}
 
 
 def test_physics_knows_no_time_scheme() -> None:

@@ -108,14 +108,7 @@ def bad_inputs():
         (("info", "broken.model"), "broken.model"),
         (("info", "."), "this is a folder"),
         (("evaluate", ".", "broken.nc"), "no ensemble here"),
-        (("study",), "command"),
-        (("study", "simulation"), "--out"),
-        (("study", "simulation", "--out", "broken.nc"), "this is a file"),
-        (("study", "simulation", "--out", "o", "--seeds", "0"), "--seeds"),
-        (("study", "simulation", "--out", "o", "--methods", "best,worst"), "'worst' is unknown"),
-        (("study", "imperfections", "--out", "o", "--only", "damping,rust"), "'rust' is unknown"),
-        (("study", "data", "--out", "o", "--methods", "paper, no knowledge,magic"), "'magic' is unknown"),
-        (("study", "simulation", "--out", "o", "--workers", "2", "--dask", "a:1"), "give one of them"),
+        (("study", "simulation", "--out", "o"), "part of the repository: git clone"),
         (("evaluate", "nowhere.nc", "nowhere.nc"), "nowhere.nc: no such file"),
         (("evaluate", "nobot", "nowhere.nc"), "nobot"),
         (("evaluate", ROBOT, "broken.nc"), "broken.nc: not a netCDF-4 file"),
@@ -135,8 +128,7 @@ def test_bad_input_gives_status_2_and_one_line(tmp_path, monkeypatch, arguments,
         Path(name).write_text("this: [is\nnot right")
     Path("columns.csv").write_text("t,x\n0,1\n")
     Path("broken.model").write_text("knode-cosserat model, format 1, package 0.1.0\nbroken")
-    # a group of commands has no --json
-    result = run(*arguments, *(["--json"] if as_json and arguments != ("study",) else []))
+    result = run(*arguments, *(["--json"] if as_json else []))
     assert result.exit_code == 2
     assert result.stdout == ""
     assert result.stderr.startswith("error: ")
@@ -168,7 +160,6 @@ OUTPUTS = {
     "animate": ("animate", "b.nc", "--out", "{}/a.gif"),
     "inspect": ("inspect", "b.bag", "--plot", "{}/a.png"),
     "record-virtual": ("record-virtual", "sine:1", "--out", "{}/a.bag"),
-    "study": ("study", "estimation", "--out", "{}/o"),
     "view": ("view", "b.nc", "--export", "{}/a.html"),
 }  # fmt: skip
 

@@ -12,6 +12,7 @@ import pytest
 import typer
 import typer.testing
 from examples import your_own_robot
+from studies.__main__ import app as studies
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
@@ -122,17 +123,22 @@ def test_its_long_python_runs(page, folder, capsys):
 # commands
 
 
+#: our programs, by what calls them
+PROGRAMS = {"knode-cosserat": app, "python -m studies": studies}
+
+
 def commands(text):
-    """Lines of a shell that call our program, as lists of words."""
+    """Lines of a shell that call our programs, as the program and a list of words."""
     for line in text.replace("\\\n", " ").splitlines():
         line = re.sub(r"\s+#.*", "", line.strip().removeprefix("$ "))
-        if line.startswith("knode-cosserat ") and "$" not in line and "--version" not in line:
-            yield shlex.split(re.split(r"\s[>|]", line)[0])[1:]
+        for program in PROGRAMS:
+            if line.startswith(f"{program} ") and "$" not in line and "--version" not in line:
+                yield program, shlex.split(re.split(r"\s[>|]", line)[0].removeprefix(program))
 
 
-def parsed(words, whole=True):
+def parsed(program, words, whole=True):
     """The command that some words name; fails on one, or an option, that does not exist."""
-    command = typer.main.get_command(app)
+    command = typer.main.get_command(PROGRAMS[program])
     words = list(words)
     while hasattr(command, "get_command") and words and not words[0].startswith("-"):
         name = words.pop(0)
@@ -151,33 +157,34 @@ def parsed(words, whole=True):
 
 
 COMMANDS = [
-    pytest.param(words, id=f"{page}: {shlex.join(words)}"[:110])
+    pytest.param(program, words, id=f"{page}: {shlex.join(words)}"[:110])
     for page in PAGES
     for language in ("sh", "")
     for _, text, _ in blocks(page, language)
-    for words in commands(text)
+    for program, words in commands(text)
 ]
 
 
-@pytest.mark.parametrize("words", COMMANDS)
-def test_a_command_parses(words, monkeypatch):
+@pytest.mark.parametrize(("program", "words"), COMMANDS)
+def test_a_command_parses(program, words, monkeypatch):
     monkeypatch.chdir(ROOT)
-    parsed(words)
+    parsed(program, words)
 
 
 def test_commands_within_sentences_exist():
     found = [
-        (page, name)
+        (page, program, name)
         for page, text in PAGES.items()
-        for name in re.findall(r"`knode-cosserat ([^`]+)`", BLOCK.sub("", text))
+        for program in PROGRAMS
+        for name in re.findall(rf"`{program} ([^`]+)`", BLOCK.sub("", text))
     ]
-    assert len(found) > 10
-    for page, name in found:
+    assert {program for _, program, _ in found} == set(PROGRAMS) and len(found) > 10
+    for page, program, name in found:
         words = name.replace("…", " ").replace("--version", "").split()
         try:
-            parsed(words, whole=False)
+            parsed(program, words, whole=False)
         except AssertionError as error:
-            raise AssertionError(f"{page}: knode-cosserat {name}: {error}") from None
+            raise AssertionError(f"{page}: {program} {name}: {error}") from None
 
 
 def test_targets_and_programs_exist():
@@ -202,8 +209,8 @@ def test_commands_print_what_the_page_shows(page, folder):
         if language != "sh":
             continue
         printed = ""
-        for words in commands(text):
-            result = typer.testing.CliRunner().invoke(app, words)
+        for program, words in commands(text):
+            result = typer.testing.CliRunner().invoke(PROGRAMS[program], words)
             assert result.exit_code == 0, result.output
             printed = result.stdout
         if k + 1 < len(shell) and shell[k + 1][0] == "":

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FOLDERS = (ROOT / "src", ROOT / "hardware" / "src")
+FOLDERS = (ROOT / "src", ROOT / "hardware" / "src", ROOT / "studies")
 SOURCES = sorted(file for folder in FOLDERS for file in folder.rglob("*.py") if "vendor" not in file.parts)
 #: a first line is a verb phrase or a noun phrase
 FORBIDDEN = ("What", "Whether", "That", "Those", "How", "Of")

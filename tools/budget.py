@@ -2,7 +2,8 @@
 
     python -m tools.budget
 
-Each figure has an aim and a ceiling. A figure above its ceiling fails; a ceiling is lowered with the code, and never raised.
+Each figure has an aim and a ceiling. A figure above its ceiling fails. A ceiling is lowered with the code, and
+never raised.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ NEEDED = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 #: optional packages, with the extra that installs each
 OPTIONAL = {
     "matplotlib": "viz", "rosbags": "ros", "pyarrow": "parquet", "tensorboardX": "tensorboard",
-    "distributed": "dask", "pydmd": "bench",
+    "distributed": "dask",
 }  # fmt: skip
 #: largest relative error of the force at the base against the rod's weight
 WEIGHT_ERROR = 1e-9

@@ -18,6 +18,7 @@ pytestmark = [
     pytest.mark.skipif(bool(missing()), reason=f"the firmware cannot be built here: {missing()}"),
 ]
 __all__ = ["ros"]
+ROOT = Path(__file__).parents[2]
 PROGRAM = Path(__file__).with_name("record_emulated.py")
 #: two to learn from, and one that is predicted
 MOTIONS = ("sine_1p0", "rand_0", "sine_2p0")
@@ -36,8 +37,10 @@ def table(folder, out):
         "--workers",
         "1",
     ]
-    command = [sys.executable, "-m", "knode_cosserat.cli", "study", "recordings", str(folder), *words]
-    done = subprocess.run([*command, "--out", str(out)], capture_output=True, text=True, check=False)
+    command = [sys.executable, "-m", "studies", "recordings", str(folder), *words]
+    done = subprocess.run(
+        [*command, "--out", str(out)], cwd=ROOT, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 0, done.stderr
     return json.loads((out / "table2.json").read_text())
 

@@ -6,11 +6,13 @@ import pickle
 import numpy as np
 import pandas as pd
 import pytest
+from studies.beam_recordings import read_beam
+from studies.cables import pickles
+from studies.cables import recordings as cables
 from tests.limits import Readers, assert_limited, limit_size
 
 from knode_cosserat._files import csv_rows, parquet_file
-from knode_cosserat.recordings import cables, content, load, pickles, recording
-from knode_cosserat.recordings.beam import read_beam
+from knode_cosserat.recordings import content, load, recording
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.formats import parquet
 

@@ -7,22 +7,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.commands import run
-
-from knode_cosserat.recordings.beam import THRESHOLD, find_release, load_of, read_beam, tip_drop
-from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.studies import beam
-from knode_cosserat.studies.beam_fit import NOMINAL, identify_beam, marker_rmse
-from knode_cosserat.studies.beam_model import (
+from studies import beam
+from studies.beam_model import (
+    NOMINAL,
     Beam,
     Numerics,
     beam_rod,
     held_beam,
+    identify_beam,
+    marker_rmse,
     predict_markers,
     shear_factor,
     step_count,
     torsion_constant,
 )
+from studies.beam_recordings import THRESHOLD, find_release, load_of, read_beam, tip_drop
+from tests.commands import run_study
+
+from knode_cosserat.recordings.findings import RecordingError
 
 FOLDER = Path(__file__).parents[1] / "files" / "beam"
 HELD_OUT = "beam_load52_V2_b"
@@ -111,7 +113,7 @@ def test_bad_recordings_are_named_in_one_line(tmp_path):
 @matplotlib
 def test_bad_arguments_are_answered_in_one_line(tmp_path, monkeypatch, arguments, words):
     monkeypatch.chdir(tmp_path)
-    result = run("study", "beam", *arguments, "--out", "o")
+    result = run_study("beam", *arguments, "--out", "o")
     assert result.exit_code == 2 and result.stderr.count("\n") == 1 and words in result.stderr
 
 
@@ -138,7 +140,7 @@ def test_the_held_out_recording_is_predicted(recordings):
 @pytest.mark.campaign
 @matplotlib
 def test_the_command_writes_errors_table_and_figure(tmp_path):
-    result = run("study", "beam", FOLDER, "--out", tmp_path, "--json")
+    result = run_study("beam", FOLDER, "--out", tmp_path, "--json")
     assert result.exit_code == 0, result.stderr
     cells = json.loads((tmp_path / "beam.json").read_text())
     assert len(cells) == 6 and {cell["method"] for cell in cells} == {"nominal", "identified"}

@@ -7,19 +7,14 @@ import pickle
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
-
-from knode_cosserat.cli import app
-from knode_cosserat.recordings.cables import CableData, CableMotion
-from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.studies.cables import frames, study
-from knode_cosserat.studies.cables.correction import learned_correction
-from knode_cosserat.studies.cables.identification import SearchStage, identify_cable
-from knode_cosserat.studies.cables.model import DT, CableModel, CableParameters, Grips
-from knode_cosserat.studies.cables.places import marker_places
-from knode_cosserat.studies.cables.report import as_markdown
-from knode_cosserat.studies.cables.result import CableResult
-from knode_cosserat.studies.cables.rollouts import (
+from studies.__main__ import app
+from studies.cables import frames, study
+from studies.cables.correction import learned_correction
+from studies.cables.identification import SearchStage, identify_cable
+from studies.cables.model import DT, CableModel, CableParameters, Grips
+from studies.cables.places import marker_places
+from studies.cables.recordings import CableData, CableMotion
+from studies.cables.rollouts import (
     CHUNK,
     NAMES,
     CablePrediction,
@@ -27,7 +22,11 @@ from knode_cosserat.studies.cables.rollouts import (
     cable_coordinates,
     cable_parameters,
 )
-from knode_cosserat.studies.cables.shapes import CableGrid, Fitter
+from studies.cables.shapes import CableGrid, Fitter
+from studies.cables.study import CableResult, as_markdown
+from typer.testing import CliRunner
+
+from knode_cosserat.solvers.simulate import simulate
 
 SPACE, NODES = "lobatto2", 9
 TRUE = CableParameters(
@@ -252,7 +251,7 @@ def test_frames_without_a_solution_are_divided(rollouts, monkeypatch, hardest):
             result[max(1, np.argmax(after)) :] = -1
         return dataclasses.replace(found, result=result)
 
-    monkeypatch.setattr("knode_cosserat.studies.cables.rollouts.simulate", failing)
+    monkeypatch.setattr("studies.cables.rollouts.simulate", failing)
     divided = rollouts.predict(TRUE, markers)
     assert plain.divided == 0 and 30 < divided.divided < 50
     np.testing.assert_array_equal(divided.markers[:15], plain.markers[:15])
@@ -281,7 +280,7 @@ def test_a_motion_without_prediction_is_named_and_left_out(rollouts, motions, mo
 
 @matplotlib
 def test_a_folder_without_cables_is_told_in_one_line(tmp_path):
-    result = CliRunner().invoke(app, ["study", "cables", str(tmp_path), "--out", str(tmp_path / "out")])
+    result = CliRunner().invoke(app, ["cables", str(tmp_path), "--out", str(tmp_path / "out")])
     assert result.exit_code == 2 and result.stderr.count("\n") == 1
     assert "no cables there" in result.stderr
 

@@ -7,6 +7,14 @@ experiment = pytest.importorskip("cosseratbench.experiment")
 registry = pytest.importorskip("cosseratbench.registry")
 
 
+@pytest.fixture(autouse=True)
+def _entry_point(monkeypatch):
+    from benchmarks.cosseratbench_solver import ENTRY_POINT
+
+    # first: an environment may have the entry point of another checkout
+    monkeypatch.syspath_prepend(ENTRY_POINT)
+
+
 def ran(name, n_elements=20):
     found = experiment.run(
         registry.load_experiment(name), registry.load_solver("knode-cosserat"), n_elements=n_elements
@@ -38,3 +46,7 @@ def test_pendulum_keeps_its_period_and_its_energy():
 def test_twist_finds_where_a_rod_buckles():
     # the suite puts the uncertainty of this measurement near half a per cent
     assert ran("twist").metrics["critical_twist_error"] < 5e-3
+
+
+def test_the_suite_finds_the_solver():
+    assert registry.load_solver("knode-cosserat").__class__.__module__ == "benchmarks.cosseratbench_solver"

@@ -6,13 +6,13 @@ import re
 
 import numpy as np
 import pytest
+from studies import comparisons, data_efficiency, simulation
+from studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
+from studies.data_efficiency import as_markdown, figure, rerun
 
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.studies import comparisons, data_efficiency, simulation
-from knode_cosserat.studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
-from knode_cosserat.studies.data_report import as_markdown, figure, rerun
 
 pydmd = pytest.mark.skipif(importlib.util.find_spec("pydmd") is None, reason="needs PyDMD")
 matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")
@@ -74,7 +74,7 @@ def test_without_pydmd_it_says_how_to_get_it(monkeypatch):
         raise ImportError(name)
 
     monkeypatch.setattr(comparisons.importlib, "import_module", missing)
-    with pytest.raises(ImportError, match=r"pip install 'knode-cosserat\[bench\]'"):
+    with pytest.raises(ImportError, match=r"pip install '\.\[studies\]'"):
         linear_predictor(ROBOT, [linear_motion(kc.controls.random(10))])
 
 

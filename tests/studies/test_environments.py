@@ -5,8 +5,9 @@ import pytest
 
 pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'knode-cosserat[rl]'")
 
+from studies import environments
+
 from knode_cosserat import envs
-from knode_cosserat.studies import environments
 
 
 @pytest.fixture

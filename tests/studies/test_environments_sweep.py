@@ -1,8 +1,7 @@
 """The measurement of sweeps gives figures, and finds interrupted sweeps equal."""
 
 import pytest
-
-from knode_cosserat.studies.environments_sweep import measure_sweep
+from studies.environments_sweep import measure_sweep
 
 
 @pytest.mark.campaign

@@ -4,17 +4,12 @@ import importlib.util
 import json
 
 import pytest
-import typer.testing
+from studies import estimation
+from tests.commands import run, run_study
 
 import knode_cosserat as kc
-from knode_cosserat.cli import app
-from knode_cosserat.studies import estimation
 
 matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")
-
-
-def run(*arguments):
-    return typer.testing.CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
 def cell(method, quantity, rms, balance=estimation.TRUE):
@@ -38,7 +33,7 @@ def test_the_table_has_errors_ratios_and_noise():
 @pytest.mark.campaign
 @matplotlib
 def test_the_best_is_three_times_better_on_every_recording(tmp_path):
-    result = run("study", "estimation", "--out", tmp_path, "--json")
+    result = run_study("estimation", "--out", tmp_path, "--json")
     assert result.exit_code == 0, result.stderr
     told = json.loads(result.stdout)
     assert told["failed"] == 0 and (tmp_path / "figures" / "estimation.png").exists()

@@ -4,10 +4,10 @@ import os
 
 import numpy as np
 import pytest
+from studies import hardware
+from studies.hardware_rig import Cable
+from studies.runner import Job, Product
 
-from knode_cosserat.studies import hardware
-from knode_cosserat.studies.hardware_rig import Cable
-from knode_cosserat.studies.runner import Job, Product
 from knode_cosserat_hardware.emulation import missing
 
 FACTS = {
@@ -37,7 +37,7 @@ def test_each_figure_has_a_limit():
 
 
 def test_quick_runs_have_each_fault():
-    from knode_cosserat.studies.hardware_faults import KINDS, NOISE_BURST
+    from studies.hardware_faults import KINDS, NOISE_BURST
 
     by_key = {job.key: job.settings for job in hardware.jobs(quick=True)}
     assert by_key["loop-faults"]["runs"] >= len((*KINDS, NOISE_BURST))
@@ -66,7 +66,7 @@ def test_a_burst_of_bit_errors_ends():
 @pytest.mark.campaign
 @pytest.mark.skipif(bool(missing()), reason=f"the firmware cannot be built here: {missing()}")
 def test_faults_within_the_closed_loop_are_caught_and_recovered_from():
-    from knode_cosserat.studies.hardware_faults import loop_faults
+    from studies.hardware_faults import loop_faults
 
     facts = loop_faults({"runs": 8}).facts
     assert facts["missed"] == facts["dead"] == facts["unsafe"] == 0, facts["trials"]

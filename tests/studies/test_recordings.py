@@ -5,19 +5,19 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from studies import recordings as study
+from studies.__main__ import app
+from studies.recordings_report import repetitions, table_of
+from studies.runner import StudyError
 from typer.testing import CliRunner
 
 import knode_cosserat as kc
-from knode_cosserat.cli import app
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
 from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.studies import recordings as study
-from knode_cosserat.studies.recordings_report import repetitions, table_of
-from knode_cosserat.studies.runner import StudyError
 
 PAPER = RecordingConfig.paper_robot()
 DT = 0.01
@@ -74,7 +74,7 @@ def folder(tmp_path_factory):
 
 
 def run(*arguments):
-    return CliRunner().invoke(app, ["study", "recordings", *map(str, arguments)])
+    return CliRunner().invoke(app, ["recordings", *map(str, arguments)])
 
 
 @pytest.mark.campaign

@@ -8,17 +8,18 @@ import time
 from pathlib import Path
 
 import pytest
+import studies
+from studies import runner
+from studies.runner import Job, StudyError, run
 
 import knode_cosserat as kc
 from knode_cosserat import _processes
-from knode_cosserat.studies import runner
-from knode_cosserat.studies.runner import Job, StudyError, run
 
 #: jobs have to be in a module that other processes can import
 MODULE = """
 import os, time
 from pathlib import Path
-from knode_cosserat.studies.runner import Product
+from studies.runner import Product
 
 def square(settings):
     with Path(settings["log"]).open("a") as log:
@@ -140,18 +141,18 @@ def test_killed_it_leaves_no_process_behind_and_the_rest_is_done_by_the_next_run
 import sys; sys.path.insert(0, {str(tmp_path)!r})
 import {NAME} as work
 from pathlib import Path
-from knode_cosserat.studies.runner import Job, run
+from studies.runner import Job, run
 log = {str(tmp_path / "log")!r}
 jobs = [Job("job-0", work.square, {{"x": 0, "log": log}})]
 jobs += [Job(f"job-{{x}}", work.wait, {{"x": x, "log": log}}) for x in (1, 2)]
 if __name__ == "__main__":
     run(jobs, Path({str(tmp_path)!r}), workers=2)
 """
-    source = str(Path(kc.__file__).parents[1])
+    sources = (str(Path(file).parents[1]) for file in (kc.__file__, studies.__file__))
     (tmp_path / "start.py").write_text(script)
     started = subprocess.Popen(
         [sys.executable, tmp_path / "start.py"],
-        env=os.environ | {"PYTHONPATH": source},
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sources)},
         stdin=subprocess.DEVNULL,
     )
     until(lambda: ran(tmp_path) == [0, 1, 2] and (tmp_path / "jobs/job-0.json").exists())

@@ -10,20 +10,20 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer.testing
+from studies import methods, simulation
+from studies.__main__ import app
+from studies.simulation import cells_of, rerun
+from studies.tables import MEASURES, spreads
 
 import knode_cosserat as kc
-from knode_cosserat.cli import app
-from knode_cosserat.evaluation.tables import MEASURES, spreads
 from knode_cosserat.learning.files.model_file import load_model
-from knode_cosserat.studies import methods, simulation
-from knode_cosserat.studies.simulation_report import cells_of, rerun
 
 KEYS = {"imperfection", "control", "method", "seed", "tip_dtw", "pose_mse"}
 TABLES = ("table1.json", "table1.csv", "table1.md")
 
 
 def study(*arguments):
-    return typer.testing.CliRunner().invoke(app, ["study", "simulation", *map(str, arguments)])
+    return typer.testing.CliRunner().invoke(app, ["simulation", *map(str, arguments)])
 
 
 def contents(out):
@@ -69,7 +69,8 @@ def test_what_is_written_is_complete(baseline):
 KILLED = """
 import functools, os, signal
 from knode_cosserat.cli import main
-from knode_cosserat.studies import simulation
+from studies import simulation
+from studies.__main__ import app
 
 true, count = simulation.predict, 0
 
@@ -82,14 +83,13 @@ def predict(settings):
     return true(settings)
 
 simulation.predict = predict
-main()
+main(app)
 """
 
 
 @pytest.mark.campaign
 def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
     arguments = [
-        "study",
         "simulation",
         "--out",
         tmp_path,
@@ -100,9 +100,10 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
         "--workers",
         1,
     ]
-    source = str(Path(importlib.util.find_spec("knode_cosserat").origin).parents[1])
+    origins = [importlib.util.find_spec(name).origin for name in ("knode_cosserat", "studies")]
+    sources = os.pathsep.join(str(Path(origin).parents[1]) for origin in origins)
     done = subprocess.run(
-        [sys.executable, "-c", KILLED, *map(str, arguments)], env=os.environ | {"PYTHONPATH": source},
+        [sys.executable, "-c", KILLED, *map(str, arguments)], env=os.environ | {"PYTHONPATH": sources},
         stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120,
     )  # fmt: skip
     assert done.returncode == -signal.SIGKILL, done.stderr
@@ -110,7 +111,7 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
     assert set(kept) == {"reference.json", "self-weight-baseline.json", "length-baseline.json"}
     assert not (tmp_path / "table1.json").exists()
 
-    result = study(*arguments[2:])
+    result = study(*arguments[1:])
     assert result.exit_code == 0, result.stderr
     assert contents(tmp_path) == contents(baseline)
     now = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "jobs").iterdir()}

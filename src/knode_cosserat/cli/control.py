@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -41,25 +41,18 @@ def parsed_reference(text: str) -> Any:
     return table(rows["t"].to_numpy(), rows[["x", "y", "z"]].to_numpy())
 
 
+#: plants of other simulators by the word before the colon: functions of the rest of the text, dt and sensor
+PLANTS: dict[str, Callable[[str, float, Any], Any]] = {}
+
+
 def _plant(text: str | None, model: Any, dt: float, sensor: Any) -> Any:
     """Return the controlled robot by its text; None: the model itself."""
     from knode_cosserat.control import SimulatedPlant
 
-    if text is None or not text.startswith("elastica:"):
-        return SimulatedPlant(model if text is None else load_system(text), dt, sensor)
-    from knode_cosserat.control.elastica_plant import ElasticaPlant
-    from knode_cosserat.control.elastica_rod import Imperfections
-
-    name, *given = text.removeprefix("elastica:").split(",")
-    known = {field.name: field.type for field in dataclasses.fields(Imperfections)}
-    changes: dict[str, Any] = {}
-    for each in given:
-        key, _, value = each.partition("=")
-        if key not in known:
-            raise ValueError(f"--plant has {each!r}; allowed is NAME=NUMBER with {', '.join(known)}")
-        changes[key] = parse_limits(f"--plant {key}", value, 1)
-    robot: Any = load_system(name)
-    return ElasticaPlant.like(robot, dt, sensor, Imperfections(**changes))
+    if text is None:
+        return SimulatedPlant(model, dt, sensor)
+    word, _, rest = text.partition(":")
+    return PLANTS[word](rest, dt, sensor) if word in PLANTS else SimulatedPlant(load_system(text), dt, sensor)
 
 
 def _live(
@@ -87,7 +80,6 @@ def _live(
     epilog=examples(
         "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
         "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
-        "control found.yaml --plant elastica:my-robot.yaml,friction=0.2 --lag 0.06 --reference path.csv",
         "control delrin-tendon-robot --live",
     )
 )
@@ -108,8 +100,7 @@ def control(
         str | None,
         typer.Option(
             metavar="ROBOT",
-            help="Robot that is controlled, simulated; elastica:ROBOT,lag=0.1: by PyElastica, with friction "
-            "and lag (an extra).",
+            help="Robot that is controlled, simulated.",
             show_default="the model itself",
         ),
     ] = None,

@@ -49,17 +49,24 @@ VECTOR_OPTIONS = frozenset(
 _NAMED_OPTIONS = frozenset(["--control"])
 
 
-class _Program(TyperGroup):
+class Program(TyperGroup):
     """Group of all commands. Errors and warnings are printed in one line on stderr."""
 
+    #: name of the program in its help texts
+    program = PROGRAM
+    #: entry points of further commands
+    plugins = COMMANDS
+
     def list_commands(self, ctx: Any) -> list[str]:
-        return [*super().list_commands(ctx), *(entry.name for entry in entry_points(group=COMMANDS))]
+        """Return the names of the commands, those of other distributions last."""
+        return [*super().list_commands(ctx), *(entry.name for entry in entry_points(group=self.plugins))]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return a command; one of another distribution is imported only here."""
         command = super().get_command(ctx, cmd_name)
         if command is not None:
             return command
-        for entry in entry_points(group=COMMANDS, name=cmd_name):
+        for entry in entry_points(group=self.plugins, name=cmd_name):
             command = typer.main.get_command(entry.load())
             command.name = cmd_name
             return command
@@ -71,11 +78,12 @@ class _Program(TyperGroup):
     def main(
         self, args: Sequence[str] | None = None, prog_name: str | None = None, *_: Any, **extra: Any
     ) -> Any:
+        """Run the command that the arguments name, and exit with its status."""
         args = list(sys.argv[1:] if args is None else args)
         try:
             with warnings.catch_warnings():
                 warnings.showwarning = _print_warning
-                status = super().main(args or ["--help"], PROGRAM, **{**extra, "standalone_mode": False})
+                status = super().main(args or ["--help"], self.program, **{**extra, "standalone_mode": False})
         except typer.Abort:
             sys.exit(1)
         except Exception as error:
@@ -153,23 +161,39 @@ def command_group(**options: Any) -> typer.Typer:
     )
 
 
-app = command_group(cls=_Program, add_completion=True)
-#: the commands under `study`
-studies = command_group(help="Repeat a study of the paper, or of a folder of recordings.")
+app = command_group(cls=Program, add_completion=True)
 
 
-def main() -> None:
-    """Run the program `knode-cosserat`."""
+def main(application: typer.Typer = app) -> None:
+    """Run the program `knode-cosserat`, or another one of the same make."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):  # a terminal that has no "²" shows \xb2
             stream.reconfigure(errors="backslashreplace")
-    app()
+    application()
 
 
-def examples(*commands: str) -> str:
+def examples(*commands: str, program: str = PROGRAM) -> str:
     """Return the examples at the end of a help text. The first character keeps the line breaks."""
     title = "Example:" if len(commands) == 1 else "Examples:"
-    return "\n".join(["\b", title, *(f"  {PROGRAM} {command}" for command in commands)])
+    return "\n".join(["\b", title, *(f"  {program} {command}" for command in commands)])
+
+
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose", "-v", help="Log details on stderr, such as recovered time steps and fitting progress."
+    ),
+]
+
+
+def log_details(*packages: str) -> None:
+    """Log the details of some packages on stderr."""
+    handler = logging.StreamHandler()
+    handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
+    for package in packages:
+        logger = logging.getLogger(package)
+        logger.addHandler(handler)
+        logger.setLevel(logging.INFO)
 
 
 def _version(requested: bool) -> None:
@@ -189,22 +213,19 @@ def program(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
-    verbose: Annotated[
-        bool,
-        typer.Option(
-            "--verbose",
-            "-v",
-            help="Log details on stderr, such as recovered time steps and fitting progress.",
-        ),
-    ] = False,
+    verbose: Verbose = False,
 ) -> None:
     """Simulate Cosserat-rod robots, learn residual models and identify parameters.
 
     Units are SI: m, s, kg, N, Pa, rad. Vectors are numbers separated by commas or spaces: 7,5,5,7.
     """
     if verbose:
-        handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(name)s: %(message)s"))
-        logger = logging.getLogger("knode_cosserat")
-        logger.addHandler(handler)
-        logger.setLevel(logging.INFO)
+        log_details("knode_cosserat")
+
+
+@app.command(
+    "study", hidden=True, context_settings={"ignore_unknown_options": True, "allow_extra_args": True}
+)
+def study() -> None:
+    """Point to the studies."""
+    raise ValueError("studies are part of the repository: git clone it, and there python -m studies NAME")

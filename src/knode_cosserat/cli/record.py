@@ -76,9 +76,9 @@ def record_virtual(
     if truth and imperfections is None:
         raise typer.BadParameter("--truth needs --imperfections SEED: it writes that robot")
     import knode_cosserat as kc
+    from knode_cosserat.identification.imperfections import drawn_robot
     from knode_cosserat.recordings.virtual import Sensors
     from knode_cosserat.recordings.virtual import record_virtual as record
-    from knode_cosserat.studies.virtual_robots import drawn_robot
 
     _require_motion(signal, seconds)
     began = perf_counter()

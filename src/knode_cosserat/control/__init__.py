@@ -6,8 +6,6 @@ from knode_cosserat.control.baselines.lqr import LQR
 from knode_cosserat.control.baselines.sampling import MPPI
 from knode_cosserat.control.baselines.tip_feedback import PID, KinematicController
 from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.elastica_plant import ElasticaPlant, Recorded, record_elastica
-from knode_cosserat.control.elastica_rod import ElasticaRod, Imperfections
 from knode_cosserat.control.lag import identified_lag
 from knode_cosserat.control.loop import LoopLog, run_loop
 from knode_cosserat.control.named import controller_named
@@ -35,9 +33,6 @@ __all__ = [
     "Command",
     "ControlLimits",
     "Controller",
-    "ElasticaPlant",
-    "ElasticaRod",
-    "Imperfections",
     "KinematicController",
     "KoopmanController",
     "LoopLog",
@@ -45,7 +40,6 @@ __all__ = [
     "PredictiveController",
     "QPError",
     "QPSolver",
-    "Recorded",
     "Reference",
     "ReferenceFormatError",
     "Sensor",
@@ -59,7 +53,6 @@ __all__ = [
     "figure_eight",
     "identified_lag",
     "parse_reference",
-    "record_elastica",
     "run_loop",
     "steps",
     "table",

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from knode_cosserat.evaluation.comparison import REFERENCE
 from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.study_figures import REFERENCE
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 
 if TYPE_CHECKING:

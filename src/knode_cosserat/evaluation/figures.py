@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from knode_cosserat.evaluation.animation import animate
+from knode_cosserat.evaluation.comparison import comparison as compare
 from knode_cosserat.evaluation.drawing import (
     AXES,
     Tips,
@@ -32,7 +33,6 @@ from knode_cosserat.evaluation.drawing import (
     tips_of,
 )
 from knode_cosserat.evaluation.recording_figures import prediction_against_measurement
-from knode_cosserat.evaluation.study_figures import comparison as compare
 from knode_cosserat.evaluation.style import (
     PALETTE,
     TIME_COLOURS,

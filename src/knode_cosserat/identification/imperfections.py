@@ -9,7 +9,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.identification.model import Model
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.virtual import commands
 from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.tendon_rod import TendonRod
 
@@ -17,6 +20,10 @@ from knode_cosserat.rods.tendon_rod import TendonRod
 SHARE = 1.0 / 3.0
 #: sizes of an effect's numbers, in standard deviations of their priors
 SIZES = (0.5, 1.5)
+#: data sheet of virtual robots; their training recordings, by name, and the end of the part used (s)
+NOMINAL = "delrin-tendon-robot"
+TRAINING = {"sine_1p0": "sine:1.0", "sine_3p0": "sine:3.0", "rand_0": "random:0"}
+END = 7.5
 
 
 @dataclasses.dataclass(frozen=True)
@@ -73,3 +80,17 @@ def imperfect_robot(
     mask = model.mask(names)
     kept = {each.label: values[each.label] for each, on in zip(model.numbers, mask, strict=True) if on}
     return Imperfect(model.reduced(x, names), tuple(names), kept, model, x)
+
+
+def nominal_robot() -> TendonRod:
+    """Return the robot of the data sheet of all virtual robots."""
+    robot = load_robot(NOMINAL)
+    assert isinstance(robot, TendonRod)
+    return robot
+
+
+def drawn_robot(seed: int) -> Imperfect:
+    """Return the virtual robot of a seed: the paper's robot with random imperfections."""
+    tension = np.concatenate([commands(signal, END).tension for signal in TRAINING.values()])
+    bodies = [each.fraction for each in RecordingConfig.paper_robot().markers]
+    return imperfect_robot(nominal_robot(), tension, seed, bodies)

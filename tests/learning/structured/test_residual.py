@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from examples.hanging_string import HangingString
+from studies import truths
 from tests.learning.bar import BAR, pulled
 
 import knode_cosserat as kc
@@ -15,7 +16,6 @@ from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.closed_form import residuals_of
 from knode_cosserat.solvers.semi_discrete import History, Point
-from knode_cosserat.studies import truths
 
 DT = 0.05
 UNSEEN = kc.controls.sine(1.5, 60, DT)

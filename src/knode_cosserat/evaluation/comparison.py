@@ -1,0 +1,110 @@
+"""Comparison of predictions with a reference: shapes and tips by label, and the line styles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from knode_cosserat.evaluation.drawing import (
+    AXES,
+    equal_scales,
+    new_figure,
+    one_of,
+    require_span,
+    tips_of,
+)
+from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: fixed line styles: the reference is wide and pale, so that a line on top of it remains visible
+REFERENCE: dict[str, Any] = {"color": "#AAAAAA", "linewidth": 3.0, "linestyle": "-"}
+METHODS: dict[str, dict[str, Any]] = {
+    "baseline": {"color": PALETTE[1], "linestyle": "-", "linewidth": 1.0},
+    "paper": {"color": PALETTE[0], "linestyle": "-", "linewidth": 1.0},
+    "calibrated": {"color": PALETTE[3], "linestyle": (0, (1, 1.5)), "linewidth": 1.6},
+    "best": {"color": PALETTE[6], "linestyle": (0, (4, 2)), "linewidth": 1.1},
+}
+#: styles of other labels, by their position in the figure
+_OTHERS = ("baseline", "best", "paper", "calibrated")
+
+
+def look_of(label: str, place: int) -> dict[str, Any]:
+    """Return the line style of a prediction: fixed for methods of the studies, otherwise by position."""
+    return METHODS[label if label in METHODS else _OTHERS[place % len(_OTHERS)]]
+
+
+def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
+    """Return one figure of the shapes and tips of several predictions, drawn over the reference.
+
+    Raises:
+        ImportError: matplotlib is not installed.
+        ValueError: there is nothing to draw, or a batch is given.
+    """
+    require_some(predictions)
+    with style():
+        figure = new_figure(TWO_COLUMNS, 3.8)
+        left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35), wspace=0.03)
+        axes = left.add_subplot(projection="3d")
+        draw_shapes(axes, reference, predictions, count)
+        show_all(axes, [reference, *predictions.values()], zoom=0.87)
+        column = right.subplots(3, 1, sharex=True)
+        draw_tips(column, reference, predictions)
+        right.align_ylabels()
+        legend_below(figure, column)
+    return figure
+
+
+def draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Trajectory], count: int) -> None:
+    """Draw `count` shapes and the tip paths of a reference and of predictions."""
+    true = np.asarray(one_of(reference).position)
+    rows = np.unique(np.linspace(0, len(true) - 1, count).round().astype(int))
+    for row in rows:
+        axes.plot(*true[row].T, **REFERENCE, solid_capstyle="round")
+    axes.plot(*true[:, -1].T, **{**REFERENCE, "linewidth": 2.0}, label="reference")
+    for place, (label, prediction) in enumerate(predictions.items()):
+        points = np.asarray(one_of(prediction).position)
+        look = {**look_of(label, place), "linestyle": "-"}
+        for row in rows:
+            axes.plot(*points[row].T, **look)
+        axes.plot(*points[:, -1].T, **{**look, "linewidth": 0.9}, label=label)
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+
+
+def show_all(axes: Any, trajectories: Sequence[Trajectory], zoom: float) -> None:
+    """Scale the axes so that all trajectories are within them."""
+    points = np.concatenate([np.asarray(each.position).reshape(-1, 3) for each in trajectories])
+    equal_scales(axes, points[None, np.isfinite(points).all(axis=1)], zoom)
+
+
+def draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Trajectory]) -> None:
+    """Draw the tip's x, y and z over time, one below the other."""
+    true = tips_of(reference)
+    for k, axes in enumerate(column):
+        axes.plot(reference.time, true[:, k], label="reference", **REFERENCE)
+        for place, (label, each) in enumerate(predictions.items()):
+            axes.plot(each.time, tips_of(each)[:, k], label=label, **look_of(label, place))
+        axes.set_ylabel(f"tip {AXES[k]} [m]")
+        require_span(axes, 0.01 * float(np.nanmax(np.abs(true))))
+    column[-1].set_xlabel("time [s]")
+
+
+def legend_below(figure: Any, axes: Any, columns: int = 6) -> None:
+    """Add one legend for all axes, each label once."""
+    handles: dict[str, Any] = {}
+    for each in axes:
+        for handle, label in zip(*each.get_legend_handles_labels(), strict=True):
+            handles.setdefault(label, handle)
+    figure.legend(
+        handles.values(), handles.keys(), loc="outside lower center", ncols=columns, handlelength=2.4
+    )
+
+
+def require_some(given: Mapping[str, Any]) -> None:
+    """Raise `ValueError` if there is nothing to draw."""
+    if not given:
+        raise ValueError("there is nothing to draw; at least one is needed")

@@ -1,0 +1,394 @@
+"""Study of closed-loop control: tracking, adaptation, observers, faults and times, with their limits."""
+
+from __future__ import annotations
+
+import time as clock
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.control import LoopLog, Sensor, SimulatedPlant, circle, run_loop, steps
+from knode_cosserat.control.commands import Controller
+from knode_cosserat.control.named import NAMES
+from knode_cosserat.control.planning import PlanController
+from knode_cosserat.estimation import (
+    Adapted,
+    KalmanObserver,
+    MovingHorizonObserver,
+    TipPosition,
+)  # fmt: skip
+from knode_cosserat.estimation.observer import TENSION_DEVIATION
+from knode_cosserat.recordings.estimation.estimate import estimate_states
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from studies import stand_in
+from studies.control_cases import (
+    ADAPTIVE,
+    DT,
+    HIGH,
+    HOLD,
+    LIMITS,
+    LOW,
+    NOMINAL,
+    RATE,
+    SECONDS,
+    SETTLED,
+    SLOW,
+    STILL,
+    TRANSIT,
+    WRONG,
+    cases_of,
+    controller_of_study,
+    nominal_robot,
+    predictive,
+    references,
+    true_robots,
+)  # fmt: skip  # fmt: skip
+from studies.report import Report, as_json, check_row, checks_table, write_texts
+from studies.runner import Job, Product, run
+from studies.tables import markdown_table
+
+
+def jobs(quick: bool) -> list[Job]:
+    """Return one job for each controller, and one for each further check."""
+    made = [
+        Job(f"tracking-{name}", tracking, {"controller": name, "quick": quick}) for name in (ADAPTIVE, *NAMES)
+    ]
+    if stand_in.is_available():
+        made.append(Job("tracking-stand-in", on_stand_in, {"quick": quick}))
+    made.append(Job("limits", limits, {"runs": 20 if quick else 1000}))
+    made.append(Job("observer", observers, {"runs": 20 if quick else 50}))
+    made.append(Job("smoother", smoother, {"runs": 3 if quick else 20}))
+    made.append(Job("force", force, {"runs": 3 if quick else 6}))
+    made.append(Job("rest", rest, {"seconds": 30.0 if quick else 600.0}))
+    made.append(Job("times", times, {"seconds": 20.0 if quick else 600.0}))
+    return made
+
+
+def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
+    """Run the study, and write control.json, control.md and tracking.json; interrupted runs are continued.
+
+    Args:
+        out: the folder.
+        quick: fewer and shorter runs.
+        how: `workers`, `dask`, `progress` as `runner.run` has them.
+    """
+    facts = run(jobs(quick), out, **how)
+    cells = [cell for name, found in facts.items() if name.startswith("tracking-") for cell in found["cells"]]
+    made = checks(facts, cells)
+    texts = {
+        "control.md": as_markdown(cells, made),
+        "control.json": as_json(made),
+        "tracking.json": as_json(cells),
+    }
+    return Report(made, write_texts(out, texts), [])
+
+
+def tracking(settings: Any) -> Product:
+    """Return a controller's tracking errors for all robots and references."""
+    controller = controller_of_study(settings["controller"])
+    cells = []
+    robots, paths = cases_of(settings["controller"], settings["quick"])
+    for name, truth in true_robots().items():
+        if name not in robots:
+            continue
+        plant = SimulatedPlant(truth, DT, Sensor(TipPosition()))
+        for path in paths:
+            reference = references()[path]
+            _fresh(controller)
+            log = run_loop(controller, plant, reference, SECONDS)
+            found = {name: values[-1] for name, values in log.parameters.items()}
+            cells.append(
+                {
+                    "controller": settings["controller"],
+                    "robot": name,
+                    "reference": path,
+                    "rmse_percent": 100.0 * _rmse(log, path) / float(truth.length),
+                    "offset_percent": 100.0 * float(log.tip_distance[-1] / truth.length),
+                    "fallbacks": log.fallbacks,
+                    "parameters": found,
+                    "true_modulus": float(truth.youngs_modulus),
+                }
+            )
+    return Product({"cells": cells}, {})
+
+
+def on_stand_in(settings: Any) -> Product:
+    """Return the tracking errors of all controllers on the PyElastica stand-in, with its identified model."""
+    names, paths = [ADAPTIVE, *NAMES], references()
+    # a loop around the stand-in takes almost as long as the robot would
+    few = {name: [] if name in SLOW else list(paths)[:2] for name in NAMES} if settings["quick"] else {}
+    given = {"robot": NOMINAL, "controllers": names, "adaptive": ADAPTIVE, "few": few}
+    return Product(stand_in.tracked(given, paths, DT, LIMITS, SECONDS, _rmse), {})
+
+
+def _fresh(controller: Controller) -> None:
+    """Let the observer forget the parameters of the run before."""
+    if isinstance(controller, PlanController):
+        controller.observer.restart()
+
+
+def _rmse(log: LoopLog, path: str) -> float:
+    """Return the RMSE (m) of settled rows; after a jump of the reference, those from `TRANSIT` on."""
+    rows = log.time >= SETTLED
+    if path == "steps":
+        rows &= log.time % HOLD >= TRANSIT
+    return float(np.sqrt(np.mean(log.tip_distance[rows] ** 2)))
+
+
+# the report
+
+
+def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+    """Return the figures of the study with their limits: check, value, limit, ok."""
+    own = [cell for cell in cells if cell["controller"] == ADAPTIVE]
+
+    def worst(robot: str, field: str = "rmse_percent") -> float:
+        return max(cell[field] for cell in own if cell["robot"].startswith(robot))
+
+    modulus = [
+        abs(cell["parameters"]["youngs_modulus"] / cell["true_modulus"] - 1.0)
+        for cell in own if cell["robot"].startswith("stiffness") and "steps" not in cell["reference"]
+    ]  # fmt: skip
+    slow, fast = facts["times"]["0.05"], facts["times"]["0.02"]
+    steady = max(
+        cell["offset_percent"]
+        for cell in own
+        if cell["robot"].startswith("unknown") and cell["reference"] == "steps"
+    )
+    listed = [
+        ("tip RMSE, exact model (% of length)", worst("exact"), 0.1),
+        ("tip RMSE, stiffness wrong by 30 % (% of length)", worst("stiffness"), 0.5),
+        ("steady offset, unknown 10 and 50 g at the tip (% of length)", steady, 0.1),
+        ("stiffness after 12 s (relative error)", max(modulus), 0.03),
+        ("external force at the tip after 6 s (relative error)", facts["force"]["error"], 0.1),
+        (f"hard limits exceeded in {facts['limits']['runs']} runs (times)", facts["limits"]["exceeded"], 0),
+        *(
+            (f"shape 1 s after a wrong start, {name} (% of length)", found["shape_error_percent"], 0.5)
+            for name, found in facts["observer"].items()
+        ),
+        *(
+            (
+                f"the same, {name}, relative to the offline smoother with all bodies",
+                found["shape_error_percent"] / facts["smoother"]["shape_error_percent"],
+                2.0,
+            )
+            for name, found in facts["observer"].items()
+        ),
+        *(
+            (
+                f"95 % regions, {name}: distance of their coverage from 94 % (%)",
+                abs(100.0 * found["coverage"] - 94.0),
+                4.0,
+            )
+            for name, found in facts["observer"].items()
+        ),
+        *((f"step, {name} (ms)", found["step_ms"], 5.0) for name, found in facts["observer"].items()),
+        ("drift of the stiffness at rest (%)", facts["rest"]["drift_percent"], 3.0),
+        ("feedback at 20 Hz, p99 (ms)", slow["feedback_p99_ms"], 5.0),
+        ("cycle at 20 Hz, p99 (ms)", slow["cycle_p99_ms"], 25.0),
+        ("cycle at 50 Hz, p99 (ms)", fast["cycle_p99_ms"], 12.0),
+        ("missed deadlines at 20 Hz", slow["missed"], 0),
+        *stand_in.checks(cells, ADAPTIVE),
+    ]  # fmt: skip
+    return [check_row(name, float(value), limit) for name, value, limit in listed]
+
+
+def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, Any]]) -> str:
+    """Return the tables in Markdown: tracking errors, and the checks."""
+    paths = list(references())
+    rows = []
+    for name in dict.fromkeys(cell["robot"] for cell in cells):
+        for controller in dict.fromkeys(cell["controller"] for cell in cells):
+            own = {c["reference"]: c for c in cells if c["robot"] == name and c["controller"] == controller}
+            if own:
+                tracked = [f"{own[path]['rmse_percent']:.3g}" if path in own else "not run" for path in paths]
+                rows.append([name, controller, *tracked])
+    return "\n\n".join(
+        [
+            "# Closed-loop control",
+            f"Simulated robots, exact measurements of the tip, control at {1.0 / DT:.0f} Hz. Tip RMSE in "
+            f"% of the length from {SETTLED:g} to {SECONDS:g} s; after a step from {TRANSIT:g} s on.",
+            markdown_table(["robot", "controller", *paths], rows),
+            checks_table(made),
+            *([] if any(cell["robot"] == stand_in.ROBOT for cell in cells) else [stand_in.MISSING]),
+        ]
+    ) + "\n"  # fmt: skip
+
+
+#: observers by name
+OBSERVERS = {"Kalman": KalmanObserver, "moving horizon": MovingHorizonObserver}
+#: places of the bodies that the offline smoother uses, and the noise of their quaternions
+BODIES, TURN_NOISE = (0.25, 0.5, 0.75, 1.0), 2e-3
+#: unknown force at the tip (N), and the seconds after which it is compared
+FORCE, FOUND = np.array([0.06, -0.04, 0.05]), 6.0
+
+
+def limits(settings: Any) -> Product:
+    """Return how often hard limits were exceeded in random runs.
+
+    Robots, their models' errors, targets (some out of reach), noise, disturbances of the controls and lost
+    measurements are random.
+    """
+    rng, nominal = np.random.default_rng(0), nominal_robot()
+    exceeded, fallbacks, periods, late = 0, 0, 0, 0
+    for k in range(settings["runs"]):
+        model = nominal.replace(
+            length=float(nominal.length) * rng.uniform(0.7, 1.2),
+            radius=float(nominal.radius) * rng.uniform(0.9, 1.2),
+            bending_damping=np.asarray(nominal.bending_damping) * rng.uniform(0.3, 2.0),
+        )
+        truth = model.replace(
+            youngs_modulus=float(model.youngs_modulus) * rng.uniform(0.7, 1.4),
+            **{"loads.0.mass": rng.uniform(0.0, 0.05)},
+        )
+        sensor = Sensor(TipPosition(), noise=rng.uniform(0.0, 3.0), dropout=rng.uniform(0.0, 0.3), seed=k)
+        plant = SimulatedPlant(truth, DT, sensor, control_noise=rng.uniform(0.0, 0.3))
+        reference = circle(rng.uniform(0.02, 0.4), rng.uniform(0.8, 6.0), rise=rng.uniform(0.0, 2.0))
+        log = run_loop(predictive(model), plant, reference, 3.0)
+        changes = np.abs(np.diff(log.control, axis=0))
+        exceeded += int(
+            np.sum((log.control < LOW) | (log.control > HIGH)) + np.sum(changes > RATE * DT + 1e-9)
+        )
+        fallbacks, periods = fallbacks + log.fallbacks, periods + len(log.time)
+        late += int(np.sum(log.feedback + log.preparation > DT))
+    return Product(
+        {
+            "runs": settings["runs"], "exceeded": exceeded, "fallbacks": fallbacks, "periods": periods,
+            "late": late,
+        },
+        {},
+    )  # fmt: skip
+
+
+def observers(settings: Any) -> Product:
+    """Return errors of the shape 1 s after a wrong start, from the tip's position alone, and coverage."""
+    robot = load_robot(NOMINAL)
+    start = equilibrium(robot, STILL)
+    facts: dict[str, Any] = {}
+    for name, kind in OBSERVERS.items():
+        observer = kind(robot, DT, TipPosition(), start_deviation=2.0)
+        worst, inside, times = [], [], []
+        for seed in range(settings["runs"]):
+            observer.restart()
+            errors, covered, took = _observed(observer, start, seed)
+            worst.append(max(errors[20:25]))
+            inside += covered[20:]
+            times += took[2:]
+        facts[name] = {
+            "shape_error_percent": 100.0 * max(worst),
+            "coverage": float(np.mean(inside)),
+            "step_ms": 1e3 * float(np.median(times)),
+        }
+    return Product(facts, {})
+
+
+def _observed(observer: KalmanObserver, start: Any, seed: int) -> tuple[list[float], list[bool], list[float]]:
+    """Return errors of the shape (parts of the length), whether the regions cover the tip, and times (s)."""
+    robot = observer.robot
+    sensor, noise = Sensor(TipPosition(), noise=1.0, seed=seed), TENSION_DEVIATION
+    plant = SimulatedPlant(robot, DT, sensor, control_noise=noise, initial=start)
+    errors, inside, times = [], [], []
+    for control in swinging_tensions():
+        measured = plant.measure()
+        began = clock.perf_counter()
+        observer.update(measured)
+        times.append(clock.perf_counter() - began)
+        found, truth = observer.estimate, plant.state
+        apart = np.asarray(robot.positions(found.y)) - np.asarray(truth.position[-1])
+        errors.append(float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) / float(robot.length))
+        inside.append(observer.covers(truth))
+        plant.apply(control)
+        began = clock.perf_counter()
+        observer.predict(control)
+        times[-1] += clock.perf_counter() - began
+    return errors, inside, times
+
+
+def swinging_tensions(steps: int = 60) -> Float[np.ndarray, "steps 4"]:
+    """Return the tensions (N) of the motions that are observed."""
+    swing = np.sin(np.arange(steps)[:, None] * DT * 4.0 + np.arange(4)) * 0.8
+    return np.asarray(STILL + swing)
+
+
+def smoother(settings: Any) -> Product:
+    """Return the error of the offline smoother, which knows all measured poses of the same motions."""
+    robot = load_robot(NOMINAL)
+    start, places = equilibrium(robot, STILL), places_at(np.array(BODIES), robot.nodes)
+    worst = []
+    for seed in range(settings["runs"]):
+        rng = np.random.default_rng(seed)
+        plant = SimulatedPlant(
+            robot, DT, Sensor(TipPosition(), seed=seed), control_noise=TENSION_DEVIATION, initial=start
+        )
+        controls = swinging_tensions()
+        seen, turned, true = [], [], []
+        for control in controls:
+            y, z = np.asarray(plant.state.y), np.asarray(plant.state.z)
+            seen.append(np.asarray(positions_at(robot, y, places, z))[0])
+            turned.append(np.asarray(quaternions_at(robot, y, places))[0])
+            true.append(np.asarray(plant.state.position[0]))
+            plant.apply(control)
+        position, quaternion = np.array(seen), np.array(turned)
+        measured = Measurements(
+            time=DT * np.arange(len(controls)), tension=controls, fractions=np.array(BODIES),
+            position=position + TipPosition().sigma * rng.normal(size=position.shape),
+            quaternion=quaternion + TURN_NOISE * rng.normal(size=quaternion.shape),
+            measured=np.ones(position.shape[:2], dtype=bool), simulated=True, source="study of control",
+            initial_tension=STILL,
+        )  # fmt: skip
+        apart = np.asarray(estimate_states(measured, robot).position) - np.array(true)
+        errors = np.sqrt(np.mean(np.sum(apart**2, axis=-1), axis=-1)) / float(robot.length)
+        worst.append(max(errors[20:25]))
+    return Product({"shape_error_percent": 100.0 * float(max(worst))}, {})
+
+
+def force(settings: Any) -> Product:
+    """Return the relative error of an unknown force at the tip, from the noisy position of the tip alone."""
+    model = load_robot(NOMINAL).replace(loads=(PointWrench(),))
+    observer = KalmanObserver(model, DT, TipPosition(), adapt=[Adapted("loads.0.force", 0.1)])
+    worst = 0.0
+    for seed in range(settings["runs"]):
+        observer.restart()
+        # the force points elsewhere in each run
+        acting = np.roll(FORCE, seed) * (1 if seed < len(FORCE) else -1)
+        truth = model.replace(**{"loads.0.force": acting})
+        plant = SimulatedPlant(truth, DT, Sensor(TipPosition(), noise=1.0, seed=seed))
+        for control in swinging_tensions(round(FOUND / DT)):
+            observer.update(plant.measure())
+            plant.apply(control)
+            observer.predict(control)
+        found = np.array(list(observer.estimate.parameters.values()))
+        worst = max(worst, float(np.linalg.norm(found - acting) / np.linalg.norm(acting)))
+    return Product({"error": worst}, {})
+
+
+def rest(settings: Any) -> Product:
+    """Return the drift of the adapted stiffness of a robot that is held still, with noise."""
+    model = nominal_robot()
+    controller = predictive(model.replace(youngs_modulus=(1.0 + WRONG) * float(model.youngs_modulus)))
+    still = steps([[0.05, 0.0, np.nan]], 1.0)
+    log = run_loop(
+        controller, SimulatedPlant(model, DT, Sensor(TipPosition(), noise=0.5)), still, settings["seconds"]
+    )
+    modulus = log.parameters["youngs_modulus"] / float(model.youngs_modulus) - 1.0
+    after = log.time > 10.0
+    return Product({"drift_percent": 100.0 * float(np.ptp(modulus[after])), "fallbacks": log.fallbacks}, {})
+
+
+def times(settings: Any) -> Product:
+    """Return times of feedback and of whole cycles, and missed deadlines, in real time."""
+    model = nominal_robot()
+    facts: dict[str, Any] = {}
+    for dt in (0.05, 0.02):
+        controller = predictive(model, dt)
+        plant = SimulatedPlant(model, dt, Sensor(TipPosition(), noise=0.5))
+        log = run_loop(controller, plant, circle(0.1, 4.0), settings["seconds"], paced=True)
+        facts[f"{dt:g}"] = log.summary() | {"periods": len(log.time)}
+    return Product(facts, {})

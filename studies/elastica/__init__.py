@@ -1,0 +1,1 @@
+"""Robots that PyElastica simulates: a stand-in for a real robot."""

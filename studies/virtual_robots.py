@@ -1,0 +1,198 @@
+"""Study of identification on virtual robots with random imperfections, whose truth is known.
+
+Each robot is recorded as the paper's was, with noisy sensors, lost frames and motors with a lag. It is
+identified from three recordings, a residual is learned on it, and both predict two other recordings.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.fit import with_residual
+from knode_cosserat.identification.identify import identify
+from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
+from knode_cosserat.identification.inputs import DT
+from knode_cosserat.identification.result import Identified
+from knode_cosserat.recordings.load import load_recording
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.virtual import record_virtual
+from knode_cosserat.solvers.result import SimulationError
+from studies.report import Report, as_json, write_texts
+from studies.runner import Job, Product, run
+from studies.tables import markdown_table
+
+#: signals of the held-out recordings
+UNSEEN = {"sine_2p0": "sine:2.0", "rand_1": "random:1"}
+#: begin of the part of each recording that is used (s): rest
+START = 0.5
+#: most draws of a robot, and the distance of their seeds
+DRAWS, APART = 5, 1000
+
+
+def jobs(seeds: Sequence[int]) -> list[Job]:
+    """Return one job for each robot."""
+    return [Job(f"robot-{seed}", robot_facts, {"seed": seed}) for seed in seeds]
+
+
+def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
+    """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
+
+    Args:
+        out: the folder.
+        seeds: one for each robot.
+        how: `workers`, `dask`, `progress` as `runner.run` has them.
+    """
+    facts = list(run(jobs(seeds), out, **how).values())
+    texts = {"virtual_robots.md": as_markdown(facts), "virtual_robots.json": as_json(facts)}
+    return Report(facts, write_texts(out, texts), [])
+
+
+def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> list[Measurements]:
+    """Return recordings of a robot, read from bags as any others."""
+    found = []
+    # all parts, also inactive ones: one compiled program serves every robot
+    robot = truth.model.robot(truth.x)
+    with tempfile.TemporaryDirectory() as folder:
+        for k, (name, signal) in enumerate(signals.items()):
+            path = Path(folder) / f"{name}.bag"
+            record_virtual(path, signal, END + 0.5, 100 * seed + k, robot=robot)
+            found.append(load_recording(path).sampled(DT, START, END, mean=True))
+    return found
+
+
+class _Recorded(NamedTuple):
+    """A virtual robot, its training and held-out recordings, and the number of draws before it."""
+
+    truth: Imperfect
+    given: list[Measurements]
+    unseen: list[Measurements]
+    redrawn: int
+
+
+def _recorded(seed: int) -> _Recorded:
+    """Return a robot and its recordings; a robot that collapses under the tensions is drawn again.
+
+    Raises:
+        SimulationError: all draws collapse.
+    """
+    for redrawn in range(DRAWS):
+        truth = drawn_robot(seed + APART * redrawn)
+        try:
+            given = recordings_of(truth, TRAINING, seed)
+            return _Recorded(truth, given, recordings_of(truth, UNSEEN, 1000 + seed), redrawn)
+        except SimulationError:
+            if redrawn == DRAWS - 1:
+                raise
+    raise AssertionError("unreachable")
+
+
+def robot_facts(settings: Any) -> Product:
+    """Return the identification's result for one robot, and its prediction errors."""
+    seed = int(settings["seed"])
+    truth, given, unseen, redrawn = _recorded(seed)
+    found = identify(nominal_robot(), given)
+    learned = with_residual(nominal_robot(), given, found)
+    outcomes = {}
+    for name, each in zip(UNSEEN, unseen, strict=True):
+        before, after = (evaluate(robot, each) for robot in (nominal_robot(), found.robot))
+        last = evaluate(learned.robot, each) if learned.kept else after
+        outcomes[name] = {
+            "nominal": before.to_dict(),
+            "identified": after.to_dict(),
+            "residual": last.to_dict(),
+            "improvement": _gain(before, after),
+        }
+    facts = {
+        "seed": seed,
+        "redrawn": redrawn,
+        "true_effects": list(truth.effects),
+        "true_values": dict(truth.values),
+        "identified": found.to_dict(),
+        "covered": _covered(truth, found),
+        "residual": {"kept": learned.kept, "steps": list(learned.steps)},
+        "unseen": outcomes,
+    }
+    return Product(facts, {})
+
+
+def _gain(before: Evaluation, after: Evaluation) -> float | None:
+    """Return the mean part by which DTW and pose MSE are less; None if a prediction failed."""
+    parts = []
+    for name in ("tip_dtw", "pose_mse"):
+        a, b = getattr(before, name), getattr(after, name)
+        if a is None or b is None:
+            return None
+        parts.append(1.0 - b / a)
+    return float(np.mean(parts))
+
+
+def _covered(truth: Imperfect, found: Identified) -> dict[str, bool]:
+    """Return which intervals hold the true value, by label."""
+    return {
+        each.label: bool(each.interval[0] <= truth.values[each.label] <= each.interval[1])
+        for each in found.estimates
+        if each.label in truth.values
+    }
+
+
+def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
+    """Return the results in Markdown: one row for each robot, and a summary."""
+    rows = []
+    for each in facts:
+        true, have = set(each["true_effects"]), set(each["identified"]["effects"])
+        gains = [outcome["improvement"] for outcome in each["unseen"].values()]
+        inside = list(each["covered"].values())
+        rows.append(
+            [
+                str(each["seed"]),
+                *("failed" if gain is None else f"{100 * gain:.1f} %" for gain in gains),
+                f"{len(true & have)} of {len(true)}",
+                ", ".join(sorted(true - have)) or "none",
+                ", ".join(sorted(have - true)) or "none",
+                f"{sum(inside)} of {len(inside)}",
+            ]
+        )
+    gains = [f"improvement, {name}" for name in UNSEEN]
+    heads = ["seed", *gains, "effects found", "missed", "false", "in interval"]
+    told = summary(facts)
+    lines = [
+        "# Virtual robots with random imperfections",
+        "Simulated recordings with noise. Improvement: mean part by which DTW of the tip and pose MSE are "
+        "less than the nominal robot's, on recordings that were not learned from.",
+        markdown_table(heads, rows),
+        f"Median improvement {100 * told['median_improvement']:.1f} %, least "
+        f"{100 * told['least_improvement']:.1f} %, failed predictions {told['failed']}. "
+        f"False effects {told['false']} of {told['found']} found. Intervals (95 %) hold the true value of "
+        f"{told['covered']} of {told['intervals']} numbers; where the set of effects is right, of "
+        f"{told['covered_right']} of {told['intervals_right']}.",
+    ]
+    return "\n\n".join(lines) + "\n"
+
+
+def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return counts and medians over all robots."""
+    gains = [outcome["improvement"] for each in facts for outcome in each["unseen"].values()]
+    solved = [gain for gain in gains if gain is not None] or [np.nan]
+    found = [(set(each["identified"]["effects"]), set(each["true_effects"])) for each in facts]
+    right = [each for each, (have, true) in zip(facts, found, strict=True) if have == true]
+    inside, inside_right = (
+        [value for each in some for value in each["covered"].values()] for some in (facts, right)
+    )
+    return {
+        "median_improvement": float(np.median(solved)),
+        "least_improvement": float(np.min(solved)),
+        "failed": sum(gain is None for gain in gains),
+        "false": sum(len(have - true) for have, true in found),
+        "found": sum(len(have) for have, _ in found),
+        "missed": sum(len(true - have) for have, true in found),
+        "covered": sum(inside),
+        "intervals": len(inside),
+        "covered_right": sum(inside_right),
+        "intervals_right": len(inside_right),
+    }
