@@ -2,7 +2,7 @@
 
     python -m tools.budget
 
-Each figure has an aim and a ceiling. A figure above its ceiling fails. A ceiling is lowered with the code, and
+Each figure has an aim and a ceiling. A figure above its ceiling fails. Ceilings are lowered with the code,
 never raised.
 """
 
