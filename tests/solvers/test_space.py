@@ -8,8 +8,10 @@ import pytest
 
 import knode_cosserat as kc
 from benchmarks.motions import soft_rod
-from knode_cosserat.solvers.space import SCHEMES
+from knode_cosserat.solvers.settings import schemes
+from knode_cosserat.solvers.space import SpaceScheme
 
+SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 LOBATTO = ("lobatto2", "lobatto4")
 FORMULAS = {
     **{name: SCHEMES[name].formula for name in LOBATTO},
