@@ -12,6 +12,7 @@ import time
 from typing import Any
 
 import numpy as np
+
 from studies.cables.model import DT, CableModel, CableParameters, Grips
 from studies.cables.rollouts import Rollouts
 

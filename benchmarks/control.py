@@ -37,7 +37,6 @@ def costs() -> dict[str, Any]:
     """A prediction over the horizon, and its derivatives by the tangents of the steps and by JAX."""
     import jax
     import numpy as np
-    from studies.control_cases import DT, nominal_robot, predictive
 
     from knode_cosserat.control import circle
     from knode_cosserat.control.prediction import linearised_prediction
@@ -45,6 +44,7 @@ def costs() -> dict[str, Any]:
     from knode_cosserat.estimation.online import Spread, errors_of
     from knode_cosserat.solvers.rollout import rollout
     from knode_cosserat.solvers.run import TimeIntegration
+    from studies.control_cases import DT, nominal_robot, predictive
 
     controller = predictive(nominal_robot())
     observer = controller.observer

@@ -166,7 +166,7 @@ def _segments(rod: Rod, scenario: Scenario, n_elements: int, dt: float | None) -
         usual = _usual_time_step(scenario)
         dt = usual * 2.0 ** math.ceil(math.log2(dt / usual))
         # waves from one time step to the next: EI w_ssss + ρA c0² w = 0
-        rate = max(rate, (mass * SCHEME.coefficients(dt, dt).c0 ** 2 / EI) ** 0.25)
+        rate = max(rate, (mass * SCHEME.coefficients(dt, dt)[0] ** 2 / EI) ** 0.25)
     for motion in filter(None, (rod.start_motion, rod.end_motion)):
         rate = max(rate, float(np.linalg.norm(motion.rotation, axis=1).max()) / rod.length)
     return max(1, math.ceil(rate * rod.length / n_elements / STEEPEST))

@@ -26,11 +26,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from tests.viewer.browser import Browser
 
 import knode_cosserat as kc
 from knode_cosserat.viewer.live import view_live
 from knode_cosserat.viewer.session import Session
+from tests.viewer.browser import Browser
 
 DT = 0.05
 EVENTS = 150

@@ -4,9 +4,9 @@ import json
 
 import pytest
 import typer.testing
-from studies.__main__ import app as studies
 
 from knode_cosserat.cli import app
+from studies.__main__ import app as studies
 
 ROBOT = "delrin-tendon-robot"
 COMMANDS = ("simulate", "equilibrium", "info", "reach", "workspace", "fit", "evaluate", "plot", "animate",

@@ -12,6 +12,7 @@ import sys
 
 import pytest
 from jaxtyping import install_import_hook
+
 from tests import progress
 
 EQUATIONS = ("rotation", "rods.loads", "rods.section", "rods.tendons")

@@ -4,12 +4,12 @@ import os
 import time
 
 import pytest
+
+from knode_cosserat._files.writing import ABANDONED, replacing, temporary_folder
 from tools.attack.cases import MOST_OFF, MOST_RESIDUAL, checked, drawn
 from tools.attack.disk import faults
 from tools.attack.kills import killed, killed_writes
 from tools.attack.samples import samples
-
-from knode_cosserat._files.writing import ABANDONED, replacing, temporary_folder
 
 pytest.importorskip("pyarrow")
 

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
 import knode_cosserat as kc
 from knode_cosserat.evaluation.metrics import dtw_distance
+from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
 # help
 

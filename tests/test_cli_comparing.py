@@ -1,9 +1,9 @@
 """Commands on trajectories that there are: evaluate, plot and animate."""
 
 import pytest
-from tests.commands import ROBOT, run, simulated, succeeded, told
 
 import knode_cosserat as kc
+from tests.commands import ROBOT, run, simulated, succeeded, told
 
 pytestmark = pytest.mark.slow
 

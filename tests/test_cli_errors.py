@@ -4,10 +4,10 @@ import os
 from pathlib import Path
 
 import pytest
-from tests.commands import ROBOT, run
 
 import knode_cosserat as kc
 from knode_cosserat.cli.arguments import require_writable
+from tests.commands import ROBOT, run
 
 
 def bad_inputs():

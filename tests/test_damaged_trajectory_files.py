@@ -8,13 +8,13 @@ import h5py
 import numpy as np
 import pytest
 import xarray
-from tests.trajectories import ROBOTS, Leapfrog, Pendulum, assert_same, fails, synthetic
 
 import knode_cosserat as kc
 from knode_cosserat import trajectory_integrity
 from knode_cosserat.trajectory_file import load_trajectory
 from knode_cosserat.trajectory_integrity import SEAL, seal
 from knode_cosserat.trajectory_system import TrajectoryFileError
+from tests.trajectories import ROBOTS, Leapfrog, Pendulum, assert_same, fails, synthetic
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 import typer
 import typer.testing
-from examples import your_own_robot
-from studies.__main__ import app as studies
 
 import knode_cosserat as kc
+from examples import your_own_robot
 from knode_cosserat.cli import app
 from knode_cosserat.recordings.virtual import record_virtual
+from studies.__main__ import app as studies
 
 ROOT = Path(__file__).parents[1]
 PAGES = {

@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+
 from tools.site import source
 
 ROOT = Path(__file__).parents[1]

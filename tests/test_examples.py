@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
-from tools.pictures import LONG, PICTURES, names
 
 import knode_cosserat as kc
+from tools.pictures import LONG, PICTURES, names
 
 ROOT = Path(__file__).parents[1]
 CAMPAIGN = pytest.mark.campaign

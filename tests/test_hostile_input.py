@@ -13,7 +13,6 @@ import jax
 import numpy as np
 import pytest
 import typer.testing
-from tools.attack import attacked, good_files
 
 import knode_cosserat as kc
 from knode_cosserat._files.writing import ABANDONED, replacing
@@ -22,6 +21,7 @@ from knode_cosserat._numbers import real_array
 from knode_cosserat.cli import app
 from knode_cosserat.cli.output import printable
 from knode_cosserat.viewer.serve import view
+from tools.attack import attacked, good_files
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 TENSIONS = np.full((3, 4), 5.0)

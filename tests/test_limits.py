@@ -7,13 +7,13 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
-from tests.limits import Readers, assert_limited, limit_size
 
 from knode_cosserat import controls, trajectory_integrity
 from knode_cosserat._files import csv_rows, limits, yaml_text
 from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
 from knode_cosserat.envs import policy
+from tests.limits import Readers, assert_limited, limit_size
 
 READERS = Readers()
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
 from benchmarks import matched
 
 ROOT = Path(__file__).parents[1]

@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
-from tests.test_controls import DT, fails, written
 
 import knode_cosserat as kc
 from knode_cosserat import named_controls
+from tests.test_controls import DT, fails, written
 
 ROD = kc.robots.SlenderRod(
     length=0.5, radius=0.005, density=1000.0, youngs_modulus=2e7,

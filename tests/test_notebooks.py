@@ -5,6 +5,7 @@ from base64 import b64decode
 
 import numpy as np
 import pytest
+
 from tools.notebooks import NOTEBOOKS, Cell, cells_of, notebook, run
 
 NAMES = ("first_steps", "learn_what_is_missed", "recording_to_control")

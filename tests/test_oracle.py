@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from benchmarks import paper_transcription as transcription
 
 import knode_cosserat as kc
+from benchmarks import paper_transcription as transcription
 
 DT = 0.05
 #: the transcription needs some 10 ms a step

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
 from scipy.optimize import brentq
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 
 HAND = np.array([0.6, -0.1])
 

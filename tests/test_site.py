@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from tools.site import api, changelog, examples, robot_file, source
 
 from knode_cosserat.rods import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
 from knode_cosserat.solvers.time import BDFAlpha
+from tools.site import api, changelog, examples, robot_file, source
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"

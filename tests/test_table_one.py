@@ -1,9 +1,9 @@
 """The Baseline columns of the paper's Table I: how far an imperfect model is from the true robot."""
 
 import pytest
-from studies.simulation import CONTROLS, DT, IMPERFECTIONS, PUBLISHED, ROBOT, ROWS
 
 import knode_cosserat as kc
+from studies.simulation import CONTROLS, DT, IMPERFECTIONS, PUBLISHED, ROBOT, ROWS
 
 # Self-weight under the step was published from a solve that had not converged, as 1.30 and 0.23; these are
 # the true figures, which the NumPy transcription confirms.

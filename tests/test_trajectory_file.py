@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 import xarray
 from hypothesis import given, settings
-from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, fails, stacked, synthetic
 
 import knode_cosserat as kc
 from knode_cosserat import trajectory_file, trajectory_system
 from knode_cosserat.trajectory_file import load_trajectory, save
+from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, fails, stacked, synthetic
 
 # round trips
 

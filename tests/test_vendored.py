@@ -8,6 +8,7 @@ import shutil
 import tarfile
 
 import pytest
+
 from tools import vendored
 from tools.vendored import CHECKSUMS, FILES, FOLDER, REGISTRY, VendoredError
 

@@ -3,10 +3,10 @@
 from pathlib import Path
 
 import pytest
-from examples import your_own_robot
-from examples.your_own_robot import HERE, main
 
 import knode_cosserat as kc
+from examples import your_own_robot
+from examples.your_own_robot import HERE, main
 
 PAGE = Path(__file__).parents[1] / "docs" / "your-own-robot.md"
 

@@ -11,9 +11,9 @@ import time
 from pathlib import Path
 
 from PIL import Image
-from tests.viewer.browser import Browser
 
 import knode_cosserat as kc
+from tests.viewer.browser import Browser
 
 ROOT = Path(__file__).parents[1]
 IMAGES = ROOT / "docs" / "images"

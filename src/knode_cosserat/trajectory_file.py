@@ -87,7 +87,11 @@ _STATE_PARTS = (
     ("_time_error", ("history_record", "history_used", "history_number"), "errors in time of both states"),
     ("_guess", ("history_guess", "history_point", "history_y"), "y of earlier states, for the first guess"),
     ("_weights", ("history_guess",), "weights of these in the first guess"),
-    ("_time", ("history_time",), "time (s), time step (s; NaN: all states are the same), 1 if rate is known"),
+    (
+        "_time",
+        ("history_time",),
+        "time (s), time step (s; NaN: all states alike), 1 if rate is known, number of different states",
+    ),
 )
 #: comment on each control about its interval; attribute for omitted intermediate rows
 _ACTED = "row i acted from row i - 1 to row i; row 0 before the motion"
@@ -269,7 +273,8 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
         shape = (*rows, *(data.sizes.get(name, 0) for name in _STAGES[1]))
         numbers[_STAGES[0]] = values_of(path, data, _STAGES[0], shape)
     settings, thinned = _settings(path, data), bool(data.attrs.get(_THINNED, 0))
-    states = {attribute: _state(path, data, name) for name, attribute, _ in _STATES}
+    memory = 2 if settings is None else settings.memory
+    states = {attribute: _state(path, data, name, memory) for name, attribute, _ in _STATES}
     require_possible(path, time, numbers, y)
     return Trajectory(system, settings, time, y, z, control, **numbers, **states, thinned=thinned)
 
@@ -277,36 +282,36 @@ def load_trajectory(path: str | Path, *, system: System | None = None) -> Trajec
 def _state_arrays(state: SolverState) -> tuple[np.ndarray, ...]:
     """Return the arrays of a solver's state, in the order of `_STATE_PARTS`."""
     records, rate, y, weights, t0, error, time_error = map(np.asarray, state.history)
-    numbers = [np.nan if state.dt is None else state.dt, float(state.rate_known)]
+    distinct = records.shape[-3] if state.distinct is None else state.distinct
+    numbers = [np.nan if state.dt is None else state.dt, float(state.rate_known), float(distinct)]
     time = np.stack([t0, *(np.full(t0.shape, number) for number in numbers)], axis=-1)
     states = np.concatenate([records, np.expand_dims(rate, -3)], axis=-3)
     return states, error, time_error, y, weights, time
 
 
-def _state(path: Path, data: xarray.Dataset, name: str) -> SolverState | None:
+def _state(path: Path, data: xarray.Dataset, name: str, memory: int) -> SolverState | None:
     """Return a solver's state, if the file has it."""
     if name + _STATE_PARTS[-1][0] not in data.variables:
         return None
     batch = tuple(data.sizes[name] for name in ("batch",) if name in data.sizes)
-    fixed = {"history_state": 3, "history_record": 2, "history_guess": GUESS_STATES, "history_time": 3}
+    fixed = {
+        "history_state": memory + 1,
+        "history_record": memory,
+        "history_guess": GUESS_STATES,
+        "history_time": 4,
+    }
     parts = {
         suffix: values_of(
             path, data, name + suffix, (*batch, *(fixed.get(x, data.sizes.get(x, 0)) for x in along))
         )
         for suffix, along, _ in _STATE_PARTS
-        if suffix != "_time_error" or name + suffix in data.variables
     }
-    states, error, y, weights, time = (
-        parts[suffix] for suffix in ("", "_error", "_guess", "_weights", "_time")
-    )
-    # measured rows and earlier files have no errors in time
-    unknown = np.full((*error.shape[:-3], 2, *error.shape[-2:]), np.nan)
-    t0, dt, known = np.moveaxis(time, -1, 0)
-    history = StateHistory(
-        states[..., :2, :, :], states[..., 2, :, :], y, weights, t0, error, parts.get("_time_error", unknown)
-    )
-    first = float(np.ravel(dt)[0]) if dt.size else np.nan
-    return SolverState(history, None if np.isnan(first) else first, bool(np.all(known)))
+    states, error, time_error, y, weights, time = parts.values()
+    t0, dt, known, distinct = np.moveaxis(time, -1, 0)
+    history = StateHistory(states[..., :-1, :, :], states[..., -1, :, :], y, weights, t0, error, time_error)
+    first, count = (float(np.ravel(x)[0]) if x.size else np.nan for x in (dt, distinct))
+    partly = None if np.isnan(count) or count == memory else int(count)
+    return SolverState(history, None if np.isnan(first) else first, bool(np.all(known)), partly)
 
 
 def _opened(file: Any) -> xarray.Dataset:

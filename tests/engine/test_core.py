@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.engine.networks import with_committee, with_network
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops, pattern
@@ -34,10 +33,12 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
 from knode_cosserat.solvers.recovery import attempt
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SCHEMES, Formula, SpaceScheme, Stage
+from knode_cosserat.solvers.settings import Settings, schemes
+from knode_cosserat.solvers.space import Formula, SpaceScheme, Stage
 from knode_cosserat.solvers.steps import StepCoefficients, TimeStep
+from tests.engine.networks import with_committee, with_network
 
+SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 DT, STEPS = 0.05, 25
 PAPER, ROUTED, LEGS = "delrin-tendon-robot", "delrin-routed-tendon-robot", "six-legged-robot"
 
@@ -199,7 +200,7 @@ def standing_history(robot, settings):
     _, y, _ = loops.static_one(robot, Settings(None, settings.space), control[None], y, (0, 1))
     none = no_history(robot, settings.space)
     found = loops.evaluator(robot, settings)(0.0, 0.0, control, none, y)
-    return repeated_record_history(robot, settings.space, found.records, found.y, 0.0)
+    return repeated_record_history(robot, settings, found.records, found.y, 0.0)
 
 
 #: robots, controls, schemes in time and along the rod, and the accuracy of estimates

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.engine.test_core import Stretching, standing_history
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
@@ -17,6 +16,7 @@ from knode_cosserat.solvers.history import history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.steps import StepCoefficients
+from tests.engine.test_core import Stretching, standing_history
 
 DT = 0.05
 PAPER, ROUTED, LEGS = "delrin-tendon-robot", "delrin-routed-tendon-robot", "six-legged-robot"

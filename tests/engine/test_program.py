@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.special
-from examples.hanging_string import HangingString
-from tests.engine.networks import PAPER, with_committee, with_network
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.engine.program import FOLDED, EngineError, Program
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import passive
@@ -24,6 +23,7 @@ from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.system import unknown_count
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import LOBATTO2
+from tests.engine.networks import PAPER, with_committee, with_network
 
 #: operations on arrays that are not those of `FOLDED`
 OF_ARRAYS = {

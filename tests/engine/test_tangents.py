@@ -7,9 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.engine.networks import with_committee, with_network
-from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
-from tests.engine.test_program import with_curved_law
 
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
@@ -27,6 +24,9 @@ from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangen
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2
 from knode_cosserat.solvers.steps import StepCoefficients
+from tests.engine.networks import with_committee, with_network
+from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
+from tests.engine.test_program import with_curved_law
 
 DT, STEPS, COLUMNS = 0.05, 6, 11
 PAPER, ROUTED, CURVED = "delrin-tendon-robot", "delrin-routed-tendon-robot", "variable-curvature-robot"

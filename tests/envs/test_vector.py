@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode
-from tests.envs.conftest import STEPS
 
 from knode_cosserat import envs
 from knode_cosserat.control.loop import _COMPILATIONS
+from tests.envs.conftest import STEPS
 
 
 def again(vector, mode):

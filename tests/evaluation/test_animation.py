@@ -4,10 +4,10 @@ import sys
 
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
 from PIL import Image
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 
 pytestmark = pytest.mark.filterwarnings("error")
 

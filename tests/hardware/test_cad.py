@@ -13,7 +13,6 @@ import hypothesis
 import numpy as np
 import pytest
 from hypothesis import strategies as st
-from tests.commands import run, succeeded, told
 
 import knode_cosserat as kc
 from knode_cosserat.rods.robot_file import format_robot
@@ -21,6 +20,7 @@ from knode_cosserat_hardware import Dimensions, HardwareDescription, Limits
 from knode_cosserat_hardware.cad import PartError, bill_of_materials, export_parts, load_dimensions
 from knode_cosserat_hardware.cad.dimensions import BOARD_LIMIT, capacity, part_dimensions
 from knode_cosserat_hardware.cad.materials import materials_table
+from tests.commands import run, succeeded, told
 
 ROOT = Path(__file__).parents[2]
 ROBOT = kc.load_robot("delrin-routed-tendon-robot")

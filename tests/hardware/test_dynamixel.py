@@ -6,11 +6,11 @@ import time
 
 import numpy as np
 import pytest
-from tests.hardware.fake_dynamixel import SYNC_READ, FakeDynamixel, crc, packet
 
 from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat_hardware.dynamixel import CURRENT, DynamixelRobot, Register
 from knode_cosserat_hardware.motor_robot import MotorReel
+from tests.hardware.fake_dynamixel import SYNC_READ, FakeDynamixel, crc, packet
 
 pytest.importorskip("dynamixel_sdk")
 IDS = (11, 12, 13, 14)

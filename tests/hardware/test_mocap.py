@@ -11,7 +11,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from tests.hardware.vrpn_server import VRPNServer
 
 import knode_cosserat as kc
 from knode_cosserat_hardware.driver import HardwareError
@@ -25,6 +24,7 @@ from knode_cosserat_hardware.middleware.natnet import (
     parse_server_info,
 )
 from knode_cosserat_hardware.simulated import SimulatedRobot
+from tests.hardware.vrpn_server import VRPNServer
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2)]
 #: identity, position, quaternion (scalar last), tracked

@@ -7,11 +7,11 @@ import time
 from pathlib import Path
 
 import pytest
-from tests.hardware import test_ros1
-from tests.hardware.test_ros1 import RosBag, equal, ros
 
 from knode_cosserat.recordings import load_recording
 from knode_cosserat_hardware.emulation import missing
+from tests.hardware import test_ros1
+from tests.hardware.test_ros1 import RosBag, equal, ros
 
 pytestmark = [
     pytest.mark.campaign,

@@ -10,12 +10,12 @@ import time
 
 import numpy as np
 import pytest
-from tests.recordings.made import PAPER, made
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
 from knode_cosserat_hardware.driver import DriverState, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
 from knode_cosserat_hardware.recorder import BagStream, Recorder, record_robot
+from tests.recordings.made import PAPER, made
 
 pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'knode-cosserat[ros]'")
 

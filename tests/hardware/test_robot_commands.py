@@ -10,8 +10,6 @@ import time
 
 import numpy as np
 import pytest
-from tests.commands import run
-from tests.hardware.fake_board import FakeBoard
 
 import knode_cosserat as kc
 from knode_cosserat_hardware.cli import motion, options
@@ -20,6 +18,8 @@ from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
 from knode_cosserat_hardware.open_driver import open_driver
 from knode_cosserat_hardware.simulated import SimulatedRobot
+from tests.commands import run
+from tests.hardware.fake_board import FakeBoard
 
 pytestmark = pytest.mark.slow
 

@@ -7,13 +7,13 @@ import time
 
 import numpy as np
 import pytest
-from tests.hardware.fake_board import FakeBoard
 
 from knode_cosserat_hardware.board_link import SerialTransport
 from knode_cosserat_hardware.driver import FAULTS, DriverState, HardwareError, Limits, fault_message
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.serial_board import SerialBoard
+from tests.hardware.fake_board import FakeBoard
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.identification.recorded import DT, measured, tensions
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import coverage, evaluate
@@ -16,6 +15,7 @@ from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.rods.routing import Polynomial
+from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
     length=0.5, radius=0.003, density=1200.0, youngs_modulus=2.0e9, tendon_offset=0.025,

@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.identification.recorded import DT, measured, tensions
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
@@ -17,6 +16,7 @@ from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.section import Sleeve, Stretch
 from knode_cosserat.rods.tendon_friction import TendonFriction
+from tests.identification.recorded import DT, measured, tensions
 
 #: as ruler, scale and data sheet have it: lying along z, with gravity across
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(

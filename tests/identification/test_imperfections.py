@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from studies import virtual_robots
 from typer.testing import CliRunner
 
 import knode_cosserat as kc
@@ -10,6 +9,7 @@ from knode_cosserat.identification.imperfections import SIZES, imperfect_robot
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.virtual import record_virtual
 from knode_cosserat.rods.parameters import ParameterError
+from studies import virtual_robots
 
 TENSION = np.array([[4.9, 4.9, 4.9, 4.9], [7.8, 4.9, 2.0, 4.9], [11.0, 6.0, 9.0, 8.0]])
 NOMINAL = kc.load_robot("delrin-tendon-robot")

@@ -4,13 +4,13 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.identification.recorded import measured, tensions
-from tests.identification.test_identify import NOMINAL, TRUE
 
 import knode_cosserat as kc
 from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Rollout
 from knode_cosserat.identification.search import Search, SearchError
+from tests.identification.recorded import measured, tensions
+from tests.identification.test_identify import NOMINAL, TRUE
 
 ROWS, BODIES = 60, 2
 

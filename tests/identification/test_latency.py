@@ -4,13 +4,13 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.identification.recorded import DT, measured, tensions
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.misfit import Misfit, data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.rods.load_cells import LoadCells
+from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
     length=0.5, radius=0.003, density=1200.0, youngs_modulus=2.0e9, tendon_offset=0.025, nodes=6

@@ -7,7 +7,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
-from tests.identification.recorded import measured, tensions
 
 import knode_cosserat as kc
 from knode_cosserat.identification.misfit import Misfit, data_of
@@ -21,6 +20,7 @@ from knode_cosserat.identification.steps import (
     time_scheme,
 )
 from knode_cosserat.solvers.time import BDF2, SDIRK2
+from tests.identification.recorded import measured, tensions
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 

@@ -5,7 +5,6 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, pulled
 
 import knode_cosserat as kc
 from knode_cosserat.engine import pattern
@@ -13,6 +12,7 @@ from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, without_range
+from tests.learning.bar import BAR, WRONG, pulled
 
 PAPER = {"time": "bdf2", "start": "paper"}
 SMALL = FitConfig.network(hidden=5, epochs=300)

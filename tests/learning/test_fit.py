@@ -11,7 +11,6 @@ import struct
 import jax
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, pulled
 
 import knode_cosserat as kc
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
@@ -22,6 +21,7 @@ from knode_cosserat.learning.training.checkpoint import data_hash
 from knode_cosserat.learning.training.progress import WatchError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.rods.wrapped import Wrapped
+from tests.learning.bar import BAR, WRONG, pulled
 
 #: the package has its function under the same name
 module = importlib.import_module("knode_cosserat.learning.fit")

@@ -5,10 +5,10 @@ import warnings
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 import knode_cosserat as kc
 from knode_cosserat.learning.gain import rollout_errors
+from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 
 class Breaking(Bar):

@@ -9,7 +9,6 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from studies.recordings import _paper_motion
 
 import knode_cosserat as kc
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, Training
@@ -18,6 +17,7 @@ from knode_cosserat.learning.residual import network
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
+from studies.recordings import _paper_motion
 
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5)
 TENSION = np.array([5.0, 5.0, 5.2, 5.4])

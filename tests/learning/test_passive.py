@@ -3,11 +3,11 @@
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point

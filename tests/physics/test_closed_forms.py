@@ -6,9 +6,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from benchmarks.closed_forms import COLUMN, ELASTICA, elastica, helix
 
 import knode_cosserat as kc
+from benchmarks.closed_forms import COLUMN, ELASTICA, elastica, helix
 
 LENGTH, RADIUS, YOUNGS_MODULUS, DENSITY = 0.5, 0.004, 3e9, 1200.0
 AREA, EI = np.pi * RADIUS**2, YOUNGS_MODULUS * np.pi * RADIUS**4 / 4

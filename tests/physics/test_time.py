@@ -3,10 +3,10 @@
 import hypothesis.strategies as st
 import numpy as np
 import pytest
-from benchmarks import closed_forms
 from hypothesis import given
 
 import knode_cosserat as kc
+from benchmarks import closed_forms
 from knode_cosserat.solvers.history import coefficient_table
 from knode_cosserat.solvers.settings import Settings
 

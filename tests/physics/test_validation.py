@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+
 from benchmarks import beams, closed_forms, motions
 
 GRID = (20, 40)

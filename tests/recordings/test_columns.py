@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.commands import run, succeeded
-from tests.recordings.formats import exported
 
 from knode_cosserat.recordings import (
     ColumnMap,
@@ -18,6 +16,8 @@ from knode_cosserat.recordings import (
     load_recording,
     proposed_config,
 )
+from tests.commands import run, succeeded
+from tests.recordings.formats import exported
 
 TIME = exported.times(50.0)
 POSITION, ROTATION = exported.bent(TIME)

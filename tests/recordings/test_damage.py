@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from rosbags import rosbag1
 from rosbags.highlevel import AnyReader
-from tests.recordings.made import PAPER, made, write
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, RecordingError
+from tests.recordings.made import PAPER, made, write
 
 #: two seconds to end up in chunks of their own
 CHUNK = 60_000

@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import RecordingConfig, RecordingError, TensionSource
 

@@ -6,15 +6,15 @@ import pickle
 import numpy as np
 import pandas as pd
 import pytest
-from studies.beam_recordings import read_beam
-from studies.cables import pickles
-from studies.cables import recordings as cables
-from tests.limits import Readers, assert_limited, limit_size
 
 from knode_cosserat._files import csv_rows, parquet_file
 from knode_cosserat.recordings import content, load, recording
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.formats import parquet
+from studies.beam_recordings import read_beam
+from studies.cables import pickles
+from studies.cables import recordings as cables
+from tests.limits import Readers, assert_limited, limit_size
 
 READERS = Readers()
 ROWS = "".join(f"{k / 20},5,0.1,0,{0.4 + k / 1e3}\n" for k in range(20))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import typer.testing
 from scipy.spatial.transform import Rotation
-from tests.recordings.made import LAG, PAPER, changed, made, write
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
@@ -14,6 +13,7 @@ from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.recordings.frame import leans_of, rod_lengths
 from knode_cosserat.recordings.recording import Body
 from knode_cosserat.recordings.write import MocapPoses, Pulls
+from tests.recordings.made import LAG, PAPER, changed, made, write
 
 NOISE = 2e-4
 

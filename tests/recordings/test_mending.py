@@ -5,11 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import MarkerSource, RecordingConfig, TensionSource, cleaning
 from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
 TIP = "/vicon/continuum_3/pose"
 CUBE = Rotation.create_group("O")

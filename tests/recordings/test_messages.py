@@ -4,8 +4,6 @@ import math
 
 import numpy as np
 import pytest
-from tests.commands import succeeded
-from tests.recordings.formats.exported import bent, times
 
 from knode_cosserat.recordings import (
     CommandSource,
@@ -18,6 +16,8 @@ from knode_cosserat.recordings import (
     proposed_config,
 )
 from knode_cosserat.recordings.messages import typestore
+from tests.commands import succeeded
+from tests.recordings.formats.exported import bent, times
 
 rosbag1 = pytest.importorskip("rosbags.rosbag1")
 rosbag2 = pytest.importorskip("rosbags.rosbag2")

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.recordings.formats.exported import bent, times
-from tests.recordings.made import PAPER, made, write
 
 from knode_cosserat.recordings import load_example, load_recording
+from tests.recordings.formats.exported import bent, times
+from tests.recordings.made import PAPER, made, write
 
 TIME = times()
 #: what is written under the titles of w, x, y, z

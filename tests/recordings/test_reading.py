@@ -7,7 +7,6 @@ import pytest
 from rosbags import rosbag1, rosbag2
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
-from tests.recordings.made import LAG, PAPER, SMALL, changed, moved, write
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import (
@@ -19,6 +18,7 @@ from knode_cosserat.recordings import (
     messages,
 )
 from knode_cosserat.recordings.write import FORMATS, MocapPoses, Pulls, write_recording
+from tests.recordings.made import LAG, PAPER, SMALL, changed, moved, write
 
 
 def turned_by(quaternion, rotation):

@@ -4,7 +4,6 @@ import dataclasses
 import sys
 
 import pytest
-from tests.recordings.made import PAPER, changed, write
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import (
@@ -15,6 +14,7 @@ from knode_cosserat.recordings import (
     messages,
 )
 from knode_cosserat.recordings.write import FORMATS, Pulls, write_recording
+from tests.recordings.made import PAPER, changed, write
 
 
 def refused(path, config=None):

@@ -4,11 +4,11 @@ import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.rods import rucker_webster as oracle
 
 import knode_cosserat as kc
 from knode_cosserat.rods.routing import Helical, Polynomial, Straight, Tapered
 from knode_cosserat.rods.tendon_friction import TendonFriction
+from tests.rods import rucker_webster as oracle
 
 DELRIN = kc.load_robot("delrin-tendon-robot")
 L = 0.635

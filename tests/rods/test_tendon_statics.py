@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 from scipy.optimize import root
-from tests.rods import rucker_webster as oracle
 
 import knode_cosserat as kc
 from knode_cosserat.rods.routing import FunctionRouting, Helical, Polynomial, Straight, Tapered, ends, routes
 from knode_cosserat.rods.tendon_law import tendon_strains
+from tests.rods import rucker_webster as oracle
 
 DELRIN = kc.load_robot("delrin-tendon-robot")
 L = 0.635

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.learning.test_systems import DT, SYSTEMS
-from tests.solvers.test_derivatives import numerically
 
 import knode_cosserat as kc
+from tests.learning.test_systems import DT, SYSTEMS
+from tests.solvers.test_derivatives import numerically
 
 STEPS = 12
 

@@ -12,9 +12,10 @@ import knode_cosserat as kc
 from knode_cosserat.solvers.grid import Grid, at_places, grid_of, taken
 from knode_cosserat.solvers.history import constant_history, rest_record
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SCHEMES
+from knode_cosserat.solvers.settings import Settings, schemes
+from knode_cosserat.solvers.space import SpaceScheme
 
+SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 CUTS = st.lists(st.floats(1e-3, 1.0 - 1e-3), min_size=1, max_size=8, unique=True)
 #: of a scheme with two stages between the ends of a piece
 STAGES = (0.25, 0.5)

@@ -11,7 +11,6 @@ import collections
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.solvers.test_random_cases import Case, worst_result
 
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Driven, Pinned
@@ -19,6 +18,7 @@ from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWren
 from knode_cosserat.rods.routing import Helical, Polynomial, Straight, Tapered
 from knode_cosserat.rods.surroundings import Cylinder, Plane, Sphere
 from knode_cosserat.rods.tendon_friction import TendonFriction
+from tests.solvers.test_random_cases import Case, worst_result
 
 STEPS = 40
 SOME = 4

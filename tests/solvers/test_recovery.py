@@ -5,7 +5,6 @@ import time
 
 import numpy as np
 import pytest
-from tests.trajectories import HOPELESS
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.history import resting_history
@@ -13,6 +12,7 @@ from knode_cosserat.solvers.recovery import Budget, BudgetError
 from knode_cosserat.solvers.recovery_methods import StepRecovery
 from knode_cosserat.solvers.settings import MEASURED
 from knode_cosserat.solvers.steps import TimeStep
+from tests.trajectories import HOPELESS
 
 DT = 0.05
 

@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.trajectories import HOPELESS, synthetic
 
 import knode_cosserat as kc
 from knode_cosserat.rods.surroundings import Plane
@@ -16,6 +15,7 @@ from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import advanced, history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.settings import Settings
+from tests.trajectories import HOPELESS, synthetic
 
 DT = 0.05
 

@@ -5,11 +5,13 @@ import itertools
 
 import numpy as np
 import pytest
-from benchmarks.motions import soft_rod
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.space import SCHEMES
+from benchmarks.motions import soft_rod
+from knode_cosserat.solvers.settings import schemes
+from knode_cosserat.solvers.space import SpaceScheme
 
+SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 LOBATTO = ("lobatto2", "lobatto4")
 FORMULAS = {
     **{name: SCHEMES[name].formula for name in LOBATTO},

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from tests.trajectories import synthetic
 
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Free, Pinned
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from tests.trajectories import synthetic
 
 L, RADIUS, E = 0.5, 2e-3, 2e9
 EI, EA = E * np.pi * RADIUS**4 / 4, E * np.pi * RADIUS**2

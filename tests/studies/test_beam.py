@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+
+from knode_cosserat.recordings.findings import RecordingError
 from studies import beam
 from studies.beam_model import (
     NOMINAL,
@@ -23,8 +25,6 @@ from studies.beam_model import (
 )
 from studies.beam_recordings import THRESHOLD, find_release, load_of, read_beam, tip_drop
 from tests.commands import run_study
-
-from knode_cosserat.recordings.findings import RecordingError
 
 FOLDER = Path(__file__).parents[1] / "files" / "beam"
 HELD_OUT = "beam_load52_V2_b"

@@ -10,10 +10,10 @@ import struct
 
 import numpy as np
 import pytest
-from studies.cables.pickles import read_pickled_array
-from studies.cables.recordings import as_markers, load_cables
 
 from knode_cosserat.recordings import RecordingError
+from studies.cables.pickles import read_pickled_array
+from studies.cables.recordings import as_markers, load_cables
 
 MARKERS = np.random.default_rng(0).normal(size=(20, 7, 3))
 

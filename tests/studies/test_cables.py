@@ -7,6 +7,9 @@ import pickle
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
+
+from knode_cosserat.solvers.simulate import simulate
 from studies.__main__ import app
 from studies.cables import frames, study
 from studies.cables.correction import learned_correction
@@ -24,9 +27,6 @@ from studies.cables.rollouts import (
 )
 from studies.cables.shapes import CableGrid, Fitter
 from studies.cables.study import CableResult, as_markdown
-from typer.testing import CliRunner
-
-from knode_cosserat.solvers.simulate import simulate
 
 SPACE, NODES = "lobatto2", 9
 TRUE = CableParameters(

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+
 from tests.commands import ROBOT, run_study
 
 ROOT = Path(__file__).parents[2]

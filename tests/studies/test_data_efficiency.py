@@ -6,13 +6,13 @@ import re
 
 import numpy as np
 import pytest
-from studies import comparisons, data_efficiency, simulation
-from studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
-from studies.data_efficiency import as_markdown, figure, rerun
 
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.solvers.settings import Settings
+from studies import comparisons, data_efficiency, simulation
+from studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
+from studies.data_efficiency import as_markdown, figure, rerun
 
 pydmd = pytest.mark.skipif(importlib.util.find_spec("pydmd") is None, reason="needs PyDMD")
 matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")

@@ -5,9 +5,8 @@ import pytest
 
 pytest.importorskip("gymnasium", reason="needs gymnasium: pip install 'knode-cosserat[rl]'")
 
-from studies import environments
-
 from knode_cosserat import envs
+from studies import environments
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """The measurement of sweeps gives figures, and finds interrupted sweeps equal."""
 
 import pytest
+
 from studies.environments_sweep import measure_sweep
 
 

@@ -4,10 +4,10 @@ import importlib.util
 import json
 
 import pytest
-from studies import estimation
-from tests.commands import run, run_study
 
 import knode_cosserat as kc
+from studies import estimation
+from tests.commands import run, run_study
 
 matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")
 

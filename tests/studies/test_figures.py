@@ -3,10 +3,10 @@ import io
 
 import numpy as np
 import pytest
-from studies import figures
 
 import knode_cosserat as kc
 from knode_cosserat.evaluation.comparison import comparison
+from studies import figures
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw
 pytestmark = pytest.mark.filterwarnings("error")

@@ -4,11 +4,11 @@ import os
 
 import numpy as np
 import pytest
+
+from knode_cosserat_hardware.emulation import missing
 from studies import hardware
 from studies.hardware_rig import Cable
 from studies.runner import Job, Product
-
-from knode_cosserat_hardware.emulation import missing
 
 FACTS = {
     "build": {"seconds": 5.0, "flash": 20_000, "ram": 1800},

@@ -5,10 +5,6 @@ import json
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from studies import recordings as study
-from studies.__main__ import app
-from studies.recordings_report import repetitions, table_of
-from studies.runner import StudyError
 from typer.testing import CliRunner
 
 import knode_cosserat as kc
@@ -18,6 +14,10 @@ from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.solvers.result import Result, SimulationError
+from studies import recordings as study
+from studies.__main__ import app
+from studies.recordings_report import repetitions, table_of
+from studies.runner import StudyError
 
 PAPER = RecordingConfig.paper_robot()
 DT = 0.01

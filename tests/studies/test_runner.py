@@ -8,12 +8,12 @@ import time
 from pathlib import Path
 
 import pytest
-import studies
-from studies import runner
-from studies.runner import Job, StudyError, run
 
 import knode_cosserat as kc
+import studies
 from knode_cosserat import _processes
+from studies import runner
+from studies.runner import Job, StudyError, run
 
 #: jobs have to be in a module that other processes can import
 MODULE = """

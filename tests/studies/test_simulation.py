@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer.testing
+
+import knode_cosserat as kc
+from knode_cosserat.learning.files.model_file import load_model
 from studies import methods, simulation
 from studies.__main__ import app
 from studies.simulation import cells_of, rerun
 from studies.tables import MEASURES, spreads
-
-import knode_cosserat as kc
-from knode_cosserat.learning.files.model_file import load_model
 
 KEYS = {"imperfection", "control", "method", "seed", "tip_dtw", "pose_mse"}
 TABLES = ("table1.json", "table1.csv", "table1.md")

@@ -3,6 +3,7 @@ import io
 import statistics
 
 import pytest
+
 from studies.tables import (
     Cell,
     Published,

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.sweeps.small_sweep import content, described
 
 from knode_cosserat.sweeps import Local, SweepError, load_sweep, run_sweep
 from knode_cosserat.sweeps.shard_file import KEY, METADATA_CHECKSUM, read_shard, require_pyarrow
+from tests.sweeps.small_sweep import content, described
 
 ROOT = Path(__file__).parents[2]
 

@@ -4,12 +4,12 @@ import json
 
 import numpy as np
 import pytest
-from tests.limits import Readers, assert_limited, limit_size
 
 from knode_cosserat._files import parquet_file
 from knode_cosserat.sweeps import manifest as manifests
 from knode_cosserat.sweeps.errors import SweepError
 from knode_cosserat.sweeps.shard_file import KEY, checksum, read_about, read_shard, shard_bytes
+from tests.limits import Readers, assert_limited, limit_size
 
 pyarrow = pytest.importorskip("pyarrow")
 pyarrow_parquet = pytest.importorskip("pyarrow.parquet")

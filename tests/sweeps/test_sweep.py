@@ -13,13 +13,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tests.commands import run, succeeded, told
-from tests.sweeps.small_sweep import ROBOT, content, described
 
 import knode_cosserat as kc
 from knode_cosserat.sweeps import Dask, Local, Plan, Slurm, Sweep, SweepError, load_sweep, run_sweep
 from knode_cosserat.sweeps.shard_file import require_pyarrow, shard_bytes
 from knode_cosserat.sweeps.work import ShardJob, Work
+from tests.commands import run, succeeded, told
+from tests.sweeps.small_sweep import ROBOT, content, described
 
 ROOT = Path(__file__).parents[2]
 

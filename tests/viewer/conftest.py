@@ -5,6 +5,7 @@ Imported within fixtures: see `tests/recordings/conftest.py`.
 
 import numpy as np
 import pytest
+
 from tests.viewer import browser as driver
 
 DT = 0.05

@@ -13,8 +13,6 @@ import time
 import numpy as np
 import pandas as pd
 import pytest
-from tests.commands import run
-from tests.viewer.connection import Connection, numbers
 
 import knode_cosserat as kc
 from knode_cosserat.control import ControlLimits, PredictiveController, Sensor, SimulatedPlant, SoftLimit
@@ -23,6 +21,8 @@ from knode_cosserat.estimation import KalmanObserver, TipPose, TipPosition
 from knode_cosserat.viewer.closed_loop import loop_page
 from knode_cosserat.viewer.loop_session import FollowedTarget, LoopSession
 from knode_cosserat.viewer.record import STATUSES
+from tests.commands import run
+from tests.viewer.connection import Connection, numbers
 
 pytestmark = pytest.mark.slow
 

@@ -10,7 +10,6 @@ import urllib.request
 
 import numpy as np
 import pytest
-from tests.viewer.connection import Connection, numbers
 
 import knode_cosserat as kc
 from knode_cosserat.viewer import view_live
@@ -18,6 +17,7 @@ from knode_cosserat.viewer.connection import MOST_PER_SECOND
 from knode_cosserat.viewer.live import require_websockets, usual_step
 from knode_cosserat.viewer.page_server import MOST_PAGES
 from knode_cosserat.viewer.session import Session
+from tests.viewer.connection import Connection, numbers
 
 websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")
 DT = 0.05

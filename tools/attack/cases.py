@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from benchmarks.paper_transcription import PaperRobot, SemiDiscreteRod
-from tools.attack.table import Row, printed_row
 
 import knode_cosserat as kc
+from benchmarks.paper_transcription import PaperRobot, SemiDiscreteRod
+from tools.attack.table import Row, printed_row
 
 STEPS, NODES = 20, (10, 19)
 #: largest independent residual, without units, and largest difference to the finer grid (of the length):

@@ -20,10 +20,9 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from knode_cosserat.errors import KnodeCosseratError
 from tools.attack.samples import samples
 from tools.attack.table import Row, printed_row
-
-from knode_cosserat.errors import KnodeCosseratError
 
 
 @contextmanager

@@ -17,10 +17,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tools.attack.samples import fingerprint, samples
-
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.trajectory_integrity import SEAL
+from tools.attack.samples import fingerprint, samples
 
 #: longest time that a file may take (s)
 PATIENCE = 5.0

@@ -22,6 +22,7 @@ import sys
 import time
 
 import numpy as np
+
 from tools.attack.table import Row, printed_row
 
 PAGES, EVENTS, ALLOWED = 1_000, 10_000.0, 0.1

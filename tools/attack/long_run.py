@@ -17,9 +17,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from tools.attack.table import Row, printed_row
 
 import knode_cosserat as kc
+from tools.attack.table import Row, printed_row
 
 #: most memory maps, three quarters of Linux's limit, and most memory (MB) of a long run
 MOST_MAPS, MOST_MEGABYTES = 49_000, 6_000

@@ -15,9 +15,9 @@ from typing import Any
 
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
-from tools.site import api, changelog, equations, examples, notebooks, robot_file, source
 
 import knode_cosserat as kc
+from tools.site import api, changelog, equations, examples, notebooks, robot_file, source
 
 #: pages that others write: without them the site is whole
 OPTIONAL = ("viewer.md", "notebooks.md")

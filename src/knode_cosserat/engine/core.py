@@ -83,11 +83,11 @@ class Core(EliminationCode):
         self.options = a(len(dataclasses.fields(NewtonOptions)))
         self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
         self.trial_unknowns, self.direction_unknowns = a(k), a(k)
-        # the motion: records of two states and their rate, states for the first guess, errors of the records
-        first = self._size
-        self.records, self.rate = [a(numbers, self.count) for _ in range(2)], a(numbers, self.count)
+        # the motion: records of earlier states and their rate, states for the first guess, errors of records
+        first, memory = self._size, range(settings.memory)
+        self.records, self.rate = [a(numbers, self.count) for _ in memory], a(numbers, self.count)
         self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3), a(1)
-        self.errors, self.time_errors = ([a(numbers, self.used) for _ in range(2)] for _ in range(2))
+        self.errors, self.time_errors = ([a(numbers, self.used) for _ in memory] for _ in range(2))
         self.error_rate = a(numbers, self.used)
         #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
         self._motion = slice(first, self._size)
@@ -383,9 +383,7 @@ class Core(EliminationCode):
             turns.set(turns.get() + 1.0)
         off, angle = self._errors_of_poses()
         known = self._spread(f.select(off <= self._get(self.length, 0), 1.0, float("nan")))
-        with self._places(self.used) as j:
-            for i in range(errors[0].size):
-                self._write_wide(self._wide(errors[0], i, j), errors[1], i, j)
+        self._write_shift(errors, self.used)
         for i, j, value in self._numbers_of(self._evaluated_at(self.better), self.used):
             self._write_wide((value - self._wide(self.records[0], i, j)) * known, errors[0], i, j)
         f.store(f.select(off <= self._get(self.length, 0), off, float("nan")), numbers, number * self.P)
@@ -459,16 +457,17 @@ class Core(EliminationCode):
         assert isinstance(scheme, SDIRK2)
         self.time_history = f = self._function("time_history", "coefficients")
         memory, coefficients = f.arguments
-        c0, c1, c2 = (f.load(coefficients, i) for i in range(3))
+        c0, *earlier = (f.load(coefficients, i) for i in range(self.settings.memory + 1))
 
         def carried(i: int, j: Index) -> Value:
-            newest, older = (self._wide(error, i, j) for error in self.time_errors)
-            return c1 * newest + c2 * older
+            return _sum(
+                c * self._wide(error, i, j) for c, error in zip(earlier, self.time_errors, strict=True)
+            )
 
         with self._places(self.used) as j:
             for i in range(e.numbers):
                 self._write_wide(carried(i, j), self.time_dH, i, j)
-        with f.if_(f.compare("ne", c2, 0.0)):
+        with f.if_(f.compare("ne", earlier[1], 0.0)):
             # the difference of the rates at both stages, and its product with the equations' derivatives
             with self._places(self.used) as j:
                 for i in range(e.numbers):
@@ -555,9 +554,7 @@ class Core(EliminationCode):
                 rate = value + self._wide(self.H, i, j) * of_rate
                 step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
                 self._write_wide(rate - step, self.difference, i, j)
-        with self._places(self.count) as j:
-            for i in range(e.numbers):
-                self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
+        self._write_shift(self.records, self.count)
         for i, j, value in self._numbers_of(newest, self.count):
             self._write_wide(value, self.records[0], i, j)
         if self.settings.uses_rate:
@@ -565,6 +562,13 @@ class Core(EliminationCode):
                 for i in range(e.numbers):
                     value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
                     self._write_wide(value, self.rate, i, j)
+
+    def _write_shift(self, states: list[Array], count: int) -> None:
+        """Shift earlier states by one step."""
+        for newer, older in reversed(list(itertools.pairwise(states))):
+            with self._places(count) as j:
+                for i in range(newer.size):
+                    self._write_wide(self._wide(newer, i, j), older, i, j)
 
     # the time loop
 
@@ -589,7 +593,7 @@ class Core(EliminationCode):
         with f.while_(going):
             with f.loop(stages) as stage:
                 number = step.get() * stages + stage.value
-                table = f.pointer(coefficients, number * 5)
+                table = f.pointer(coefficients, number * (self.settings.memory + 3))
                 f.call(self.stage, memory, numbers, table, f.pointer(controls, number * (e.nc * P)))
                 if self.scheme:
                     f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
@@ -614,13 +618,15 @@ class Core(EliminationCode):
         e, P = self.equations, self.P
         self.stage = f = self._function("stage", "numbers", "coefficients", "controls")
         memory, numbers, coefficients, controls = f.arguments
-        c0, c1, c2, d1, t = (f.load(coefficients, i) for i in range(5))
+        c0, *earlier, d1, t = (f.load(coefficients, i) for i in range(self.settings.memory + 3))
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
         def history(states: list[Array], rate: Array, target: Array, count: int) -> None:
             with self._places(count) as j:
                 for i in range(e.numbers):
-                    value = c1 * self._wide(states[0], i, j) + c2 * self._wide(states[1], i, j)
+                    value = _sum(
+                        c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True)
+                    )
                     if self.settings.uses_rate:
                         value = value + d1 * self._wide(rate, i, j)
                     self._write_wide(value, target, i, j)
@@ -702,7 +708,7 @@ class Core(EliminationCode):
         f = self._now = self.module.function("evaluate", names, exported=True)
         memory, coefficients, control, turns = f.arguments
         f.call(self.setup, memory)
-        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, 4), control)
+        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         if len(self.grid.between):
             self._write_filling(turns, self.residual_of_y)
         f.call(self.recorded, memory, coefficients)
@@ -761,7 +767,8 @@ class Core(EliminationCode):
                 y, turns = self.grid.spread(y), FILLING * (self.grid.parts.shape[1] - 1)
             for array, values in ((self.H, history), (self.y, y)):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
-            table, control = np.array([c0, 0.0, 0.0, 0.0, t]), np.array(control, dtype=float)
+            table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
+            table[[0, -1]] = c0, t
             self._evaluate(*(each.ctypes.data for each in (memory, table, control)), turns)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
@@ -884,14 +891,14 @@ class Core(EliminationCode):
 
 def coefficients_of(
     steps: StepCoefficients, stages: int, span: tuple[int, int]
-) -> Float[np.ndarray, "T stages 5"]:
+) -> Float[np.ndarray, "T stages n"]:
     """Return coefficients and the time since row 0 (s) of all stages of a span of steps."""
     start, stop = span
-    table = np.empty((stop - start, stages, 5))
-    coefficients = np.asarray(steps.table).reshape(2, stages, 4)
-    table[..., :4] = coefficients[1]
-    table[: int(start == 0), :, :4] = coefficients[0]
-    table[..., 4] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
+    coefficients = np.asarray(steps.table)
+    coefficients = coefficients.reshape(len(coefficients), stages, -1)
+    table = np.empty((stop - start, stages, coefficients.shape[-1] + 1))
+    table[..., :-1] = coefficients[np.minimum(np.arange(start, stop), len(coefficients) - 1)]
+    table[..., -1] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
     return table
 
 

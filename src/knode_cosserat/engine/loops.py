@@ -35,8 +35,7 @@ def tangents_for(
     kind: type[AnyTangents], pattern: Pattern, settings: Settings, moving: Sequence[np.ndarray]
 ) -> AnyTangents:
     """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
-    key = pattern, masks_of(moving), settings.space, settings.uses_rate, kind
-
+    key = pattern, masks_of(moving), settings.space, settings.memory, settings.uses_rate, kind
     return compiled(key, lambda: kind(pattern.system, settings, moving))
 
 
@@ -74,7 +73,7 @@ def loop_many(
 
 
 #: the coefficients of equilibria
-STILL = StepCoefficients(np.zeros((2, 4)), 0.0)
+STILL = StepCoefficients(np.zeros((1, 4)), 0.0)
 
 
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
@@ -97,10 +96,10 @@ def static_many(system: System, settings: Settings, controls: Any, y: Any, stop:
 
 
 def table_of(settings: Settings, steps: StepCoefficients, count: int, t0: float) -> np.ndarray:
-    """Return the coefficients and the time (s) of all stages of the first steps (solves, 5)."""
-    table = coefficients_of(steps, settings.stages, (0, count)).reshape(-1, 5)
-    table[:, 4] += t0
-    return table
+    """Return the coefficients and the time (s) of all stages of the first steps (solves, memory + 3)."""
+    table = coefficients_of(steps, settings.stages, (0, count))
+    table[..., -1] += t0
+    return table.reshape(-1, table.shape[-1])
 
 
 def at_all_stages(system: System, settings: Settings, values: Any) -> np.ndarray:

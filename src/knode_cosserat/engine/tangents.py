@@ -73,7 +73,8 @@ class TangentCode(EliminationCode):
         super().__init__(TangentEquations(system, moving, self.transposed, settings.space), False, lanes)
         e, a = self.equations, self._array
         ny, nx, numbers, k = e.ny, e.ny + e.nz, e.numbers, e.k
-        self.records, self.rate = [a(numbers, self.used) for _ in range(2)], a(numbers, self.used)
+        memory = range(settings.memory)
+        self.records, self.rate = [a(numbers, self.used) for _ in memory], a(numbers, self.used)
         # derivatives at all places
         self.z_by_y = a(len(e.z_by_y), self.used)
         self.places = {"rates": self.used, "far": self.pieces, "tip": 1, "base": 1}
@@ -89,7 +90,7 @@ class TangentCode(EliminationCode):
         self.columns = 1 if self.transposed else lanes
         many = a if self.transposed else self._tangent_array
         whole, self._size = self._size, 0
-        records, rate = [many(numbers, self.used, 1) for _ in range(2)], many(numbers, self.used, 1)
+        records, rate = [many(numbers, self.used, 1) for _ in memory], many(numbers, self.used, 1)
         self._reserve_state()
         self.state_size, self._size = self._size, whole
         groups = self.groups[1] * self.strands
@@ -145,7 +146,7 @@ class TangentCode(EliminationCode):
         e = self.equations
         self.data = f = self._function("data", "coefficients", "control", "unknowns")
         _, coefficients, control, unknowns = f.arguments
-        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, 4), control)
+        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         weights = [f.load(coefficients, k) for k in self._history_weights]
         with self._places(self.used) as j:
             for i in range(e.numbers):
@@ -158,7 +159,7 @@ class TangentCode(EliminationCode):
     @property
     def _history_weights(self) -> range:
         """Numbers of the coefficients of records and, if the scheme uses it, of the rate."""
-        return range(1, 4 if self.settings.uses_rate else 3)
+        return range(1, 1 + self.settings.memory + self.settings.uses_rate)
 
     def _write_solution(self) -> None:
         """The solution y at all points, from its row at the nodes (see `StepProblem.filled`)."""
@@ -200,9 +201,10 @@ class TangentCode(EliminationCode):
         """The records after a step."""
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
-        with self._places(self.used) as j:
-            for i in range(self.equations.numbers):
-                self._write_wide(self._wide(self.records[0], i, j), self.records[1], i, j)
+        for newer, older in reversed(list(itertools.pairwise(self.records))):
+            with self._places(self.used) as j:
+                for i in range(self.equations.numbers):
+                    self._write_wide(self._wide(newer, i, j), older, i, j)
         for i, j, newest in self._numbers_of(self._evaluated_at(self.y), self.used):
             self._write_wide(newest, self.records[0], i, j)
             if self.settings.uses_rate:
@@ -404,9 +406,9 @@ class TangentCode(EliminationCode):
                 found += _copies(e.numbers, (t.rate, j), (t.history, j))
                 for i in range(e.numbers):
                     found.append(Add(Number(t.rate, i, j), Number(t.newest, i, j), c0))
-            newest, older = t.records
-            found += _copies(e.numbers, (older, j), (newest, j))
-            return found + _copies(e.numbers, (newest, j), (t.newest, j))
+            for newer, older in reversed(list(itertools.pairwise(t.records))):
+                found += _copies(e.numbers, (older, j), (newer, j))
+            return found + _copies(e.numbers, (t.records[0], j), (t.newest, j))
 
         def shown(node: Index) -> list[Operation]:
             point = self._node(node)
@@ -527,7 +529,7 @@ class TangentCode(EliminationCode):
         f, e = self._now, self.equations
         sizes = e.nc, self._row_size, e.k
         found = [f.pointer(each, step.value * size) for each, size in zip(data, sizes, strict=True)]
-        return [f.pointer(coefficients, step.value * 5), *found]
+        return [f.pointer(coefficients, step.value * (self.settings.memory + 3)), *found]
 
     @property
     def _row_size(self) -> int:
@@ -652,15 +654,16 @@ class TangentCore(TangentCode):
             f.call(self.shift, memory, table)
 
     def solve(
-        self, parameters: np.ndarray, table: Float[np.ndarray, "solves 5"], solved: tuple[Any, Any],
+        self, parameters: np.ndarray, table: Float[np.ndarray, "solves n"], solved: tuple[Any, Any],
         controls: Float[np.ndarray, "solves c"], moves: tuple[Any, Any], d_controls: Any, states: Any,
         d_tip: Any = 0.0,
     ) -> tuple[Any, Any]:  # fmt: skip
         """Return the tangents of solved rows (solves, nodes, x, m) and unknowns (solves, k, m), and states.
 
         `moves` are directions of the moving parameters (d, n) and weights (d, m); `states` are records
-        (2, used, x) and rate before the first step, and their tangents with one more axis (m). `d_tip` (k, m)
-        is added to the tangents of the tip's residual. The states returned are those after the last step.
+        (memory, used, x) and rate before the first step, and their tangents with one more axis (m). `d_tip`
+        (k, m) is added to the tangents of the tip's residual. The states returned are those after the last
+        step.
         """
         e, L, (records, rate, d_records, d_rate) = self.equations, self.L, states
         (directions, weights), count = moves, len(controls)
@@ -697,7 +700,7 @@ class TangentCore(TangentCode):
         moved_after = [
             np.moveaxis(each, (0, 1), (2, 3)).reshape(places, -1, blocks * L)[..., :m] for each in moved_after
         ]
-        found = np.stack(after[:2]), after[2], np.stack(moved_after[:2]), moved_after[2]
+        found = np.stack(after[:-1]), after[-1], np.stack(moved_after[:-1]), moved_after[-1]
         return found, (d_rows[..., :m], d_unknowns[..., :m])
 
 
@@ -882,12 +885,12 @@ class CotangentCore(TangentCode):
         return sum(map(self._length_of, self._kept))
 
     def solve(
-        self, parameters: np.ndarray, table: Float[np.ndarray, "solves 5"], solved: tuple[Any, Any],
+        self, parameters: np.ndarray, table: Float[np.ndarray, "solves n"], solved: tuple[Any, Any],
         controls: Float[np.ndarray, "solves c"], states: tuple[Any, Any], cotangents: Any,
     ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
         """Return the cotangents of moving parameters (n, m), controls (solves, c, m), records and rate.
 
-        `states` are records (2, used, x) and rate before the first step. `cotangents` are those of rows
+        `states` are records (memory, used, x) and rate before the first step. `cotangents` are those of rows
         (solves, nodes, x, m) and unknowns (solves, k, m), and of records and rate after the last step.
         """
         begun, count = self._begun(parameters, solved, controls, table, *states), len(controls)
@@ -905,7 +908,7 @@ class CotangentCore(TangentCode):
         self._run(*(each.ctypes.data for each in arrays), count, m)
         joined = [self._joined(each, self._numbers(state, each)[:, 0], len(d_rate)) for each in parts]
         before = [np.moveaxis(each, 0, -1) for each in joined]
-        return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:2]), before[2]
+        return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:-1]), before[-1]
 
 
 def _callable(address: int, pointers: int, numbers: int) -> Any:

@@ -237,7 +237,7 @@ def step_many(
 
 def task_of(spec: Spec) -> TimeIntegration:
     """Return the time integration of a period."""
-    return TimeIntegration(spec.settings, spec.dt, 1, "regular")
+    return TimeIntegration(spec.settings, spec.dt, 1, spec.settings.memory)
 
 
 def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Move:

@@ -80,7 +80,7 @@ class OnlineModel(eqx.Module):
 
     def task(self, steps: int) -> TimeIntegration:
         """Return so many steps from a state with a history."""
-        return TimeIntegration(self.settings, self.dt, steps, "regular")
+        return TimeIntegration(self.settings, self.dt, steps, self.settings.memory)
 
     def at(self, x: Any) -> System:
         """Return the robot at coordinates of its parameters."""

@@ -22,7 +22,7 @@ from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
-from knode_cosserat.solvers.history import coefficient_table, rows_suffice
+from knode_cosserat.solvers.history import coefficient_table, history_of, rows_suffice
 from knode_cosserat.solvers.replay import replay, replayed_settings
 from knode_cosserat.solvers.semi_discrete import Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.settings import MEASURED, Settings
@@ -312,14 +312,15 @@ def histories(
     settings: Settings, dt: float, record: np.ndarray, stages: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return c0 (T,) and ʰ (T, N, x) of every row, by the trajectory's own scheme; zero in row 0."""
-    table = coefficient_table(settings, dt).reshape(2, settings.stages, 4)
-    rate, newest = np.zeros_like(record[0]), [record[0]] * 2
+    table = coefficient_table(settings, dt)
+    table = table.reshape(len(table), settings.stages, -1)
+    rate, newest = np.zeros_like(record[0]), [record[0]] * settings.memory
     c0, history = np.zeros(len(record)), np.zeros_like(record)
     for i in range(1, len(record)):
-        for coefficients, now in zip(table[min(i - 1, 1)], [*stages[i], record[i]], strict=True):
-            c0[i], c1, c2, d1 = coefficients
-            history[i] = c1 * newest[0] + c2 * newest[1] + d1 * rate
-            rate, newest = c0[i] * now + history[i], [now, newest[0]]
+        for coefficients, now in zip(table[min(i, len(table)) - 1], [*stages[i], record[i]], strict=True):
+            c0[i] = coefficients[0]
+            history[i] = history_of(newest, rate, coefficients, settings)
+            rate, newest = c0[i] * now + history[i], [now, *newest[:-1]]
     return c0, history
 
 

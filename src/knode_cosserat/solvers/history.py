@@ -8,7 +8,7 @@ equations (`grid.Grid`). The history stores them there. The rows of a trajectory
 from __future__ import annotations
 
 import functools
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,7 +22,7 @@ from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.problem import Evaluated, StepProblem, places_of, row_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
-from knode_cosserat.solvers.time import BDF1
+from knode_cosserat.solvers.time import BDF1, padded
 
 #: number of earlier states in the first guess of a step, and the extrapolations in time (constant, linear,
 #: quadratic) of which the guess is the weighted mean
@@ -33,15 +33,10 @@ EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
 SOLVED = 2e-8
 
 
-#: kind of a motion's first step: "start" by the settings, from one state; "regular" like any other, from two
-#: states; "consistent" by BDF1
-FirstStep = Literal["start", "regular", "consistent"]
-
-
 class StateHistory(NamedTuple):
     """The states before a step, newest first."""
 
-    records: Float[Any, "2 places x"]
+    records: Float[Any, "memory places x"]
     rate: Float[Any, "places x"]
     #: for the first guess
     y: Float[Any, "past points y"]
@@ -49,40 +44,52 @@ class StateHistory(NamedTuple):
     weights: Float[Any, " past"]
     #: time of row 0 (s): step i ends at t0 + (i + 1) dt
     t0: Float[Any, ""]
-    #: estimated discretisation errors of both records and of the rate, at the places of the scheme
-    error: Float[Any, "3 used x"]
-    #: estimated errors of both records by the time scheme, at these places; NaN: lost
-    time_error: Float[Any, "2 used x"]
+    #: estimated discretisation errors of the records and of the rate, at the places of the scheme
+    error: Float[Any, "memory_and_rate used x"]
+    #: estimated errors of the records by the time scheme, at these places; NaN: lost
+    time_error: Float[Any, "memory used x"]
 
 
 class SolverState(eqx.Module):
     """State of the solver at a row of a motion, from which the motion continues."""
 
     history: StateHistory
-    #: time step (s) between the two states of the history; None if all its states are the same one
+    #: time step (s) between the states of the history; None if all its states are the same one
     dt: float | None = eqx.field(static=True, default=None)
     #: True if the history's rate is that of its newest state
     rate_known: bool = eqx.field(static=True, default=True)
+    #: number of different states in the history, if not all are
+    distinct: int | None = eqx.field(static=True, default=None)
 
-    def first_step(self, settings: Settings) -> FirstStep:
-        """Return the kind of the step that follows, by these settings."""
+    def known(self, settings: Settings) -> int:
+        """Return the number of states from which the next step can be made; 0 if it lacks a rate."""
         if settings.uses_rate and not self.rate_known:
-            return "consistent"
-        return "start" if self.dt is None else "regular"
+            return 0
+        return 1 if self.dt is None else self.distinct or settings.memory
+
+    def after(self, history: StateHistory, dt: float, steps: int, settings: Settings) -> SolverState:
+        """Return the state after so many steps (s)."""
+        distinct = self.known(settings) + steps
+        return SolverState(history, dt, settings.uses_rate, distinct if distinct < settings.memory else None)
 
 
-def coefficient_table(settings: Settings, dt: float, first: FirstStep = "start") -> np.ndarray:
-    """Return the coefficients (2, 4) of the first step and of all later steps; zeros for statics.
+def coefficient_table(settings: Settings, dt: float, known: int = 1) -> np.ndarray:
+    """Return the coefficients (rows, memory + 2) of the first steps and of all later ones.
 
-    With several stages (2, stages, 4).
+    They are zeros for statics. With several stages they are (rows, stages, memory + 2). `known` are the
+    states before the first step; see `SolverState.known`.
     """
     if settings.time is None:
-        return np.zeros((2, 4))
+        return np.zeros((1, settings.memory + 2))
     if settings.stages > 1:
-        return np.array([settings.time.stages(dt)] * 2)
-    regular = settings.time.coefficients(dt, dt)
-    by_bdf1 = first == "consistent" or (first == "start" and settings.start == "consistent")
-    return np.array([BDF1().coefficients(dt, dt) if by_bdf1 else regular, regular])
+        return np.array([settings.time.stages(dt)])
+    missing = range(max(known, 1), settings.memory) if settings.start == "consistent" else range(0)
+    schemes = [settings.time.starter(count) for count in missing]
+    if not known:
+        schemes = [BDF1(), *schemes[1:]]
+    steps = [dt] * (settings.memory - 1)
+    rows = [scheme.coefficients(dt, *steps) for scheme in (*schemes, settings.time)]
+    return np.array([padded(row, settings.memory) for row in rows])
 
 
 def at_stages(system: System, settings: Settings, controls: Any, before: Any, sudden: bool) -> Any:
@@ -107,10 +114,10 @@ def at_stages(system: System, settings: Settings, controls: Any, before: Any, su
 def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) -> Any:
     """Return ʰ of y, z and y_s (paper eq. 3, lumped history terms).
 
-    ʰ = c1 (newest) + c2 (second newest) + d1 (newest rate)
+    ʰ = c1 (newest) + c2 (second newest) + … + d1 (newest rate)
     """
-    _, c1, c2, d1 = coefficients
-    history = c1 * states[0] + c2 * states[1]
+    _, *weights, d1 = coefficients
+    history = sum(c * state for c, state in zip(weights, states, strict=True))
     return history + d1 * rate if settings.uses_rate else history
 
 
@@ -118,7 +125,7 @@ def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) 
     """Return the history of the next step."""
     numeric: Any = jnp if is_traced((past, records, rate, y)) else np
     return past._replace(
-        records=numeric.stack([records, past.records[0]]),
+        records=numeric.stack([records, *past.records[:-1]]),
         rate=rate,
         y=numeric.concatenate([y[None], past.y[:-1]]),
         weights=weights,
@@ -154,7 +161,7 @@ def resting_history(system: System, settings: Settings) -> StateHistory:
         return constant_history(system, settings, rest_record(system), np.zeros(system.control_size))
     _, records = unloaded(system, settings.space)
     y = records[: grid_of(system).tip + 1, : system.y_layout.size]
-    return repeated_record_history(system, settings.space, records, y, 0.0)
+    return repeated_record_history(system, settings, records, y, 0.0)
 
 
 @functools.partial(jax.jit, static_argnames="settings")
@@ -169,23 +176,23 @@ def constant_history(
     still = StepProblem.still(system, settings.space, control, t0)
     found = still.evaluated(row[:, : system.y_layout.size])
     records = still_records(system, settings.space, row, found)
-    return repeated_record_history(system, settings.space, records, found.y, t0)
+    return repeated_record_history(system, settings, records, found.y, t0)
 
 
 def repeated_record_history(
-    system: System, space: SpaceScheme, records: Float[Any, "places x"], y: Float[Any, "points y"], t0: Any
+    system: System, settings: Settings, records: Float[Any, "places x"], y: Float[Any, "points y"], t0: Any
 ) -> StateHistory:
     """Return a history in which all earlier states equal one state."""
-    used = used_places(system, space)
+    used, memory = used_places(system, settings.space), settings.memory
     numeric: Any = jnp if is_traced((records, y, t0)) else np
     return StateHistory(
-        numeric.stack([records] * 2),
+        numeric.stack([records] * memory),
         numeric.zeros_like(records),
         numeric.stack([y] * GUESS_STATES),
         numeric.asarray(EXTRAPOLATIONS[0]),
         numeric.asarray(t0, dtype=float),
-        numeric.zeros((3, used, records.shape[-1])),
-        numeric.zeros((2, used, records.shape[-1])),
+        numeric.zeros((memory + 1, used, records.shape[-1])),
+        numeric.zeros((memory, used, records.shape[-1])),
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
 import jax
@@ -117,17 +118,23 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
     state = _last_state(system, initial, settings, dt, record)
     if state is None:
         state = SolverState(at_one_state(system, history_settings(settings), record, control, t0))
-    elif state.dt is None or not np.isclose(state.dt, dt) or state.first_step(settings) == "consistent":
+    elif (
+        state.dt is None
+        or not np.isclose(state.dt, dt)
+        or not state.known(settings)
+        or len(state.history.records) != settings.memory
+    ):
         # one state is all that a step of another length can use
         history = state.history
         alone = history._replace(
-            records=numeric.stack([history.records[0]] * 2),
+            records=numeric.stack([history.records[0]] * settings.memory),
             weights=numeric.asarray(EXTRAPOLATIONS[0]),
-            error=numeric.stack([history.error[0], *history.error[::2]]),
+            error=numeric.stack([history.error[0]] * settings.memory + [history.error[-1]]),
+            time_error=numeric.stack([*history.time_error[:1]] * settings.memory),
         )
         state = SolverState(alone, None, state.rate_known)
     history = state.history._replace(t0=numeric.asarray(t0, dtype=float))
-    state = SolverState(history, state.dt, state.rate_known)
+    state = dataclasses.replace(state, history=history)
     made = initial.settings
     result = initial.result[-1] if made and made.time else _coarse_only(initial.result[-1])
     return InitialState(record, control, state, result)
@@ -149,14 +156,15 @@ def _last_state(
         if len(initial.time) < 2:
             return None
         numeric: Any = jnp if is_traced(initial) else np
-        rows = numeric.concatenate([initial.y[-2:], initial.z[-2:]], axis=-1)
+        count = settings.memory
+        rows = numeric.concatenate([initial.y[-count:], initial.z[-count:]], axis=-1)
         apart = dt if is_traced(initial.time) else float(initial.time[-1] - initial.time[-2])
-        return state_of_rows(system, settings.space, rows, apart)
+        return state_of_rows(system, settings, rows, apart)
     state = initial.final_state
     if state is None or state.history.rate.shape != no_history(system, settings.space).shape:
         known = replay(initial, initial.system, dt)
         return None if known is None else known.state
-    return SolverState(_moved_to(system, settings.space, state.history, record), state.dt, state.rate_known)
+    return dataclasses.replace(state, history=_moved_to(system, settings.space, state.history, record))
 
 
 def _moved_to(system: System, space: SpaceScheme, history: StateHistory, record: Any) -> StateHistory:

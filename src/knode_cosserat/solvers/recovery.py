@@ -91,7 +91,7 @@ def attempt(
         past, weights = step.past, EXTRAPOLATIONS[0]
         # the first guess is the newest of the earlier states
         guess = past._replace(y=np.stack([y, *past.y[:-1]]), weights=weights, t0=0.0)
-        one = StepCoefficients(np.stack([step.coefficients] * 2), step.t)
+        one = StepCoefficients(np.asarray(step.coefficients)[None], step.t)
         _, after, rows = engine.loop_one(system, patient, one, controls, guess, (0, 1), tip_offset)
         state = after._replace(y=np.stack([after.y[0], *past.y[:-1]]), weights=weights, t0=past.t0)
     return SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))

@@ -15,7 +15,7 @@ from knode_cosserat.solvers.recovery import Budget, Recovery, SolvedStep, natura
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.steps import TimeStep
-from knode_cosserat.solvers.time import BDF1, BDF2
+from knode_cosserat.solvers.time import BDF1, BDF2, padded
 
 #: smallest substep as a part of a time step, and largest number of substeps tried
 LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
@@ -59,13 +59,15 @@ class StepRecovery(Recovery):
         """
         settings, past, dt = self.settings, self.step.past, self.dt
         before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
-        reached, part, previous = 0.0, 0.5, 1.0
+        reached, part, memory = 0.0, 0.5, settings.memory
+        #: lengths of earlier steps, the last one first
+        previous = [dt] * (memory - 1)
         assert settings.time is not None
         regular = settings.time if settings.stages == 1 else BDF2()
         scheme = settings.time if settings.start == "paper" and settings.stages == 1 else BDF1()
         for _ in range(MOST_SUBSTEPS):
             until = min(1.0, reached + part)
-            coefficients = scheme.coefficients((until - reached) * dt, previous * dt)
+            coefficients = padded(scheme.coefficients((until - reached) * dt, *previous), memory)
             step = TimeStep(past, coefficients, float(self.step.t) - (1.0 - until) * dt)
             substep = StepRecovery(self.system, settings, step, dt, self.budget)
             found = substep.direct(before + until * (now - before), ease=part < EASE_BELOW)
@@ -77,8 +79,9 @@ class StepRecovery(Recovery):
             self.corrections = substep.corrections
             if until == 1.0:
                 return found._replace(state=self._whole(found.state))
-            past, previous, scheme = found.state, until - reached, regular
-            reached, part = until, 2.0 * previous
+            past, scheme = found.state, regular
+            previous = [(until - reached) * dt, *previous[:-1]]
+            reached, part = until, 2.0 * (until - reached)
         return None
 
     def direct(self, control: Any, ease: bool) -> SolvedStep | None:
@@ -93,9 +96,9 @@ class StepRecovery(Recovery):
         """Return the history of the next step, which holds whole steps, not substeps."""
         before = self.step.past
         return after._replace(
-            records=np.stack([after.records[0], before.records[0]]),
+            records=np.stack([after.records[0], *before.records[:-1]]),
             y=np.stack([after.y[0], *before.y[:-1]]),
-            error=np.stack([after.error[0], before.error[0], after.error[2]]),
+            error=np.stack([after.error[0], *before.error[:-2], after.error[-1]]),
         )
 
 
@@ -136,7 +139,7 @@ def recovered_stages(
         )  # fmt: skip
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
-    whole = TimeStep(step.past, BDF1().coefficients(dt, dt), step.t[-1])
+    whole = TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
     solved = _Substeps(system, settings, whole, dt, budget).recover((before[-1], now[-1]))
     lost = solved.state._replace(time_error=np.full_like(solved.state.time_error, np.nan))
     row, count = solved.row, settings.stages - 1
@@ -180,11 +183,11 @@ class StaticRecovery(Recovery):
         system, part = self.system, 0.0
         settings = Settings(BDF1(), self.settings.space, newton=self.settings.newton)
         still = still_state(system, settings.space, controls[1], self._y)
-        past = repeated_record_history(system, settings.space, still.records, self._y, 0.0)
+        past = repeated_record_history(system, settings, still.records, self._y, 0.0)
         natural = natural_time(system) or 0.1
         dt, longest = 0.1 * natural, 1e5 * natural
         for _ in range(80):
-            step = TimeStep(past, BDF1().coefficients(dt, dt), 0.0)
+            step = TimeStep(past, BDF1().coefficients(dt), 0.0)
             moving = StepRecovery(system, settings, step, dt, self.budget)
             target = min(1.0, part + DRAWN)
             found = moving.solve(controls[1], moving.guesses()[0], (1.0 - target) * still.tip)

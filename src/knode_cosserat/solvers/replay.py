@@ -46,7 +46,7 @@ def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0:
         return constant_history(system, settings, row, control, t0)
     still = still_state(system, settings.space, control, np.asarray(row)[:, : system.y_layout.size], t0)
     records = still_records(system, settings.space, np.asarray(row), still)
-    return repeated_record_history(system, settings.space, records, still.y, t0)
+    return repeated_record_history(system, settings, records, still.y, t0)
 
 
 class Replay(NamedTuple):
@@ -88,11 +88,12 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
             acting = numeric.tile(acting, made.stages)
         acting = acting.reshape(len(acting) * made.stages, controls.shape[1])
         controls = numeric.concatenate([controls[:1], acting])
-    steps = StepCoefficients.of(made, apart, state.first_step(made))
+    steps = StepCoefficients.of(made, apart, state.known(made))
     past = state.history._replace(t0=numeric.asarray(time[row], dtype=float))
     history, terms = _along(system, made, past, (rows, controls), steps)
-    rate_known = state.rate_known and made.uses_rate
-    return Replay(row + 1, terms[made.stages - 1 :: made.stages], SolverState(history, apart, rate_known))
+    last = state.after(history, apart, len(time) - 1 - row, made)
+    last = dataclasses.replace(last, rate_known=state.rate_known and made.uses_rate)
+    return Replay(row + 1, terms[made.stages - 1 :: made.stages], last)
 
 
 def history_settings(settings: Settings) -> Settings:
@@ -119,10 +120,11 @@ def _known_row(
     if state is not None and state.history.rate.shape == no_history(system, made.space).shape:
         return 0, state
     numeric: Any = jnp if is_traced(trajectory) else np
-    rows: Any = numeric.concatenate([trajectory.y[:2], trajectory.z[:2]], axis=-1)
+    count = made.memory
+    rows: Any = numeric.concatenate([trajectory.y[:count], trajectory.z[:count]], axis=-1)
     if is_traced(time) or time[0] != 0.0:
-        state = state_of_rows(system, made.space, rows, dt)
-        return None if state is None else (1, state)
+        state = state_of_rows(system, made, rows, dt)
+        return None if state is None else (count - 1, state)
     history = resting_history(system, made)
     rest = rest_record(system)
     if not is_traced((rest, rows)) and not np.allclose(rest, rows[0], rtol=0.0, atol=AT_REST):
@@ -131,18 +133,19 @@ def _known_row(
 
 
 def state_of_rows(
-    system: System, space: SpaceScheme, rows: Float[Any, "2 nodes x"], dt: float
+    system: System, settings: Settings, rows: Float[Any, "memory nodes x"], dt: float
 ) -> SolverState | None:
-    """Return the solver's state at the second of two rows, interpolated between nodes; None with y_st."""
-    return None if system.mixed else SolverState(_of_rows(system, space, rows), dt, rate_known=False)
+    """Return the solver's state at the last of the rows, interpolated between nodes.
 
-
-def _of_rows(system: System, space: SpaceScheme, rows: Any) -> StateHistory:
+    None if the rows are too few, or do not hold the history, which has y_s.
+    """
+    if system.mixed or len(rows) < settings.memory:
+        return None
     numeric: Any = jnp if is_traced((system, rows)) else np
-    records = [at_places(system, space, row) for row in rows[::-1]]
-    y = grid_of(system).spread(rows[1, :, : system.y_layout.size])
-    repeated = repeated_record_history(system, space, records[0], y, 0.0)
-    return repeated._replace(records=numeric.stack(records))
+    records = [at_places(system, settings.space, row) for row in rows[::-1]]
+    y = grid_of(system).spread(rows[-1, :, : system.y_layout.size])
+    repeated = repeated_record_history(system, settings, records[0], y, 0.0)
+    return SolverState(repeated._replace(records=numeric.stack(records)), dt, rate_known=False)
 
 
 def _along(

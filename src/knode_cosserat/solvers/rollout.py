@@ -348,7 +348,7 @@ def static_rollout(task: Equilibria, pattern: Pattern) -> Callable[[System, Any,
     def tangent(primals: Any, tangents: Any) -> Any:
         rows, system = run(*primals), primals[0]
         none = no_history(system, task.settings.space)[: used_places(system, task.settings.space)]
-        still = jnp.stack([none] * 2), none
+        still = jnp.stack([none] * task.settings.memory), none
         return rows, _pushed(task, pattern, primals, tangents, rows, (*still, jnp.zeros(())), still)[0]
 
     run.defjvp(tangent, symbolic_zeros=True)

@@ -22,7 +22,7 @@ from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.evaluation import map_robots
 from knode_cosserat.solvers.guess import materials
-from knode_cosserat.solvers.history import FirstStep, SolverState, StateHistory
+from knode_cosserat.solvers.history import SolverState, StateHistory
 from knode_cosserat.solvers.recovery import Budget, SolvedStep
 from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery, recovered_stages
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -67,14 +67,15 @@ class TimeIntegration:
     settings: Settings
     dt: float
     steps: int
-    first: FirstStep = "start"
+    #: states before the first step (`SolverState.known`)
+    known: int = 1
     #: seconds that recovery may take; None: 20 times the run's own time or 5 s, whichever is more
     recovery_budget: float | None = None
 
     @property
     def coefficients(self) -> StepCoefficients:
         """Coefficients of the steps."""
-        return StepCoefficients.of(self.settings, self.dt, self.first)
+        return StepCoefficients.of(self.settings, self.dt, self.known)
 
     def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
         """Solve a span of steps until one fails: number of steps done, the last state, rows of the span."""

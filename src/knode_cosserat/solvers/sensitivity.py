@@ -40,9 +40,9 @@ class SystemMoves(NamedTuple):
 class TangentState(NamedTuple):
     """History before a step at the places of the scheme, and its tangents: the carry of the tangent loop."""
 
-    records: Float[Any, "2 used x"]
+    records: Float[Any, "memory used x"]
     rate: Float[Any, "used x"]
-    d_records: Float[Any, "2 used x ..."]
+    d_records: Float[Any, "memory used x ..."]
     d_rate: Float[Any, "used x ..."]
     #: time of row 0 (s)
     t0: Any
@@ -104,7 +104,8 @@ def static_tangents(
     system, (_, d_controls) = at[0], changes
     none = no_history(system, settings.space)[: used_places(system, settings.space)]
     d_none = np.zeros((*none.shape, d_controls.shape[-1]))
-    state = TangentState(np.stack([none] * 2), none, np.stack([d_none] * 2), d_none, 0.0)
     still = dataclasses.replace(settings, time=None)
+    before, d_before = (np.stack([each] * still.memory) for each in (none, d_none))
+    state = TangentState(before, none, d_before, d_none, 0.0)
     after, found = tangent_time_loop(still, STILL, solved, at, changes, state, d_tip)
     return *found, after.d_records[0]

@@ -6,11 +6,9 @@ import dataclasses
 from collections.abc import Iterator
 from typing import Any, Literal, Self
 
-from knode_cosserat.solvers import space as space_schemes
-from knode_cosserat.solvers import time as time_schemes
 from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import TimeScheme
+from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
+from knode_cosserat.solvers.time import BDF2, TWO_STAGES, TimeScheme
 
 Start = Literal["paper", "consistent"]
 Between = Literal["held", "linear"]
@@ -25,8 +23,8 @@ class Settings:
     before the first equal to the first, which delays a motion that begins suddenly by half a step.
     """
 
-    time: TimeScheme | None = time_schemes.TWO_STAGES
-    space: SpaceScheme = space_schemes.LOBATTO2
+    time: TimeScheme | None = TWO_STAGES
+    space: SpaceScheme = LOBATTO2
     start: Start = "consistent"
     newton: NewtonOptions = NewtonOptions()
     #: controls are constant from row to row, or linear (`history.at_stages`)
@@ -36,6 +34,11 @@ class Settings:
     def uses_rate(self) -> bool:
         """True if the time scheme needs y_t of the previous step."""
         return self.time is not None and self.time.uses_rate
+
+    @property
+    def memory(self) -> int:
+        """Number of earlier states that enter a step."""
+        return 2 if self.time is None else self.time.memory
 
     @property
     def stages(self) -> int:
@@ -58,8 +61,8 @@ class Settings:
         if between not in ("held", "linear"):
             raise ValueError(f'between is {between!r}; allowed is "held" or "linear"')
         return cls(
-            None if time is None else _scheme("time", time, TimeScheme, time_schemes.SCHEMES),
-            _scheme("space", space, SpaceScheme, space_schemes.SCHEMES),
+            None if time is None else _scheme("time", time, TimeScheme),
+            _scheme("space", space, SpaceScheme),
             start,  # type: ignore[arg-type]
             newton,
             between,  # type: ignore[arg-type]
@@ -89,18 +92,24 @@ class Settings:
 
 
 #: for rows that were not simulated: rates are differences of the rows, by the paper's scheme
-MEASURED = Settings(time_schemes.BDF2(), start="paper")
+MEASURED = Settings(BDF2(), start="paper")
 
 
 def _described(scheme: Any) -> dict[str, Any] | None:
     return None if scheme is None else {"scheme": type(scheme).__name__, **dataclasses.asdict(scheme)}
 
 
-def _scheme(what: str, given: Any, kind: Any, known: Any) -> Any:
+def schemes(kind: type) -> dict[str, type]:
+    """Return the schemes in time or in space by their names, those of users among them."""
+    return {cls.name: cls for cls in _subclasses(kind) if cls.name}
+
+
+def _scheme(what: str, given: Any, kind: Any) -> Any:
+    known = schemes(kind)
     if isinstance(given, kind):
         return given
     if isinstance(given, str) and given in known:
-        return known[given]
+        return known[given]()
     names = ", ".join(f'"{name}"' for name in known)
     raise ValueError(f"{what} is {given!r}; allowed is {names}, or a {kind.__name__}")
 
@@ -114,7 +123,7 @@ def _named(base: type, *, scheme: str, **options: Any) -> Any:
     return known[scheme](**options)
 
 
-def _subclasses(cls: type) -> Iterator[type]:
+def _subclasses(cls: type) -> Iterator[Any]:
     subclasses: list[type] = cls.__subclasses__()
     for subclass in subclasses:
         yield subclass

@@ -19,7 +19,7 @@ from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
-from knode_cosserat.solvers.history import SolverState, at_stages
+from knode_cosserat.solvers.history import at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import (
@@ -328,9 +328,9 @@ def _initial(
         at_start = initial_state(system, settings, batch, budget, held)
     else:
         at_start = continued_state(system, initial, settings, dt)
-    first = at_start.state.first_step(settings)
+    known = at_start.state.known(settings)
     acting = at_stages(system, settings, controls, at_start.control[..., None, :], at_start.state.dt is None)
-    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], first, budget), acting
+    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], known, budget), acting
 
 
 def _plain(
@@ -382,7 +382,7 @@ def _trajectory(
     t0 = numeric.asarray(at_start.state.history.t0)
     time = (t0[0] if axis else t0) + np.arange(task.steps + 1) * dt
     final = history._replace(t0=numeric.full(np.shape(t0), time[-1]))
-    final = SolverState(final, dt, settings.uses_rate)
+    final = at_start.state.after(final, dt, task.steps, settings)
     initial, final = jax.tree.map(numeric.asarray, (at_start.state, final))
     joined = {
         name: numeric.concatenate([numeric.expand_dims(first[name], axis), values], axis)

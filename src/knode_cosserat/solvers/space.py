@@ -56,6 +56,8 @@ _BOOLE = Formula(
 class SpaceScheme(abc.ABC):
     """A one-step scheme in arclength, by its formula and the formula that checks it."""
 
+    #: name in `simulate` and on the command line; empty: none
+    name: ClassVar[str] = ""
     formula: ClassVar[Formula]
     #: a formula of higher order; its stages begin with those of `formula`
     check: ClassVar[Formula]
@@ -75,6 +77,7 @@ class SpaceScheme(abc.ABC):
 class Euler(SpaceScheme):
     """Forward Euler, order 1: the paper's scheme, to reproduce it. Unstable where segments are long."""
 
+    name = "euler"
     order = 1
     formula = Formula((), (1.0, 0.0))
     check = _SIMPSON
@@ -87,6 +90,7 @@ class Lobatto2(SpaceScheme):
     One evaluation a node, and the fastest per step. Stable on any grid.
     """
 
+    name = "lobatto2"
     order = 2
     formula = Formula((), (0.5, 0.5))
     check = _SIMPSON
@@ -99,6 +103,7 @@ class Lobatto4(SpaceScheme):
     Two evaluations a node. Use it if the tip error must be below a thousandth of the length.
     """
 
+    name = "lobatto4"
     order = 4
     formula = _SIMPSON
     check = _BOOLE
@@ -106,4 +111,3 @@ class Lobatto4(SpaceScheme):
 
 #: the default
 LOBATTO2 = Lobatto2()
-SCHEMES: dict[str, SpaceScheme] = {"lobatto2": LOBATTO2, "lobatto4": Lobatto4(), "euler": Euler()}

@@ -83,12 +83,12 @@ class Stepper:
         else:
             check_initial(robot, initial, None)
             at_start = continued_state(robot, initial, settings, self.dt)
-        first = at_start.state.first_step(settings)
-        self._task = TimeIntegration(settings, self.dt, 1, first, recovery_budget)
+        known = at_start.state.known(settings)
+        self._task = TimeIntegration(settings, self.dt, 1, known, recovery_budget)
         self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
         self._steps, self._result = 0, int(at_start.result)
         self._control = np.asarray(at_start.control, dtype=float)
-        self._begun = at_start.state.dt is not None
+        self._begun, self._first_state = at_start.state.dt is not None, at_start.state
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
         row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0, 0.0, stages, np.zeros(0))
         self._state = self._row(row, self._control, self.time, at_start.state)
@@ -124,15 +124,14 @@ class Stepper:
         self._past, self._control, self._begun = after, control, True
         self._result = int(row.result)
         self._steps += 1
-        self._state = self._row(row, control, self.time, self._state_after(after, self.time))
+        self._state = self._row(row, control, self.time, self._state_after(after, self._steps))
         return self._state
 
     def preview(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Return the row that `step` would return, without changing the state. Raises the same errors."""
         control = self._checked(control)
         row, after = self._solve(control, stop)
-        time = self.time + self.dt
-        return self._row(row, control, time, self._state_after(after, time))
+        return self._row(row, control, self.time + self.dt, self._state_after(after, self._steps + 1))
 
     def _checked(self, control: Any) -> np.ndarray:
         try:
@@ -169,9 +168,10 @@ class Stepper:
             raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
         return row._replace(result=int(carried_results(np.array([result]), self._result)[0])), after
 
-    def _state_after(self, past: StateHistory, time: float) -> SolverState:
-        """Return the solver's state after a step."""
-        return SolverState(past._replace(t0=np.asarray(time)), self.dt, self._task.settings.uses_rate)
+    def _state_after(self, past: StateHistory, steps: int) -> SolverState:
+        """Return the solver's state after so many steps."""
+        past = past._replace(t0=np.asarray(self._t0 + steps * self.dt))
+        return self._first_state.after(past, self.dt, steps, self._task.settings)
 
     def _row(self, row: StepRows, control: np.ndarray, time: float, state: SolverState) -> Trajectory:
         single = StepRows(*(np.asarray(leaf)[None] for leaf in row))

@@ -12,7 +12,6 @@ from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
     GUESS_STATES,
-    FirstStep,
     StateHistory,
     coefficient_table,
 )
@@ -61,25 +60,25 @@ class StepRows(NamedTuple):
 
 
 class StepCoefficients(NamedTuple):
-    """Coefficients of a run's first step and of all later steps, its time step (s), and the ends of stages.
+    """Coefficients of a run's first steps and of all later ones, its time step (s), and the ends of stages.
 
-    A scheme of several stages has coefficients (2, stages, 4) and as many ends, as parts of a step.
+    A scheme of several stages has coefficients (rows, stages, n) and as many ends, as parts of a step.
     """
 
-    table: Float[Any, "2 4"]
+    table: Float[Any, "rows n"]
     dt: Any
     ends: Any = 1.0
 
     @classmethod
-    def of(cls, settings: Settings, dt: float, first: FirstStep = "start") -> StepCoefficients:
-        """Return the coefficients of a run with steps of dt (s)."""
+    def of(cls, settings: Settings, dt: float, known: int = 1) -> StepCoefficients:
+        """Return the coefficients of a run with steps of dt (s); `known` as in `coefficient_table`."""
         ends = np.array(settings.time.ends) if settings.time and settings.stages > 1 else 1.0
-        return cls(coefficient_table(settings, dt, first), dt, ends)
+        return cls(coefficient_table(settings, dt, known), dt, ends)
 
     def at(self, t0: Any, i: Any) -> tuple[Any, Any]:
         """Return the coefficients of step i, and the times (s) at its end or at those of its stages."""
         numeric: Any = jnp if is_traced((self, i)) else np
-        return numeric.where(i == 0, self.table[0], self.table[1]), t0 + (i + self.ends) * self.dt
+        return self.table[numeric.minimum(i, len(self.table) - 1)], t0 + (i + self.ends) * self.dt
 
 
 class TimeStep(NamedTuple):

@@ -139,8 +139,8 @@ def _step(
     y = still_state(system, space, control, guess).y
     _, y, found = Equilibria(still, 1).solve(system, control[None], y, (0, 1))
     records = still_state(system, space, control, y).records[:used]
-    steps = StepCoefficients.of(settings, 1.0 / c0, "regular")
-    count, past, parts = records.size, np.stack([records] * 2), []
+    steps = StepCoefficients.of(settings, 1.0 / c0, settings.memory)
+    count, past, parts = records.size, np.stack([records] * settings.memory), []
     for k in range(0, count, COLUMNS):
         m = min(COLUMNS, count - k)
         d_past = np.zeros((2, count, m))

@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, Bar, pulled
-from tests.learning.calibration.data import DT, FOUR, ROBOT, noisy, sines
 
 import knode_cosserat as kc
 from knode_cosserat.learning.calibration import search
@@ -22,6 +20,8 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.samples import DataError
 from knode_cosserat.solvers import semi_discrete
+from tests.learning.bar import BAR, WRONG, Bar, pulled
+from tests.learning.calibration.data import DT, FOUR, ROBOT, noisy, sines
 
 pytestmark = pytest.mark.slow
 

@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, pulled
-from tests.learning.calibration.data import FOUR, ROBOT, as_measured, noisy
 
 import knode_cosserat as kc
 from knode_cosserat.learning.calibration import search
@@ -14,6 +12,8 @@ from knode_cosserat.learning.calibration.calibrate import calibrate
 from knode_cosserat.learning.calibration.misfit import SegmentMisfit
 from knode_cosserat.learning.calibration.noise import by_states, errors_of
 from knode_cosserat.learning.calibration.unknowns import searched, unknowns_of, values
+from tests.learning.bar import BAR, WRONG, pulled
+from tests.learning.calibration.data import FOUR, ROBOT, as_measured, noisy
 
 
 def holds(result: Any, truth: kc.System) -> list[bool]:

@@ -4,10 +4,10 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, Bar, pulled
 
 from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
 from knode_cosserat.learning.calibration.unknowns import searched, unknowns_of, values
+from tests.learning.bar import BAR, Bar, pulled
 
 
 class Hanging(Bar):

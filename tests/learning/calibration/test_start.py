@@ -4,7 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, Bar, pulled
 
 import knode_cosserat as kc
 from knode_cosserat.learning.calibration.calibrate import calibrate
@@ -18,6 +17,7 @@ from knode_cosserat.learning.calibration.unknowns import (
     with_numbers,
 )
 from knode_cosserat.learning.samples import DataError
+from tests.learning.bar import BAR, Bar, pulled
 
 
 class Weighed(Bar):

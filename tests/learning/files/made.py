@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.learning.files.model_file import ModelFileError
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Network, Residual, input_size

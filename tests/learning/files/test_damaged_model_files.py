@@ -9,16 +9,16 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
+
+from knode_cosserat.learning.files import container, model_file
+from knode_cosserat.learning.files.model_file import ModelFileError, load_model
+from knode_cosserat.learning.knode import KNODE, About
 from tests.learning.files.made import (
     MODELS,
     ROBOT,
     fails,
     network,
 )
-
-from knode_cosserat.learning.files import container, model_file
-from knode_cosserat.learning.files.model_file import ModelFileError, load_model
-from knode_cosserat.learning.knode import KNODE, About
 
 # files that are not right
 

@@ -9,8 +9,15 @@ import hypothesis.strategies as st
 import jax
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
 from hypothesis import given, settings
+
+import knode_cosserat as kc
+from examples.hanging_string import HangingString
+from knode_cosserat.learning.files import container, model_file, unpacking
+from knode_cosserat.learning.files.model_file import ModelFileError, load_model
+from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.learning.structured.residual import Structured
 from tests.learning.files.made import (
     MODELS,
     ROBOT,
@@ -24,13 +31,6 @@ from tests.learning.files.made import (
     fails,
     network,
 )
-
-import knode_cosserat as kc
-from knode_cosserat.learning.files import container, model_file, unpacking
-from knode_cosserat.learning.files.model_file import ModelFileError, load_model
-from knode_cosserat.learning.knode import KNODE, About
-from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.structured.residual import Structured
 
 # round trips
 

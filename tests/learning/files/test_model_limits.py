@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
-from tests.limits import Readers, assert_limited
 
 from knode_cosserat._files.limits import VARIABLE
 from knode_cosserat.learning.files import container, unpacking
+from tests.limits import Readers, assert_limited
 
 READERS = Readers()
 TITLE = container.Title("test", 1)

@@ -7,12 +7,12 @@ import h5py
 import numpy as np
 import pytest
 import typer.testing
-from tests.learning.files.made import MODELS, ROBOT, STRING, TENSIONS, Pull, assert_same, fails, network
 
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.trajectory_system import TrajectoryFileError
+from tests.learning.files.made import MODELS, ROBOT, STRING, TENSIONS, Pull, assert_same, fails, network
 
 pytestmark = pytest.mark.slow
 

@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from examples.hanging_string import HangingString
-from studies import truths
-from tests.learning.bar import BAR, pulled
 
 import knode_cosserat as kc
+from examples.hanging_string import HangingString
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.closed_form import residuals_of
 from knode_cosserat.solvers.semi_discrete import History, Point
+from studies import truths
+from tests.learning.bar import BAR, pulled
 
 DT = 0.05
 UNSEEN = kc.controls.sine(1.5, 60, DT)

@@ -13,7 +13,6 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, pulled
 
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
 from knode_cosserat.learning.fit import fit
@@ -25,6 +24,7 @@ from knode_cosserat.learning.training.checkpoint import (
     unpacked,
 )
 from knode_cosserat.learning.training.progress import ProgressMonitor
+from tests.learning.bar import BAR, WRONG, pulled
 
 ROOT = Path(__file__).parents[3]
 CONFIG = FitConfig(

@@ -10,7 +10,6 @@ import numpy as np
 import optax
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.learning.bar import BAR, WRONG, pulled
 
 import knode_cosserat as kc
 from knode_cosserat.learning.config import NetworkOptions, Training
@@ -26,6 +25,7 @@ from knode_cosserat.learning.training.losses import (
     value_scales,
 )
 from knode_cosserat.solvers import semi_discrete
+from tests.learning.bar import BAR, WRONG, pulled
 
 DT = 0.05
 

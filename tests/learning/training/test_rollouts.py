@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from tests.learning.bar import BAR, WRONG, pulled
 
 import knode_cosserat as kc
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, StructuredOptions
@@ -27,6 +26,7 @@ from knode_cosserat.learning.training.rollouts import (
 )
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.learning.training.stages import RolloutRun
+from tests.learning.bar import BAR, WRONG, pulled
 
 OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)
 

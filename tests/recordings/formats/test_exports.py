@@ -6,7 +6,6 @@ import gzip
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from tests.recordings.formats import exported
 
 from knode_cosserat.recordings import (
     BaseSource,
@@ -18,6 +17,7 @@ from knode_cosserat.recordings import (
     load_recording,
 )
 from knode_cosserat.recordings.formats import format_of, formats
+from tests.recordings.formats import exported
 
 TIME = exported.times()
 LOST = range(80, 90)

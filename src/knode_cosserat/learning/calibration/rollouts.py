@@ -151,7 +151,7 @@ def _differences(
     """Return differences (M,) of solved rows from measurements, and their derivatives (M, n)."""
     settings, ny, n = task.settings, robot.y_layout.size, len(coordinates)
     directions, past, d_past = _started(
-        robot, coordinates, rows.before, rows.past, unknowns, settings, task.first == "start"
+        robot, coordinates, rows.before, rows.past, unknowns, settings, task.known == 1
     )
     moves, first = SystemMoves(directions, np.eye(n)), np.asarray(rows.first)
     d_first = np.zeros((*first.shape, n))
@@ -293,8 +293,8 @@ class RolloutMisfit:
                 return None
         else:
             at_start = continued_state(system, initial, settings, dt)
-        first = at_start.state.first_step(settings)
-        task = TimeIntegration(settings, dt, len(control), first)
+        known = at_start.state.known(settings)
+        task = TimeIntegration(settings, dt, len(control), known)
         acting = at_stages(system, settings, control, at_start.control, at_start.state.dt is None)
         found, _, cause = run_one(task, system, acting, at_start.state.history, at_start.control)
         if cause:
