@@ -15,7 +15,6 @@ from typing import Any, NamedTuple, cast
 from knode_cosserat import controls
 from knode_cosserat.evaluation.metrics import pose_mse, tip_dtw
 from knode_cosserat.evaluation.tables import Cell, Published
-from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
@@ -128,7 +127,7 @@ class _Kept:
             self.files[name] = path.read_bytes()
 
     def model(self, model: KNODE, name: str) -> None:
-        self.files[f"models/{name}"] = encoded(model, name)
+        self.files[f"models/{name}"] = model.to_bytes()
 
 
 class _Outcome(NamedTuple):

@@ -8,10 +8,10 @@ from typing import Any
 
 from knode_cosserat.evaluation import study_figures
 from knode_cosserat.evaluation.tables import Cell, as_csv, as_markdown
+from knode_cosserat.loading import load_trajectory
 from knode_cosserat.studies import runner, simulation
 from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 from knode_cosserat.trajectory import Trajectory
-from knode_cosserat.trajectory_file import load_trajectory
 
 Facts = Mapping[str, Mapping[str, Any]]
 
