@@ -17,7 +17,7 @@ LAYERS = (
     ("errors", "_files", "_jax", "_lazy", "_numbers", "_processes", "_program_cache", "_reprs", "rotation"),
     ("io",),
     ("rods", "robots"),
-    ("controls", "_signals"),
+    ("controls",),
     ("solvers", "engine", "trajectory"),
     ("named_controls",),
     ("metrics", "evaluation.metrics", "evaluation.state_errors"),

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer.testing
-from knode_cosserat.learning.knode import load_model
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
 from knode_cosserat.evaluation.tables import MEASURES, spreads
+from knode_cosserat.learning.knode import load_model
 from knode_cosserat.studies import methods, simulation
 from knode_cosserat.studies.simulation_report import cells_of, rerun
 
