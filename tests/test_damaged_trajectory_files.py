@@ -32,7 +32,7 @@ def test_files_that_are_something_else(tmp_path, path):
         load_trajectory(tmp_path)
     for content in (b"", b"CDF\x01 an older netCDF", b"time,p\n0,1\n"):
         (tmp_path / "other.nc").write_bytes(content)
-        with fails("other.nc: not a knode-cosserat trajectory (netCDF-4 file)"):
+        with fails("other.nc: not a netCDF-4 file; allowed is a knode-cosserat trajectory"):
             load_trajectory(tmp_path / "other.nc")
     xarray.Dataset({"p": ("time", [1.0, 2.0])}).to_netcdf(tmp_path / "foreign.nc", engine="h5netcdf")
     with fails("foreign.nc: truncated, or damaged, or written by another program"):

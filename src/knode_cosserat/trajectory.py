@@ -40,6 +40,8 @@ class Trajectory(eqx.Module):
     `held_tension` of row k act from row k to row k + 1, here, in `Measurements` and in files. `control` is
     the control in each row's own equations, which acted up to that row. Rows that were not solved are NaN;
     `result` says why. A pytree: it can be returned from a jitted function.
+
+    The last three fields are states of the solver, from which a motion continues exactly.
     """
 
     system: System
@@ -59,17 +61,20 @@ class Trajectory(eqx.Module):
     position_error: Any = None
     #: estimated error of positions (m) by the time steps, the largest over the nodes; NaN or None: unknown
     time_error: Any = None
+    #: True in rows outside the training range of a learned or identified model; None if unknown
+    extrapolated: Any = None
+    #: True if intermediate rows were left out: the controls held there are not known
+    thinned: bool = eqx.field(static=True, default=False)
+
+    # states of the solver
+
     #: state of the solver in row 0 of a motion; None for equilibria, and where it is unknown
     initial_state: SolverState | None = None
     #: state of the solver in the last row, from which a motion continues exactly; None as for `initial_state`
     final_state: SolverState | None = None
-    #: True in rows outside the training range of a learned or identified model; None if unknown
-    extrapolated: Any = None
     #: states y, z (and y_s, where rows have it) at the stages of the time scheme before each row, which its
     #: history needs: (*batch, T, stages - 1, N, x); None for schemes of one stage, and where they are unknown
     stages: Any = None
-    #: True if intermediate rows were left out: the controls held there are not known
-    thinned: bool = eqx.field(static=True, default=False)
 
     # named parts
 

@@ -118,7 +118,7 @@ def load_system(name: str, changes: list[str] | None = None, nodes: int | None =
             f"{name}: this is a recording or table; allowed is a robot or a model. To check a recording, "
             f"type: {command_line('inspect', name)}"
         )
-    if kind == MODEL:
+    if kind in (MODEL, "HDF5"):
         return modified(kc.load_model(name), changes, nodes)
     if os.path.isdir(name):
         raise ValueError(

@@ -294,17 +294,22 @@ def _fields_of(cls: Any) -> tuple[str, ...]:
 
 
 def kind_of(path: str | Path) -> str:
-    """Return the kind of a file by its last line, such as "knode-cosserat model"; empty for other files."""
+    """Return the kind of a file by its last line, such as "knode-cosserat model".
+
+    It is "HDF5" for an HDF5 file that does not end as a container, and empty for any other file.
+    """
     try:
         # checked first: opening a pipe would block until somebody writes
         if not os.path.isfile(path):
             return ""
         with open(path, "rb") as file:
+            if file.read(len(_MAGIC)) != _MAGIC:
+                return ""
             file.seek(max(0, file.seek(0, io.SEEK_END) - _LONGEST_LINE))
             line = _LAST_LINE.search(file.read())
     except OSError:
         return ""
-    return line[1].decode("ascii") if line else ""
+    return line[1].decode("ascii") if line else "HDF5"
 
 
 def read(path: str | Path, kind: Kind, classes: Mapping[str, type] | None = None) -> Content:
@@ -350,7 +355,7 @@ def decoded(data: bytes, kind: Kind, source: str, classes: Mapping[str, type] | 
 def _require_whole(data: bytes, kind: Kind) -> None:
     """Raise `ContainerError` unless bytes are of this kind and version, and have their checksum."""
     if not data.startswith(_MAGIC):
-        raise ContainerError(f"not a {kind.name} (netCDF-4 file)")
+        raise ContainerError(f"not a netCDF-4 file; allowed is a {kind.name}")
     line = _LAST_LINE.search(data, max(0, len(data) - _LONGEST_LINE))
     if line is None:
         raise ContainerError(

@@ -236,7 +236,7 @@ def _loaded(robot: str | System, changes: Mapping[str, Any]) -> System:
 
 
 def _load(name: str) -> System:
-    if kind_of(name) == "knode-cosserat model":
+    if kind_of(name) in ("knode-cosserat model", "HDF5"):
         from knode_cosserat.learning.knode import load_model
 
         return load_model(name)
