@@ -18,7 +18,6 @@ from knode_cosserat.identification.fit import fit as learn
 from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
 from knode_cosserat.learning.config import FitConfig
-from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.samples import DataError
@@ -347,7 +346,7 @@ def predicted(settings: Any) -> Product:
     files = {}
     for seed, system in learned.systems.items():
         if isinstance(system, KNODE):
-            files[f"models/{method}-{seed}"] = encoded(system, f"{method}-{seed}")
+            files[f"models/{method}-{seed}"] = system.to_bytes()
         elif isinstance(system, System) and method != "baseline":
             about = f"identified from {', '.join(settings['train'])}, for space={learned.space!r}"
             files[f"models/{method}.yaml"] = format_robot(system, about).encode()

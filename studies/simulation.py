@@ -13,14 +13,13 @@ from pathlib import Path
 from typing import Any, cast
 
 from knode_cosserat import controls
-from knode_cosserat.learning.files.model_file import encoded
 from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.loading import load_trajectory
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
-from knode_cosserat.trajectory_file import load_trajectory
 from studies import figures, runner
 from studies.comparisons import compared
 from studies.methods import METHODS
@@ -131,7 +130,7 @@ class _Kept:
             self.files[name] = path.read_bytes()
 
     def model(self, model: KNODE, name: str) -> None:
-        self.files[f"models/{name}"] = encoded(model, name)
+        self.files[f"models/{name}"] = model.to_bytes()
 
 
 def predicted(system: System | str, control: str, rows: int, dt: float) -> Trajectory | str:

@@ -2,13 +2,12 @@
 
 import zipfile
 
-import h5py
 import hypothesis.strategies as st
 import numpy as np
 import pytest
 from hypothesis import given
 
-from knode_cosserat import controls, trajectory_integrity
+from knode_cosserat import controls
 from knode_cosserat._files import csv_rows, limits, yaml_text
 from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
@@ -115,16 +114,6 @@ def policy_size_when_unpacked(folder, patch):
 def policy_layers(folder, patch):
     patch.setattr(policy, "MOST_LAYERS", 1)
     return lambda: policy.Policy.load(saved_policy(folder))
-
-
-@READERS
-def trajectory_expansion(folder, patch):
-    path = folder / "it.nc"
-    with h5py.File(path, "w") as file:
-        file.create_dataset("y", (1000,), "f8", chunks=(100,))
-    patch.setattr(trajectory_integrity, "EXPANSION", 0)
-    patch.setattr(trajectory_integrity, "ALLOWANCE", 7999)
-    return lambda: trajectory_integrity.require_own_data(path)
 
 
 @pytest.mark.parametrize("name", READERS)

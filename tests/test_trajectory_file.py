@@ -4,7 +4,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import h5py
 import hypothesis.strategies as st
 import numpy as np
 import pytest
@@ -12,9 +11,20 @@ import xarray
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from knode_cosserat import trajectory_file, trajectory_system
-from knode_cosserat.trajectory_file import load_trajectory, save
-from tests.trajectories import ROBOT, ROBOTS, Leapfrog, Pendulum, assert_same, fails, stacked, synthetic
+from knode_cosserat import loading, trajectory
+from knode_cosserat.io import container
+from knode_cosserat.loading import load_trajectory
+from tests.trajectories import (
+    ROBOT,
+    ROBOTS,
+    Leapfrog,
+    Pendulum,
+    assert_same,
+    edited,
+    fails,
+    stacked,
+    synthetic,
+)
 
 # round trips
 
@@ -49,7 +59,7 @@ def test_trajectories_come_back_the_same(tmp_path, trajectory):
 def test_trajectories_of_any_size_come_back_the_same(tmp_path_factory, batch, steps, nodes, seed):
     path = tmp_path_factory.mktemp("trajectories") / "a.nc"
     trajectory = synthetic((batch,) if batch else (), steps, nodes, seed=seed)
-    save(trajectory, path)
+    trajectory.save(path)
     assert_same(load_trajectory(path), trajectory)
 
 
@@ -85,12 +95,10 @@ def test_settings_come_back_the_same(tmp_path, chosen):
 def test_a_users_scheme_is_found_while_it_exists(tmp_path):
     path = tmp_path / "a.nc"
     trajectory = synthetic(settings=kc.solvers.Settings(time=Leapfrog(0.25)))
-    save(trajectory, path)
+    trajectory.save(path)
     assert_same(load_trajectory(path), trajectory)
-    with h5py.File(path, "a") as file:
-        file.attrs["format_version"] = 1  # without a checksum
-        file.attrs["settings"] = file.attrs["settings"].replace("Leapfrog", "Hopfrog")
-    with fails("attribute 'settings'", "no TimeScheme is called 'Hopfrog'", "BDF2"):
+    edited(path, facts=lambda text: text.replace("Leapfrog", "Hopfrog"))
+    with fails("'settings' is not understood", "no TimeScheme is called 'Hopfrog'", "BDF2"):
         load_trajectory(path)
 
 
@@ -122,75 +130,61 @@ def test_a_robot_with_a_part_made_of_code_is_asked_for(tmp_path, part, batch):
     assert_same(load_trajectory(tmp_path / "a.nc", system=robot), trajectory)
 
 
-@pytest.fixture
-def codec(monkeypatch):
-    """Pendulums as text, whose length in mm a file can hold; longer ones cannot be written."""
+class Measured(Pendulum):
+    """A pendulum that a file can hold as text, its length in mm; longer ones cannot be written."""
 
-    def encode(pendulum, source):
-        if pendulum.length > 0.9:
-            raise ValueError(f"{source}: too long")
-        return f"{float(pendulum.length) * 1000:.0f} mm".encode()
+    def to_bytes(self):
+        if self.length > 0.9:
+            raise ValueError("too long")
+        return f"{float(self.length) * 1000:.0f} mm".encode()
 
-    def decode(data, source):
+    @staticmethod
+    def read(data):
         try:
-            return Pendulum(int(data.removesuffix(b" mm")) / 1000)
+            return Measured(int(data.removesuffix(b" mm")) / 1000)
         except ValueError:
-            raise ValueError(f"{source}: not a pendulum: {data!r}") from None
+            raise ValueError(f"not a pendulum: {data!r}") from None
 
-    monkeypatch.setattr(trajectory_system, "_codecs", {})
-    trajectory_system.register_codec(Pendulum, encode, decode)
+
+READERS = {"Measured": Measured.read}
 
 
 @pytest.mark.parametrize(
     ("batch", "lengths"),
     [((), 0.5), ((2,), 0.5), ((3,), [0.5, 0.1, 0.025]), ((1,), [0.25])],
 )
-def test_a_system_with_a_codec_is_in_the_file(tmp_path, codec, batch, lengths):
-    robot = Pendulum(lengths) if isinstance(lengths, float) else stacked(*map(Pendulum, lengths))
-    trajectory = synthetic(batch, robot=robot)
-    trajectory.save(tmp_path / "a.nc")
-    assert_same(load_trajectory(tmp_path / "a.nc"), trajectory)
-    assert_same(load_trajectory(tmp_path / "a.nc", system=robot), trajectory)
+def test_a_system_of_bytes_is_in_the_file(tmp_path, batch, lengths):
+    robot = Measured(lengths) if isinstance(lengths, float) else stacked(*map(Measured, lengths))
+    moved = synthetic(batch, robot=robot)
+    moved.save(tmp_path / "a.nc")
+    assert_same(trajectory.load_trajectory(tmp_path / "a.nc", readers=READERS), moved)
+    assert_same(load_trajectory(tmp_path / "a.nc", system=robot), moved)
+    with fails("there is no reader of its system, a Measured: give it"):
+        load_trajectory(tmp_path / "a.nc")
 
 
-def test_what_a_codec_cannot_write_is_asked_for(tmp_path, codec):
-    for pendulum in (Pendulum(0.95), stacked(Pendulum(0.5), Pendulum(0.95))):
-        trajectory = synthetic((2,), robot=pendulum)
-        trajectory.save(tmp_path / "a.nc")
-        with fails("does not describe its system, a Pendulum (a Pendulum: too long)", "system=…"):
-            load_trajectory(tmp_path / "a.nc")
-        assert_same(load_trajectory(tmp_path / "a.nc", system=pendulum), trajectory)
+def test_a_system_that_cannot_be_written_is_asked_for(tmp_path):
+    for pendulum in (Measured(0.95), stacked(Measured(0.5), Measured(0.95))):
+        moved = synthetic((2,), robot=pendulum)
+        moved.save(tmp_path / "a.nc")
+        with fails("does not describe its system, a Measured (too long)", "system=…"):
+            trajectory.load_trajectory(tmp_path / "a.nc", readers=READERS)
+        assert_same(load_trajectory(tmp_path / "a.nc", system=pendulum), moved)
 
 
-def test_bytes_of_systems_that_are_not_right(tmp_path, codec, monkeypatch):
+def test_bytes_of_systems_that_are_not_right(tmp_path):
     path = tmp_path / "a.nc"
-    robots = stacked(Pendulum(0.5), Pendulum(0.025))
-    synthetic((2,), robot=robots).save(path)
-    data = xarray.load_dataset(path, decode_cf=False)
-    data.attrs["format_version"] = 1  # without a checksum
-    assert data["system_sizes"].values.tolist() == [6, 5]
-    for sizes in ([6, 6], [11, 0], [-1, 12], [2**62, 2**62], [6.0, 5.0]):
-        changed = data.assign(system_sizes=("batch", np.array(sizes)))
-        changed.to_netcdf(path, engine="h5netcdf")
-        with fails("a.nc: the variable 'system_bytes' does not hold what it should"):
-            load_trajectory(path)
-    data.assign(system_sizes=("batch", [5, 6])).to_netcdf(path, engine="h5netcdf")
-    with fails("a.nc: variable 'system_bytes': not a pendulum: b'500 m'", "or give it", "system=…"):
-        load_trajectory(path)
-    data.drop_vars("system_sizes").to_netcdf(path, engine="h5netcdf")
-    with fails("a.nc: variable 'system_bytes': not a pendulum: b'500 mm25 mm'"):
-        load_trajectory(path)
-    data.assign(system_bytes=("system_byte", np.zeros(11))).to_netcdf(path, engine="h5netcdf")
-    with fails("the variable 'system_bytes' does not hold"):
-        load_trajectory(path)
-    data.to_netcdf(path, engine="h5netcdf")
-    monkeypatch.setattr(trajectory_system, "_codecs", {})
-    with fails("nothing that is imported here reads its system, a Pendulum: give it"):
-        load_trajectory(path)
+    for readers, parts in (
+        ({"Measured": lambda data: Measured.read(data[1:])}, ("a Measured: not a pendulum", "or give it")),
+        ({"Measured": lambda data: ROBOT if data == b"25 mm" else Measured.read(data)}, ("or give it",)),
+    ):
+        synthetic((2,), robot=stacked(Measured(0.005), Measured(0.025))).save(path)
+        with fails("a.nc: its system, ", *parts):
+            trajectory.load_trajectory(path, readers=readers)
 
 
 def test_reading_asks_nothing_of_pickle_or_eval():
-    for module in (trajectory_file, trajectory_system):
+    for module in (trajectory, loading, container):
         source = Path(module.__file__).read_text(encoding="utf-8")
         assert not re.search(r"\b(pickle|eval|exec|import_module)\b", source)
 
@@ -210,6 +204,7 @@ def test_labels(tmp_path):
         assert data["tension"].dims == ("batch", "time", "tension_index")
         assert data["result"].dims == ("batch", "time")
         assert data["p"].attrs == {"units": "m", "long_name": "position, global frame"}
+        assert set(data.coords) == {"time", "arclength", "axis", "quaternion", "tension_index"}
         assert {name: data[name].attrs["units"] for name in ("time", "arclength", "n", "u", "tension")} == {
             "time": "s", "arclength": "m", "n": "N", "u": "1/m", "tension": "N",
         }  # fmt: skip
@@ -226,9 +221,9 @@ def test_labels(tmp_path):
         assert flags["no_convergence"] == int(kc.Result.NO_CONVERGENCE)
         assert data["result"].flag_values.dtype == data["result"].dtype
         assert data.attrs["format"] == "knode-cosserat trajectory"
-        assert data.attrs["format_version"] == 2
+        assert data.attrs["format_version"] == 1
         assert "length: 0.635  # m" in data.attrs["robot"]
-        assert '"scheme": "SDIRK2"' in data.attrs["settings"]
+        assert '"scheme":"SDIRK2"' in data.attrs["facts"]
         assert {"title", "knode_cosserat_version"} <= set(data.attrs)
 
 

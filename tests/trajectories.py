@@ -1,18 +1,22 @@
 """Trajectories of random numbers to be saved, and what tests of their files have in common."""
 
 import dataclasses
+import hashlib
+import io
 import re
 from typing import Any, ClassVar
 
+import h5py
 import jax
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.io.container import _LAST_LINE
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.solvers.history import SolverState, StateHistory
 from knode_cosserat.solvers.time import TimeScheme
-from knode_cosserat.trajectory_system import TrajectoryFileError
+from knode_cosserat.trajectory import TrajectoryFileError
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 PAPER = kc.solvers.Settings()
@@ -55,6 +59,26 @@ HOPELESS = [1e8, 0.0, 0.0, 1e8]
 def fails(*parts):
     """A `TrajectoryFileError` of one line that has all the parts, in order."""
     return pytest.raises(TrajectoryFileError, match=r"^(?!.*\n).*" + ".*".join(map(re.escape, parts)))
+
+
+def edited(path, edit=None, facts=None):
+    """Change the content of a container, with a new checksum; `facts` changes their JSON text."""
+    data = path.read_bytes()
+    line = _LAST_LINE.search(data)
+    file = io.BytesIO(data[: line.start()])
+    with h5py.File(file, "r+") as opened:
+        if edit is not None:
+            edit(opened)
+        if facts is not None:
+            opened.attrs["facts"] = facts(opened.attrs["facts"])
+    path.write_bytes(sealed(file.getvalue(), line))
+    return path
+
+
+def sealed(content, line):
+    """The bytes of a container with this content; `line` is the match of another one's last line."""
+    content += line[0][: line.start(4) - line.start()]
+    return content + hashlib.sha256(content).hexdigest().encode() + b"\n"
 
 
 def assert_same(a, b):

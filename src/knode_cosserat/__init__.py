@@ -37,14 +37,13 @@ if TYPE_CHECKING:
     from knode_cosserat.identification.fit import fit
     from knode_cosserat.identification.identify import identify
     from knode_cosserat.learning import KNODE, FitConfig, load_model
+    from knode_cosserat.loading import load_trajectory
     from knode_cosserat.recordings import estimate_states, load_recording
     from knode_cosserat.robots import System, catalog, load_robot, save_robot
     from knode_cosserat.solvers import Result, SimulationError, equilibrium, simulate
     from knode_cosserat.statics.reach import inverse_kinematics
     from knode_cosserat.statics.workspace import workspace
-    from knode_cosserat.trajectory import Trajectory
-    from knode_cosserat.trajectory_file import load_trajectory
-    from knode_cosserat.trajectory_system import TrajectoryFileError
+    from knode_cosserat.trajectory import Trajectory, TrajectoryFileError
     from knode_cosserat.viewer import view
 
 __all__ = [
@@ -97,14 +96,13 @@ make_lazy(
         "knode_cosserat.errors": "KnodeCosseratError",
         "knode_cosserat.identification": "fit identify",
         "knode_cosserat.learning": "KNODE FitConfig load_model",
+        "knode_cosserat.loading": "load_trajectory",
         "knode_cosserat.recordings": "estimate_states load_recording",
         "knode_cosserat.rods.robot_file": "catalog load_robot save_robot",
         "knode_cosserat.rods.system": "System",
         "knode_cosserat.solvers": "Result SimulationError equilibrium simulate",
         "knode_cosserat.statics": "inverse_kinematics workspace",
-        "knode_cosserat.trajectory": "Trajectory",
-        "knode_cosserat.trajectory_file": "load_trajectory",
-        "knode_cosserat.trajectory_system": "TrajectoryFileError",
+        "knode_cosserat.trajectory": "Trajectory TrajectoryFileError",
         "knode_cosserat.viewer": "view",
     },
 )

@@ -18,8 +18,7 @@ from knode_cosserat import controls
 from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat._signals import Sampled, checked_tensions, require_effect, step_times
-from knode_cosserat.controls import ControlsError
+from knode_cosserat.controls import ControlsError, Sampled, checked_tensions, require_effect, step_times
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 

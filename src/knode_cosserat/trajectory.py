@@ -1,8 +1,17 @@
-"""Result of a simulation: states over time, with the result of each step."""
+"""Result of a simulation, states over time with the result of each step, and its file.
+
+`Trajectory.save` writes a `container`, which any netCDF tool reads: every field of y, z and the controls is a
+variable under its own name, with unit and meaning, over the dimensions (batch,) time, node and component. The
+robot is an attribute, as the text of a robot file; settings and states of the solver are in the facts. Arrays
+are stored exactly. Reading runs no code from the file.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, Self
 
 import equinox as eqx
@@ -11,10 +20,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, quantity
+from knode_cosserat.errors import KnodeCosseratError, first_line
+from knode_cosserat.io import container
+from knode_cosserat.io.container import ContainerError, Variable
+from knode_cosserat.rods import robot_file
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.history import SolverState
+from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.settings import Settings
 
@@ -26,6 +40,8 @@ class Trajectory(eqx.Module):
     `held_tension` of row k act from row k to row k + 1, here, in `Measurements` and in files. `control` is
     the control in each row's own equations, which acted up to that row. Rows that were not solved are NaN;
     `result` says why. A pytree: it can be returned from a jitted function.
+
+    The last three fields are states of the solver, from which a motion continues exactly.
     """
 
     system: System
@@ -45,17 +61,20 @@ class Trajectory(eqx.Module):
     position_error: Any = None
     #: estimated error of positions (m) by the time steps, the largest over the nodes; NaN or None: unknown
     time_error: Any = None
+    #: True in rows outside the training range of a learned or identified model; None if unknown
+    extrapolated: Any = None
+    #: True if intermediate rows were left out: the controls held there are not known
+    thinned: bool = eqx.field(static=True, default=False)
+
+    # states of the solver
+
     #: state of the solver in row 0 of a motion; None for equilibria, and where it is unknown
     initial_state: SolverState | None = None
     #: state of the solver in the last row, from which a motion continues exactly; None as for `initial_state`
     final_state: SolverState | None = None
-    #: True in rows outside the training range of a learned or identified model; None if unknown
-    extrapolated: Any = None
     #: states y, z (and y_s, where rows have it) at the stages of the time scheme before each row, which its
     #: history needs: (*batch, T, stages - 1, N, x); None for schemes of one stage, and where they are unknown
     stages: Any = None
-    #: True if intermediate rows were left out: the controls held there are not known
-    thinned: bool = eqx.field(static=True, default=False)
 
     # named parts
 
@@ -279,10 +298,266 @@ class Trajectory(eqx.Module):
             system, self.settings, time, **picked, initial_state=initial, final_state=final, thinned=thinned
         )
 
-    def save(self, path: Any) -> None:
-        """Write a labelled netCDF file (see `trajectory_file.save`)."""
-        provided(type(self), "save")(self, path)
+    def save(self, path: str | Path) -> None:
+        """Write a labelled netCDF-4 file that `load_trajectory` reads back equal.
+
+        The file is written completely or not at all. For a system that no file can describe, the states are
+        still written, and `load_trajectory` needs the system as an argument.
+
+        Raises:
+            TrajectoryFileError: the arrays do not fit together, or the file cannot be written.
+        """
+        with KIND.naming(path):
+            content = _encoded(self)
+        container.write(path, content, KIND)
 
 
 def _picked(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+# files
+
+
+class TrajectoryFileError(KnodeCosseratError, ValueError):
+    """A trajectory's file cannot be read or written; the message is one line with the reason."""
+
+    code = "trajectory-file"
+
+
+KIND = container.Kind("knode-cosserat trajectory", 1, TrajectoryFileError)
+#: prefix of a parameter's name if each robot of a batch has its own value
+PARAMETER = "robot_"
+_STATES: dict[str, type] = {"SolverState": SolverState, "StateHistory": StateHistory}
+#: variables with one number in each row: name, unit, meaning; the first three are always there
+_ROWS = {
+    "result": ("1", "how the step ended; below zero: not solved"),
+    "residual": ("1", "largest residual, in natural units"),
+    "iterations": ("1", "Newton corrections"),
+    "position_error": ("m", "estimated discretisation error of positions, the largest over the nodes"),
+    "time_error": ("m", "estimated error of positions by the time steps, the largest over the nodes"),
+    "extrapolated": ("1", "1 in rows outside the range that the model was trained in"),
+}
+_HINT = "give it, load_trajectory(path, system=…)"
+
+
+def _encoded(trajectory: Trajectory) -> bytes:
+    """Return the bytes of a trajectory's file."""
+    system = trajectory.system
+    _require_names(system)
+    batch = ("batch",) if np.ndim(trajectory.y) == 4 else ()
+    rows = (*batch, "time")
+    arclength = np.asarray(trajectory.arclength)
+    variables = {
+        "time": Variable(trajectory.time, ("time",), _label("s", "time")),
+        "arclength": Variable(
+            arclength, (*batch, "node")[-arclength.ndim :], _label("m", "arclength of the nodes")
+        ),
+    }
+    for k, (layout, packed) in enumerate(trajectory._layouts()):
+        control = k == 2
+        for field in layout.fields:
+            component, names = f"{field.name}_index", np.arange(1, field.size + 1)
+            if field.name == "h" and field.size == 4:
+                component, names = "quaternion", np.array(["w", "x", "y", "z"])
+            elif field.size == 3 and not control:
+                component, names = "axis", np.array(["x", "y", "z"])
+            variables[component] = Variable(names, (component,))
+            label = _label(field.unit, field.meaning)
+            label |= {"comment": _ACTED} if control else {"coordinates": "arclength"}
+            dimensions = (*rows, component) if control else (*rows, "node", component)
+            variables[field.name] = Variable(layout.get(np.asarray(packed), field.name), dimensions, label)
+    for name, (unit, meaning) in _ROWS.items():
+        if getattr(trajectory, name) is not None:
+            values = np.asarray(getattr(trajectory, name))
+            label = _label(unit, meaning)
+            if name == "result":  # by the CF conventions
+                label["flag_values"] = np.array([int(code) for code in Result], values.dtype)
+                label["flag_meanings"] = " ".join(code.name.lower() for code in Result)
+            values = values.astype(np.int8) if values.dtype.kind == "b" else values
+            variables[name] = Variable(values, rows, label)
+    facts: dict[str, Any] = {
+        "settings": None if trajectory.settings is None else trajectory.settings.described(),
+        "thinned": trajectory.thinned,
+        **{name: getattr(trajectory, name) for name in ("initial_state", "final_state", "stages")},
+    }
+    attributes = {
+        "title": f"Trajectory of a {type(system).__name__}",
+        "comment": "Row 0 is the initial state, row i the state after control i; NaN if not solved.",
+        "system": type(system).__name__,
+    }
+    many = np.ndim(system.length) > 0
+    robots: list[Any] = [_picked(system, i) for i in range(len(system.length))] if many else [system]
+    try:
+        if type(system) in robot_file.KINDS.values():
+            attributes["robot"] = robot_file.format_robot(robots[0])
+            variables |= _parameters(system) if many else {}
+        elif hasattr(system, "to_bytes"):
+            parts = [np.frombuffer(robot.to_bytes(), np.uint8) for robot in robots]
+            facts["model"] = parts if many else parts[0]
+    except ValueError as error:  # a part is a Python function, for example
+        facts["system_missing"] = first_line(error)
+    return container.encoded(KIND, facts, variables=variables, attributes=attributes, classes=_STATES)
+
+
+#: comment on each control about its interval
+_ACTED = "row i acted from row i - 1 to row i; row 0 before the motion"
+
+
+def _label(unit: str, meaning: str) -> dict[str, Any]:
+    return {"units": unit, "long_name": meaning}
+
+
+def _require_names(system: System) -> None:
+    """Raise `ContainerError` unless every field's name can be a variable's name."""
+    used = {"time", "node", "batch", "arclength", "axis", "quaternion", "arrays", *_ROWS}
+    for layout in (system.y_layout, system.z_layout, system.control_layout):
+        for name in layout.names:
+            if name in used or "/" in name or name.startswith(PARAMETER) or name.endswith("_index"):
+                raise ContainerError(
+                    f"a {type(system).__name__} has a field {name!r}; in a file that name is taken, by "
+                    "another field or otherwise, or impossible"
+                )
+            used.add(name)
+
+
+def _parameters(system: System) -> dict[str, Variable]:
+    """Return the parameters of a batch of robots, and of their parts, as variables."""
+    variables = {}
+    for name, parameter, values in _numbers(system):
+        dimensions = ("batch", *(f"{PARAMETER}{name}_{k}" for k in range(1, np.ndim(values))))
+        variables[PARAMETER + name] = Variable(values, dimensions, _label(parameter.unit, parameter.meaning))
+    return variables
+
+
+def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any]]:
+    """Yield every parameter that is set, of a robot and its parts: name for `System.replace`, and value.
+
+    Places are left out: they are equal for all robots of a batch.
+    """
+    fixed = {field.name for field in dataclasses.fields(owner) if field.metadata.get("static")}
+    for name, parameter in parameters_of(type(owner)).items():
+        value = getattr(owner, name)
+        if value is not None and name not in fixed:
+            yield before + name, parameter, value
+    for name in slots_of(type(owner)):
+        parts = getattr(owner, name)
+        for k, part in enumerate(parts) if isinstance(parts, tuple) else [(None, parts)]:
+            if part is not None:
+                yield from _numbers(part, f"{before}{name}." if k is None else f"{before}{name}.{k}.")
+
+
+def load_trajectory(
+    path: str | Path, *, system: System | None = None,
+    readers: Mapping[str, Callable[[bytes], System]] | None = None,
+) -> Trajectory:  # fmt: skip
+    """Read a trajectory that `Trajectory.save` wrote.
+
+    Args:
+        path: the file.
+        system: the trajectory's system. Only needed for a system that no file can describe, such as one of a
+            user's class.
+        readers: for names of classes without a robot file, the function that makes a system from the bytes
+            of its method `to_bytes`.
+
+    Raises:
+        TrajectoryFileError: the file cannot be read, is not a trajectory, or has invalid contents.
+    """
+    content = container.read(path, KIND, _STATES)
+    with KIND.naming(path):
+        return _trajectory(content, _system(content, readers or {}) if system is None else system)
+
+
+def _trajectory(content: container.Content, system: System) -> Trajectory:
+    time, rows = content.values("time"), content.values("result").shape
+    nodes = content.values("arclength").shape[-1:]
+
+    def packed(layout: Layout, along: tuple[int, ...]) -> np.ndarray:
+        fields = [content.values(field.name, (*rows, *along, field.size)) for field in layout.fields]
+        return np.concatenate(fields, axis=-1) if fields else np.zeros((*rows, *along, 0))
+
+    y, z = packed(system.y_layout, nodes), packed(system.z_layout, nodes)
+    numbers: dict[str, Any] = {
+        name: content.values(name, rows) for k, name in enumerate(_ROWS) if k < 3 or name in content.variables
+    }
+    if "extrapolated" in numbers:
+        numbers["extrapolated"] = numbers["extrapolated"].astype(bool)
+    _require_possible(time, numbers, y)
+    described = content.fact("settings", dict | None)
+    try:
+        settings = None if described is None else Settings.from_description(described)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise ContainerError(f"'settings' is not understood: {first_line(error)}") from None
+    states = {name: content.fact(name, SolverState | None) for name in ("initial_state", "final_state")}
+    for name, state in states.items():
+        history = state.history if state is not None else None
+        if history is not None and not (
+            isinstance(history, StateHistory)
+            and np.shape(history.t0) == rows[:-1]
+            and np.shape(history.records)[:-2] == (*rows[:-1], 2)
+            and np.shape(history.y)[:-2] == (*rows[:-1], GUESS_STATES)
+        ):
+            raise ContainerError(f"{name!r} is no state of the solver of these rows")
+    stages = content.fact("stages", np.ndarray | None)
+    thinned, control = content.fact("thinned", bool), packed(system.control_layout, ())
+    return Trajectory(
+        system, settings, time, y, z, control, **numbers, **states, stages=stages, thinned=thinned
+    )
+
+
+def _require_possible(time: np.ndarray, numbers: Mapping[str, np.ndarray], y: np.ndarray) -> None:
+    """Raise `ContainerError` if rows contradict each other, as those of no simulation do."""
+    result = numbers["result"]
+    solved, unknown = result >= 0, np.setdiff1d(result, [int(code) for code in Result])
+    for wrong, reason in (
+        (time.shape != result.shape[-1:], "it has another number of times than of rows"),
+        (not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0), "its times do not increase"),
+        (unknown.size, f"it has the result code {', '.join(map(str, unknown[:1]))}"),
+        (not np.all(np.isfinite(y[solved])), "a solved row has a state that is not finite"),
+        (
+            not np.all(np.isfinite(numbers["residual"][solved])),
+            "a solved row has a residual that is not finite",
+        ),
+        (np.any(numbers["iterations"] < 0), "a number of iterations is negative"),
+    ):
+        if wrong:
+            raise ContainerError(f"not a trajectory that a simulation wrote: {reason}")
+
+
+def _system(content: container.Content, readers: Mapping[str, Callable[[bytes], System]]) -> System:
+    """Return the robot, or the batch of robots, that a file describes."""
+    name, text = str(content.attributes.get("system", "class unknown")), content.attributes.get("robot")
+    if text is not None:
+        return _robots(content, str(text))
+    if "model" not in content.facts:
+        missing = content.facts.get("system_missing")
+        reason = f" ({missing})" if missing else ""
+        raise ContainerError(f"the file does not describe its system, a {name}{reason}: {_HINT}")
+    if name not in readers:
+        raise ContainerError(f"there is no reader of its system, a {name}: {_HINT}")
+    parts = content.fact("model", np.ndarray | list)
+    try:
+        if isinstance(parts, np.ndarray):
+            return readers[name](parts.tobytes())
+        systems = [readers[name](np.asarray(part).tobytes()) for part in parts]
+        return jax.tree.map(lambda *leaves: np.stack(leaves), *systems)
+    except (TypeError, ValueError) as error:
+        raise ContainerError(f"its system, a {name}: {first_line(error)}; or {_HINT}") from None
+
+
+def _robots(content: container.Content, text: str) -> System:
+    try:
+        robot = robot_file.parse_robot(text, "attribute 'robot'")
+        if not any(name.startswith(PARAMETER) for name in content.variables):
+            return robot
+        count = len(content.values("result"))
+        values = {
+            name: content.values(PARAMETER + name, (count, *np.shape(value)))
+            for name, _, value in _numbers(robot)
+        }
+        robots = [robot.replace(**{name: many[i] for name, many in values.items()}) for i in range(count)]
+    except robot_file.RobotFileError as error:
+        raise ContainerError(str(error)) from None
+    except ParameterError as error:
+        raise ContainerError(f"a robot of the batch is not possible: {error}") from None
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *robots)

@@ -8,7 +8,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble, Prediction
-from knode_cosserat.learning.files.model_file import ModelFileError
+from knode_cosserat.learning.knode import ModelFileError
 
 DT = 0.05
 ROBOT = kc.load_robot("delrin-tendon-robot")

@@ -7,8 +7,7 @@ import time
 
 import pytest
 
-from knode_cosserat.learning.files.container import ContainerError
-from knode_cosserat.learning.files.unpacking import MOST_NESTED, _depth
+from knode_cosserat.io.container import MOST_NESTED, ContainerError, nesting
 from knode_cosserat.recordings.container import ALLOWANCE, RATIO, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats.ros1 import CHUNK as CHUNK_1
@@ -79,6 +78,6 @@ def test_tables_that_are_computed_are_refused(tmp_path, columns):
 
 
 def test_depth_of_a_header_is_known_before_it_is_read():
-    assert _depth(b'{"a": [[1], {"b": []}]}') == 4
-    assert _depth(b"[" * 3500) > MOST_NESTED
+    assert nesting('{"a": [[1], {"b": []}]}') == 4
+    assert nesting("[" * 3500) > MOST_NESTED
     assert issubclass(ContainerError, ValueError)

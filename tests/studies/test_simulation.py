@@ -12,7 +12,7 @@ import pytest
 import typer.testing
 
 import knode_cosserat as kc
-from knode_cosserat.learning.files.model_file import load_model
+from knode_cosserat.learning.knode import load_model
 from studies import methods, simulation
 from studies.__main__ import app
 from studies.simulation import cells_of, rerun

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.trajectory_integrity import SEAL
 from tools.attack.samples import fingerprint, samples
 
 #: longest time that a file may take (s)
@@ -27,11 +26,9 @@ PATIENCE = 5.0
 WORDS = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"nan ", b"1e99", b"-1\n\n", b"[[[[", b"*a: ", b"9999")
 
 
-#: a trajectory without the checksum of its bytes, as earlier versions wrote it: with one of its contents only
-OLD = "old-trajectory.nc"
 #: kinds with a checksum of their numbers
 CHECKSUMMED = (
-    "trajectory.nc", OLD, "model.model", "member.checkpoint", "policy.npz", "shard.parquet", "sweep.json",
+    "trajectory.nc", "model.model", "member.checkpoint", "policy.npz", "shard.parquet", "sweep.json",
 )  # fmt: skip
 
 
@@ -53,9 +50,7 @@ def good_files(folder: Path) -> dict[str, Callable[[Path], Any]]:
             sample.write(folder / name, 0)
             sample.read(folder / name)
             readers[name] = sample.read
-    content = (folder / "trajectory.nc").read_bytes()
-    (folder / OLD).write_bytes(content[: content.rindex(SEAL)])
-    return readers | {OLD: readers["trajectory.nc"]}
+    return readers
 
 
 def damaged(content: bytes, chance: random.Random) -> bytes:

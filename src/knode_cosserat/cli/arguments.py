@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 FORMATS = (".png", ".pdf", ".svg")
 #: endings of recordings
 RECORDINGS = (".bag", ".mcap", ".db3", ".csv", ".parquet", ".csv.gz", ".bag.active")
-#: first bytes of netCDF-4 files and of model files
-TRAJECTORY_MARK, MODEL_MARK = b"\x89HDF", b"knode-cosserat model,"
+#: kinds of files, see `io.container.kind_of`
+TRAJECTORY, MODEL = "knode-cosserat trajectory", "knode-cosserat model"
 
 ROBOT = "Name of a catalog robot (listed by `knode-cosserat info`), robot file (YAML), or fitted model."
 
@@ -106,20 +106,20 @@ def load_system(name: str, changes: list[str] | None = None, nodes: int | None =
     The content of a file decides its type.
     """
     import knode_cosserat as kc
+    from knode_cosserat.io.container import kind_of
 
     if name in kc.catalog():
         return modified(kc.load_robot(name), changes, nodes)
-    if _begins(name, TRAJECTORY_MARK):
+    kind = kind_of(name)
+    if kind == TRAJECTORY:
         raise ValueError(f"{name}: this is a trajectory; allowed is a robot or a model")
     if is_recording(name):
         raise ValueError(
             f"{name}: this is a recording or table; allowed is a robot or a model. To check a recording, "
             f"type: {command_line('inspect', name)}"
         )
-    if _begins(name, MODEL_MARK):
-        from knode_cosserat.learning.files.model_file import load_model
-
-        return modified(load_model(name), changes, nodes)
+    if kind in (MODEL, "HDF5"):
+        return modified(kc.load_model(name), changes, nodes)
     if os.path.isdir(name):
         raise ValueError(
             f"{name}: this is a folder; allowed is a robot or a model, such as one file of an ensemble"
@@ -184,12 +184,16 @@ def _parse_value(text: str) -> Any:
 
 def is_trajectory(name: str) -> bool:
     """True if a file is a trajectory by its content, or by its ending if there is no such file."""
-    return Path(name).suffix == ".nc" or _begins(name, TRAJECTORY_MARK)
+    from knode_cosserat.io.container import kind_of
+
+    return Path(name).suffix == ".nc" or kind_of(name) == TRAJECTORY
 
 
 def is_recording(name: str) -> bool:
     """True if a file is a bag or a table by its ending, and not a trajectory by its content."""
-    return name.lower().endswith(RECORDINGS) and not _begins(name, TRAJECTORY_MARK)
+    from knode_cosserat.io.container import kind_of
+
+    return name.lower().endswith(RECORDINGS) and kind_of(name) != TRAJECTORY
 
 
 def command_line(*words: str | Path) -> str:
@@ -200,7 +204,6 @@ def command_line(*words: str | Path) -> str:
 def load_trajectory_file(path: Path) -> Trajectory:
     """Return the trajectory in a file, of a robot or of a model."""
     import knode_cosserat as kc
-    from knode_cosserat.learning.files import model_file  # noqa: F401  (registers models with the reader)
 
     if is_recording(str(path)) and path.exists():
         raise ValueError(
@@ -208,13 +211,6 @@ def load_trajectory_file(path: Path) -> Trajectory:
             f"a recording, type: {command_line('inspect', path)}"
         )
     return kc.load_trajectory(path)
-
-
-def _begins(name: str, mark: bytes) -> bool:
-    if not os.path.isfile(name):
-        return False
-    with open(name, "rb") as file:
-        return file.read(len(mark)) == mark
 
 
 def require_writable(

@@ -153,7 +153,8 @@ def _with_breaks(body: Body, longest: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw_frames(axes: Any, recording: Recording) -> None:
     """Draw missing frames and events, a row per stream."""
-    from knode_cosserat.recordings.recording import bridge, period
+    from knode_cosserat.recordings.quality import period
+    from knode_cosserat.recordings.recording import bridge
 
     streams = [(body.name, body.topic, body.time) for body in (*recording.bodies, recording.base) if body]
     if recording.tension is not None:

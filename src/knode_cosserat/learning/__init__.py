@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     )
     from knode_cosserat.learning.ensemble import Ensemble, Prediction, load_ensemble
     from knode_cosserat.learning.explain import explain
-    from knode_cosserat.learning.files.model_file import ModelFileError, load_model
-    from knode_cosserat.learning.knode import KNODE
+    from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
     from knode_cosserat.learning.residual import Residual
     from knode_cosserat.learning.samples import DataError
     from knode_cosserat.learning.training.checkpoint import CheckpointError
@@ -56,8 +55,7 @@ make_lazy(
         ),
         "knode_cosserat.learning.ensemble": "Ensemble Prediction load_ensemble",
         "knode_cosserat.learning.explain": "explain",
-        "knode_cosserat.learning.files.model_file": "ModelFileError load_model",
-        "knode_cosserat.learning.knode": "KNODE",
+        "knode_cosserat.learning.knode": "KNODE ModelFileError load_model",
         "knode_cosserat.learning.residual": "Residual",
         "knode_cosserat.learning.samples": "DataError",
         "knode_cosserat.learning.training.checkpoint": "CheckpointError",

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._reprs import count_of, wrapped
-from knode_cosserat.learning.files.model_file import ModelFileError, load_model
-from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 

@@ -1,18 +1,42 @@
-"""KNODE: a nominal model with a learned residual, which is itself a system."""
+"""KNODE: a nominal model with a learned residual, which is itself a system; and its file.
+
+`KNODE.save` writes a `container`: its facts describe the nominal model (the text of a robot file), the
+residual and the metadata of the fit, with the names of their classes. Arrays are restored bit for bit.
+Loading runs no code from a file: objects are made only of known classes, and only their fields are set; the
+constructor of a residual is not called. The package's own residuals are known. A user's class is given at
+loading, `load_model("model", residuals=[MyResidual])`. The fields of a residual may hold arrays, numbers,
+text, None, other modules and dataclasses, and lists, tuples and dictionaries of these.
+"""
 
 from __future__ import annotations
 
+import re
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any, Self
 
 import equinox as eqx
+import jax
+import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._registry import provided
+from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
-from knode_cosserat.learning.residual import Residual
-from knode_cosserat.rods.system import Correction, System
+from knode_cosserat.errors import KnodeCosseratError, first_line
+from knode_cosserat.io import container
+from knode_cosserat.io.container import ContainerError
+from knode_cosserat.learning.passive import Passive, Sizes
+from knode_cosserat.learning.residual import Network, Nothing, Residual
+from knode_cosserat.learning.structured.expansion import Expansion, Term
+from knode_cosserat.learning.structured.residual import Load, Structured
+from knode_cosserat.rods import robot_file
+from knode_cosserat.rods.system import Correction, System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import Wrapped
+from knode_cosserat.solvers import semi_discrete, space, time
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.solvers.settings import Settings
 
 
 class About:
@@ -107,6 +131,219 @@ class KNODE(Wrapped):
         numbers = {name.removeprefix("residual."): value for name, value in own.items()}
         return type(self)(found.knowledge, self.residual.with_coefficients(numbers), self.about, self.trained)
 
-    def save(self, path: Any) -> None:
-        """Write the model to a file (see `model_file.save`)."""
-        provided(type(self), "save")(self, path)
+    def to_bytes(self) -> bytes:
+        """Return the bytes of the model's file. Raises `ModelFileError`."""
+        with KIND.naming("a KNODE"):
+            return _encoded(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write the model to a file at exactly this path; `load_model` reads an equal model.
+
+        The file is written atomically. If no robot file can describe the nominal model, its class name,
+        layouts and parameters are written, and `load_model` needs the nominal model as an argument.
+
+        Raises:
+            ModelFileError: the model contains something that cannot be stored, it is a batch, or the file
+                cannot be written.
+        """
+        with KIND.naming(path):
+            content = _encoded(self)
+        container.write(path, content, KIND)
+
+
+# files
+
+
+class ModelFileError(KnodeCosseratError, ValueError):
+    """A model file that cannot be read or written. The message is one line with the reason."""
+
+    code = "model-file"
+
+
+KIND = container.Kind("knode-cosserat model", 1, ModelFileError)
+#: characters of a robot file in a model: YAML is slow to read
+MOST_TEXT = 100_000
+#: classes that a model's file may have objects of
+CLASSES: dict[str, type] = {
+    cls.__name__: cls
+    for cls in (
+        Network, Nothing, Passive, Sizes, Structured, Load, Expansion, Term, Settings, NewtonOptions,
+        space.Euler, space.Lobatto2, space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal,
+        time.SDIRK2, TrainedRange,
+    )
+}  # fmt: skip
+
+
+def load_model(path: str | Path, *, knowledge: System | None = None, residuals: Iterable[type] = ()) -> KNODE:
+    """Read a model from a file of `KNODE.save`.
+
+    Args:
+        path: the file.
+        knowledge: the nominal model. Needed only if no robot file can describe it, such as for a user's
+            class; it must equal the one that the model was saved with.
+        residuals: classes of the model's residual that are not in the package.
+
+    Raises:
+        ModelFileError: the file cannot be read, is of another kind or version, truncated or damaged, or its
+            parts do not fit together.
+    """
+    return _model(container.read(path, KIND, _classes(residuals)), str(path), knowledge)
+
+
+def decoded_model(
+    data: bytes, source: str, *, knowledge: System | None = None, residuals: Iterable[type] = ()
+) -> KNODE:
+    """Return the model in a file's bytes; see `load_model`."""
+    return _model(container.decoded(data, KIND, source, _classes(residuals)), source, knowledge)
+
+
+def _classes(residuals: Iterable[Any]) -> dict[str, type]:
+    classes = dict(CLASSES)
+    for cls in residuals:
+        if not (isinstance(cls, type) and container.has_fields(cls)):
+            raise ModelFileError(
+                f"{cls!r} cannot be in a model file; allowed is an Equinox module or a dataclass"
+            )
+        if not container.same_class(classes.get(cls.__name__, cls), cls):
+            raise ModelFileError(
+                f"there is another class {cls.__name__} already, of {classes[cls.__name__].__module__}; "
+                "call yours otherwise"
+            )
+        classes[cls.__name__] = cls
+    return classes
+
+
+def _encoded(model: KNODE) -> bytes:
+    if type(model) is not KNODE:
+        raise ContainerError(f"a {type(model).__name__} is not a model; allowed is a KNODE")
+    if is_traced(model):
+        raise ContainerError("a model cannot be written inside jit, grad or vmap")
+    if np.ndim(model.knowledge.length):
+        raise ContainerError("a batch of models cannot be written to one file; write them one by one")
+    facts = _facts(model)
+    _require_fit(model)
+    return container.encoded(KIND, facts, classes=CLASSES, others=True)
+
+
+def _facts(model: KNODE) -> dict[str, Any]:
+    knowledge: dict[str, Any] = {"class": type(model.knowledge).__name__}
+    if type(model.knowledge) is KNODE:
+        knowledge["model"] = _facts(model.knowledge)
+    elif type(model.knowledge) in robot_file.KINDS.values():
+        try:
+            knowledge["robot"] = robot_file.format_robot(model.knowledge)
+        except robot_file.RobotFileError as error:
+            raise ContainerError(str(error)) from None
+    else:
+        knowledge["traits"] = _traits(model.knowledge)
+    return {
+        "knowledge": knowledge,
+        "residual": model.residual,
+        "trained": model.trained,
+        "about": model.about.facts,
+    }
+
+
+def _traits(system: System) -> dict[str, Any]:
+    """Return the traits that a given nominal model must share with the saved one."""
+    layouts = {"y": system.y_layout, "z": system.z_layout, "controls": system.control_layout}
+    parameters = {name: getattr(system, name) for name in system.parameters()}
+    return {
+        **{name: [list(field[:3]) for field in layout.fields] for name, layout in layouts.items()},
+        "unknowns at the base": list(system.base_unknowns),
+        "mixed": bool(system.mixed),
+        "nodes": system.nodes,
+        **{name: None if value is None else np.asarray(value) for name, value in parameters.items()},
+    }
+
+
+def _model(content: container.Content, source: str, knowledge: System | None) -> KNODE:
+    with KIND.naming(source):
+        model = _model_of(content.facts, knowledge)
+        _require_fit(model)
+        return model
+
+
+def _model_of(facts: Any, nominal: System | None) -> KNODE:
+    if not isinstance(facts, dict):
+        raise ContainerError(f"its model is a {type(facts).__name__}; allowed is a mapping")
+    trained = facts.get("trained")
+    kinds = {"knowledge": dict, "residual": Residual, "about": dict}
+    kinds |= {} if trained is None else {"trained": TrainedRange}
+    for name, kind in kinds.items():
+        if not isinstance(facts.get(name), kind):
+            raise ContainerError(
+                f"its {name} is a {type(facts.get(name)).__name__}; allowed is a {kind.__name__}"
+            )
+    return KNODE(_knowledge(facts["knowledge"], nominal), facts["residual"], About(facts["about"]), trained)
+
+
+def _knowledge(described: dict[str, Any], nominal: System | None) -> System:
+    name = str(described.get("class"))
+    if "model" in described:
+        return _model_of(described["model"], nominal)
+    if "robot" in described:
+        text, most = str(described["robot"]), allowed(MOST_TEXT)
+        if len(text) > most:
+            raise ContainerError(f"its robot file has {len(text)} characters; allowed is {most}; {MORE}")
+        try:
+            robot = robot_file.parse_robot(text, "its robot file")
+        except robot_file.RobotFileError as error:
+            raise ContainerError(str(error)) from None
+        if nominal is not None:
+            _require_same(nominal, name, _traits(robot))
+        return robot
+    if not isinstance(described.get("traits"), dict):
+        raise ContainerError("its 'knowledge' has neither a robot nor traits")
+    if nominal is None:
+        raise ContainerError(
+            f"its knowledge is a {name[:60]}, which no robot file describes: "
+            "give it, load_model(path, knowledge=…)"
+        )
+    _require_same(nominal, name, described["traits"])
+    return nominal
+
+
+def _require_same(nominal: System, name: str, traits: dict[str, Any]) -> None:
+    if type(nominal).__name__ != name:
+        raise ContainerError(
+            f"the knowledge given is a {type(nominal).__name__}; the model was saved with a {name[:60]}"
+        )
+
+    def short(value: Any) -> str:
+        text = " ".join(str(value.tolist() if isinstance(value, np.ndarray) else value).split())
+        return text if len(text) <= 100 else text[:100] + "…"
+
+    present = _traits(nominal)
+    for trait in {**present, **traits}:
+        one, other = present.get(trait), traits.get(trait)
+        arrays = isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
+        if not (np.array_equal(one, other) if arrays else repr(one) == repr(other)):  # type: ignore[arg-type]
+            raise ContainerError(
+                f"the knowledge given has other {trait[:60]} than the one that the model was saved with: "
+                f"{short(one)}, not {short(other)}"
+            )
+
+
+def _require_fit(model: KNODE) -> None:
+    """Raise `ContainerError` unless the equations can be traced, with results as in the layouts."""
+    ny, nz = model.y_layout.size, model.z_layout.size
+    history = History(np.zeros(()), np.zeros(ny), np.zeros(nz), np.zeros(ny))
+
+    def equations(model: KNODE, y: Any, control: Any, history: History) -> tuple[Any, Any, Any]:
+        y_s, z = semi_discrete.derivatives(model, Point(np.zeros(()), np.zeros(()), y, control, history))
+        return y_s, z, semi_discrete.tip(model, np.zeros(()), control, y, history)
+
+    try:
+        length = np.asarray(model.length)
+        results = jax.eval_shape(equations, model, np.zeros(ny), np.zeros(model.control_size), history)
+        shapes = [part.shape for part in results]
+    except Exception as error:  # a residual may raise any error if arrays do not fit
+        reason = re.sub(r"<function \S+ at 0x[0-9a-f]+>", "the equations", first_line(error))
+        raise ContainerError(f"residual and knowledge do not fit together: {reason}") from None
+    expected = [(ny,), (nz,), (unknown_count(model),)]
+    if shapes != expected or length.shape != () or length.dtype.kind not in "fiu" or not np.isfinite(length):
+        raise ContainerError(
+            f"residual and knowledge do not fit together: y_s, z, tip have shapes {shapes}; allowed is "
+            f"{expected}, and a length that is a number, not {length.tolist()}"
+        )

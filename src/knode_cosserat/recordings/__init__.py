@@ -1,8 +1,5 @@
 """Recordings of robots: measured data, on one clock and in the robot's frame."""
 
-from typing import Any
-
-from knode_cosserat._registry import provide
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -40,29 +37,3 @@ __all__ = [
     "load_recording",
     "proposed_config",
 ]
-
-
-# these modules import SciPy's optimisation and tables: only when they are needed
-
-
-def _health(recording: Recording) -> Any:
-    from knode_cosserat.recordings.health import health_of
-
-    return health_of(recording)
-
-
-def _measured(*args: Any) -> Any:
-    from knode_cosserat.recordings.exchange import measurement_fields
-
-    return measurement_fields(*args)
-
-
-def _save(*args: Any) -> None:
-    from knode_cosserat.recordings.exchange import save
-
-    save(*args)
-
-
-provide(Recording, "health", _health)
-provide(Measurements, "of", _measured)
-provide(Measurements, "save", _save)

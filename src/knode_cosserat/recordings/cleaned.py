@@ -11,7 +11,8 @@ from knode_cosserat.recordings import cleaning
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity
 from knode_cosserat.recordings.plausibility import implausible_tensions
-from knode_cosserat.recordings.recording import Body, Tensions, bridge, period
+from knode_cosserat.recordings.quality import period
+from knode_cosserat.recordings.recording import Body, Tensions, bridge
 from knode_cosserat.recordings.sources import (
     MOTOR_UNITS,
     POSITION_UNITS,

@@ -11,13 +11,12 @@ import numpy as np
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.sources import MarkerSource, TensionSource
-from knode_cosserat.recordings.table import HELD
+from knode_cosserat.recordings.sources import HELD, MarkerSource, TensionSource
 from knode_cosserat.recordings.write import BAGS, FORMATS, MocapPoses, Pulls, write_recording
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
+    from knode_cosserat.recordings.measurements import Measurements
     from knode_cosserat.trajectory import Trajectory
 
 

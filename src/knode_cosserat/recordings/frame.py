@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -12,8 +13,10 @@ from scipy.spatial.transform import Rotation
 from knode_cosserat.recordings.config import UP, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.orientation import misread_orientation
-from knode_cosserat.recordings.recording import Body
 from knode_cosserat.recordings.sources import POSITION_UNITS
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.recording import Body
 
 #: shortest rest for the calibration of a body's axes (s), and smallest number of frames
 SHORTEST_REST, FEWEST_FRAMES = 0.2, 5

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy.optimize
@@ -12,8 +12,10 @@ from jaxtyping import Float
 from knode_cosserat.recordings.cleaning import rotation_steps
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import rest_mask, rest_positions, rod_lengths
-from knode_cosserat.recordings.quality import Health, Latency, StreamHealth, TensionError
-from knode_cosserat.recordings.recording import Body, Recording, Tensions, period
+from knode_cosserat.recordings.quality import Health, Latency, StreamHealth, TensionError, period
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.recording import Body, Recording, Tensions
 
 #: smallest standard deviation of commands for an estimate of their latency (N)
 QUIET = 0.05

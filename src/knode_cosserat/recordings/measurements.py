@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -75,11 +74,15 @@ class Measurements:
             AttributeError: the system has no positions.
             ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
         """
-        return cls(**provided(cls, "of")(trajectory, fractions))
+        from knode_cosserat.recordings.exchange import measurement_fields
+
+        return cls(**measurement_fields(trajectory, fractions))
 
     def save(self, path: str | Path) -> None:
         """Write a table or a bag (.csv, .parquet, .bag, .mcap, .db3); see `exchange.save`."""
-        provided(type(self), "save")(self, path)
+        from knode_cosserat.recordings.exchange import save
+
+        save(self, path)
 
     @property
     def held_tension(self) -> Float[np.ndarray, "T tendons"]:

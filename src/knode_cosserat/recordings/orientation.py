@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings.findings import Finding
-from knode_cosserat.recordings.recording import Body
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.recording import Body
 
 #: smallest bending (rad, root mean square) that shows how orientations are meant
 SMALLEST_BEND = np.radians(3.0)

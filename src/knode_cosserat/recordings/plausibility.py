@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import rest_positions
-from knode_cosserat.recordings.recording import Body, Tensions, period
+from knode_cosserat.recordings.quality import period
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.recording import Body, Tensions
 
 #: plausible range of a tendon robot's tensions (N)
 SLACK, STRONG = 0.12, 120.0

@@ -5,7 +5,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from knode_cosserat.recordings.findings import Finding
+
+
+def period(time: Float[np.ndarray, " n"]) -> float:
+    """Return the median time from row to row (s); zero for fewer than two rows."""
+    return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,12 +12,11 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._files.limits import MORE, allowed
-from knode_cosserat._registry import provided
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.quality import Health
+from knode_cosserat.recordings.quality import Health, period
 
 #: largest number of rows of a grid: more rows are a mistake
 MOST_ROWS = 10_000_000
@@ -198,8 +197,10 @@ class Recording:
 
     def health(self) -> Health:
         """Return the quality report: rates, gaps, noise, latency, tension errors and findings."""
-        report: Health = provided(type(self), "health")(self)
-        return report
+        # SciPy's optimisation is imported with it
+        from knode_cosserat.recordings.health import health_of
+
+        return health_of(self)
 
     def _driver(self, kind: str) -> Tensions:
         if kind not in ("measured", "commanded", "none"):
@@ -245,11 +246,6 @@ class Recording:
 def bridge(time: Float[np.ndarray, " n"], longest: float) -> float:
     """Return the longest gap between rows of a stream that is bridged (s)."""
     return max(longest, 1.5 * period(time)) + _SAME
-
-
-def period(time: Float[np.ndarray, " n"]) -> float:
-    """Return the median time from row to row (s); zero for fewer than two rows."""
-    return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
 
 
 def _held(driver: Tensions, time: Float[np.ndarray, " T"], longest: float) -> Float[np.ndarray, "T tendons"]:

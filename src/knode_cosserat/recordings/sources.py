@@ -27,6 +27,9 @@ TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: units of motors: angles to rad, or wound-up lengths to m
 MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
 
+#: default prefixes of a table's columns of tensions
+TENSION, HELD, COMMAND = "tension", "held_tension", "command"
+
 
 def set_field(settings: Any, name: str, value: Any) -> None:
     """Set a field of frozen settings while they are made."""

@@ -35,6 +35,9 @@ from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.messages import Stream
 from knode_cosserat.recordings.plausibility import SLOW
 from knode_cosserat.recordings.sources import (
+    COMMAND,
+    HELD,
+    TENSION,
     TIME_UNITS,
     ColumnMap,
     CommandSource,
@@ -44,8 +47,6 @@ from knode_cosserat.recordings.sources import (
 )
 
 TIME = "time [s]"
-#: default prefixes of the columns of tensions
-TENSION, HELD, COMMAND = "tension", "held_tension", "command"
 #: metadata key of the tensions before the first row
 INITIAL = "initial tension"
 ALLOWED = (

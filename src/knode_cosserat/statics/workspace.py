@@ -12,9 +12,10 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat import named_controls
-from knode_cosserat._files.netcdf import netcdf_in_memory
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import quantity, robot_text, wrapped
+from knode_cosserat.io import container
+from knode_cosserat.io.container import Variable
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -35,6 +36,7 @@ from knode_cosserat.statics.response import Pose, equilibrium_poses, tip_pose
 CHUNK = 1024
 #: endings of the files that a workspace can be written to
 FORMATS = (".nc", ".csv", ".npz")
+KIND = container.Kind("knode-cosserat workspace", 1, container.ContainerError)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -104,12 +106,16 @@ class Workspace:
         arrays |= {"result": self.result, "residual": self.residual, "strain": self.strain}
         known = {name: array for name, array in arrays.items() if array is not None}
         with replacing(path) as temporary:
-            {".nc": self._netcdf, ".csv": self._table, ".npz": _numpy}[path.suffix](temporary, known)
+            if path.suffix == ".nc":
+                temporary.write_bytes(self._netcdf(known))
+            elif path.suffix == ".csv":
+                self._table(temporary, known)
+            else:
+                with open(temporary, "wb") as file:
+                    np.savez_compressed(file, allow_pickle=False, **known)
 
-    def _netcdf(self, path: Path, arrays: dict[str, np.ndarray]) -> None:
-        import xarray
-
-        said = {
+    def _netcdf(self, arrays: dict[str, np.ndarray]) -> bytes:
+        labels = {
             "control": ("", f"control: {', '.join(named_controls.titles(self.system.control_layout))}"),
             "position": ("m", "position of the tip, global frame"),
             "quaternion": ("1", "orientation of the tip, scalar first"),
@@ -118,14 +124,14 @@ class Workspace:
             "strain": ("", f"largest change from rest of {', '.join(self.system.z_layout.names)}"),
         }
         variables = {
-            name: (
-                ("sample", f"{name}_component")[: array.ndim],
+            name: Variable(
                 array,
-                {"units": said[name][0], "long_name": said[name][1]},
+                ("sample", f"{name}_component")[: array.ndim],
+                {"units": labels[name][0], "long_name": labels[name][1]},
             )
             for name, array in arrays.items()
         }
-        path.write_bytes(netcdf_in_memory(xarray.Dataset(variables)).getvalue())
+        return container.encoded(KIND, {"system": type(self.system).__name__}, variables=variables)
 
     def _table(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
         """Write controls with names and units, as in files of controls; other columns numbered from 0."""
@@ -141,11 +147,6 @@ class Workspace:
             writer = csv.writer(file)
             writer.writerow(names)
             writer.writerows(zip(*(column.tolist() for column in columns), strict=True))
-
-
-def _numpy(path: Any, arrays: dict[str, np.ndarray]) -> None:
-    with open(path, "wb") as file:
-        np.savez_compressed(file, allow_pickle=False, **arrays)
 
 
 def sample(low: np.ndarray, high: np.ndarray, count: int, seed: int = 0) -> np.ndarray:

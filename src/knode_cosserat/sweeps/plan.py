@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import hashlib
-import os
 import re
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
@@ -21,6 +20,7 @@ from knode_cosserat import named_controls
 from knode_cosserat._files.json_text import json_checksum
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.io.container import kind_of
 from knode_cosserat.rods.paths import owner_at, parameter_at
 from knode_cosserat.rods.robot_file import format_robot, load_robot
 from knode_cosserat.rods.system import System
@@ -31,9 +31,6 @@ from knode_cosserat.sweeps.description import SHARD_CASES, SHARD_MEGABYTES, Rang
 from knode_cosserat.sweeps.errors import SweepError
 from knode_cosserat.sweeps.sampling import case_seeds, unit_points
 from knode_cosserat.sweeps.signals import placeholders, signals
-
-#: first bytes of model files
-MODEL_MARK = b"knode-cosserat model,"
 
 
 class Cases(NamedTuple):
@@ -239,13 +236,10 @@ def _loaded(robot: str | System, changes: Mapping[str, Any]) -> System:
 
 
 def _load(name: str) -> System:
-    if os.path.isfile(name):
-        with open(name, "rb") as file:
-            is_model = file.read(len(MODEL_MARK)) == MODEL_MARK
-        if is_model:
-            from knode_cosserat.learning.files.model_file import load_model
+    if kind_of(name) in ("knode-cosserat model", "HDF5"):
+        from knode_cosserat.learning.knode import load_model
 
-            return load_model(name)
+        return load_model(name)
     return load_robot(name)
 
 

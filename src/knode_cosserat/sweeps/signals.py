@@ -17,7 +17,7 @@ import numpy as np
 from knode_cosserat import controls, named_controls
 from knode_cosserat._files.csv_rows import SAME_TIME
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat._signals import step_times
+from knode_cosserat.controls import step_times
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.sweeps.errors import SweepError

@@ -12,8 +12,7 @@ import pytest
 
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
-from knode_cosserat.learning.files.model_file import ModelFileError
-from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.knode import KNODE, About, ModelFileError
 from knode_cosserat.learning.residual import Network, Residual, input_size
 from knode_cosserat.learning.structured.expansion import CURVED, expansion
 from knode_cosserat.learning.structured.residual import Load, Structured, ambient_layout, loaded

@@ -6,11 +6,21 @@ import numpy as np
 import pytest
 
 from knode_cosserat._files.limits import VARIABLE
-from knode_cosserat.learning.files import container, unpacking
+from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.io import container
 from tests.limits import Readers, assert_limited
 
 READERS = Readers()
-TITLE = container.Title("test", 1)
+
+
+class ProbeError(KnodeCosseratError, ValueError):
+    """An error of the files here."""
+
+    code = "probe"
+
+
+KIND = container.Kind("knode-cosserat test", 1, ProbeError)
+CLASSES = {}
 
 
 class Thing(NamedTuple):
@@ -19,56 +29,64 @@ class Thing(NamedTuple):
     x: int
 
 
+CLASSES["Thing"] = Thing
+
+
 def contained():
-    writer = container.Writer()
-    things = writer.value([Thing(k) for k in range(5)], "things", {"Thing": Thing})
-    values = writer.value(np.arange(9.0), "values", {})
-    return writer.file(TITLE, {"things": things, "values": values})
+    facts = {"things": [Thing(k) for k in range(5)], "values": np.arange(9.0)}
+    return container.encoded(KIND, facts, classes=CLASSES)
+
+
+def decoded(data):
+    return lambda: container.decoded(data, KIND, "it", CLASSES)
 
 
 @READERS
-def model_size(folder, patch):
-    patch.setattr(container, "MOST_HEADER", 0)
-    patch.setattr(container, "MOST_ARRAYS", 100)
-    path = folder / "model"
-    path.write_bytes(bytes(500))
-    return lambda: container.read(path)
+def file_size(folder, patch):
+    path = folder / "it"
+    path.write_bytes(contained())
+    patch.setattr(container, "LARGEST_FILE", path.stat().st_size - 1)
+    return lambda: container.read(path, KIND, CLASSES)
 
 
 @READERS
-def model_header(folder, patch):
+def file_facts(folder, patch):
     data = contained()
-    patch.setattr(unpacking, "MOST_HEADER", 100)
-    return lambda: unpacking.Reader(data, TITLE)
+    patch.setattr(container, "MOST_FACTS", 100)
+    return decoded(data)
 
 
 @READERS
-def model_objects(folder, patch):
+def file_objects(folder, patch):
     data = contained()
-    patch.setattr(unpacking, "MOST_OBJECTS", 4)
-
-    def read():
-        opened = unpacking.Reader(data, TITLE)
-        return opened.value(opened.header["things"], "things", {"Thing": Thing})
-
-    return read
+    patch.setattr(container, "MOST_OBJECTS", 4)
+    return decoded(data)
 
 
 @READERS
-def objects_of_a_written_model(folder, patch):
+def file_expansion(folder, patch):
+    data = contained()
+    patch.setattr(container, "EXPANSION", 0)
+    patch.setattr(container, "ALLOWANCE", 71)
+    return decoded(data)
+
+
+@READERS
+def objects_of_a_written_file(folder, patch):
     patch.setattr(container, "MOST_OBJECTS", 4)
     return contained
 
 
 @READERS
-def header_of_a_written_model(folder, patch):
-    patch.setattr(container, "MOST_HEADER", 100)
+def facts_of_a_written_file(folder, patch):
+    patch.setattr(container, "MOST_FACTS", 100)
     return contained
 
 
 @READERS
-def arrays_of_a_written_model(folder, patch):
-    patch.setattr(container, "MOST_ARRAYS", 71)
+def size_of_a_written_file(folder, patch):
+    size = len(contained())
+    patch.setattr(container, "LARGEST_FILE", size - 1)
     return contained
 
 

@@ -3,7 +3,6 @@ import json
 import subprocess
 import sys
 
-import h5py
 import numpy as np
 import pytest
 import typer.testing
@@ -11,8 +10,19 @@ import typer.testing
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.structured.residual import Structured
-from knode_cosserat.trajectory_system import TrajectoryFileError
-from tests.learning.files.made import MODELS, ROBOT, STRING, TENSIONS, Pull, assert_same, fails, network
+from knode_cosserat.trajectory import TrajectoryFileError
+from tests.learning.files.made import (
+    MODELS,
+    ROBOT,
+    STRING,
+    TENSIONS,
+    YOURS,
+    Pull,
+    assert_same,
+    fails,
+    network,
+)
+from tests.trajectories import edited
 
 pytestmark = pytest.mark.slow
 
@@ -51,7 +61,7 @@ def test_a_prediction_comes_back_with_its_model(prediction):
 def test_a_prediction_is_read_in_another_process(prediction):
     _, path = prediction
     code = (
-        "import sys, knode_cosserat as kc, knode_cosserat.learning.files.model_file\n"
+        "import sys, knode_cosserat as kc\n"
         "found = kc.load_trajectory(sys.argv[1])\n"
         "print(type(found.system).__name__, found.y.shape, found.system.residual.input_weights.sum().hex())"
     )
@@ -95,9 +105,8 @@ def test_batches_of_models(tmp_path):
     many = dataclasses.replace(batch, system=members[0])
     many.save(tmp_path / "many.nc")
     assert_same(kc.load_trajectory(tmp_path / "many.nc").system, members[0])
-    with h5py.File(tmp_path / "batch.nc", "a") as file:
-        file["system_sizes"][0] += 1
-    with fails("batch.nc: the variable 'system_bytes' does not hold", error=TrajectoryFileError):
+    edited(tmp_path / "batch.nc", lambda file: file["arrays/model[1]"].__setitem__(-1, 0))
+    with fails("batch.nc: its system, a KNODE: its model: ", error=TrajectoryFileError):
         kc.load_trajectory(tmp_path / "batch.nc")
 
 
@@ -121,17 +130,25 @@ def test_predictions_of_what_no_file_describes_are_saved_all_the_same(tmp_path):
         assert found.system is system
 
 
+def test_predictions_of_a_users_residual_are_read_with_its_classes(tmp_path):
+    model = KNODE(ROBOT, Pull(0.1))
+    y, z, zeros = np.zeros((3, 5, model.y_layout.size)), np.zeros((3, 5, model.z_layout.size)), np.zeros(3)
+    states = kc.Trajectory(
+        model, None, np.arange(3.0), y, z, np.zeros((3, 4)), zeros.astype(int), zeros, zeros
+    )
+    states.save(tmp_path / "a.nc")
+    assert_same(kc.load_trajectory(tmp_path / "a.nc", residuals=YOURS).system, model)
+
+
 def test_predictions_whose_model_is_damaged(prediction, tmp_path):
     _, path = prediction
     (tmp_path / "a.nc").write_bytes(path.read_bytes())
-    with h5py.File(tmp_path / "a.nc", "a") as file:
-        file.attrs["format_version"] = 1  # without a checksum
-        file["system_bytes"][-1] ^= 1
+    edited(tmp_path / "a.nc", lambda file: file["arrays/model"].__setitem__(500, 77))
     with fails(
-        "a.nc: variable 'system_bytes': damaged", "load_trajectory(path, system=…)", error=TrajectoryFileError
-    ):
+        "a.nc: its system, a KNODE: its model: damaged", "load_trajectory(path, system=…)",
+        error=TrajectoryFileError,
+    ):  # fmt: skip
         kc.load_trajectory(tmp_path / "a.nc")
-    with h5py.File(tmp_path / "a.nc", "a") as file:
-        file.attrs["system"] = "os.system"
-    with fails("nothing that is imported here reads its system, a os.system", error=TrajectoryFileError):
+    edited(tmp_path / "a.nc", lambda file: file.attrs.__setitem__("system", "os.system"))
+    with fails("there is no reader of its system, a os.system", error=TrajectoryFileError):
         kc.load_trajectory(tmp_path / "a.nc")

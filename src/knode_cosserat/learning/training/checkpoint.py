@@ -19,21 +19,20 @@ import jax
 import numpy as np
 
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.io import container
 from knode_cosserat.learning.config import FitConfig
-from knode_cosserat.learning.files import container
-from knode_cosserat.learning.files.container import ContainerError, Title, Writer
-from knode_cosserat.learning.files.unpacking import Reader
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
-
-TITLE = Title("knode-cosserat checkpoint", 1)
-SUFFIX = ".checkpoint"
 
 
 class CheckpointError(KnodeCosseratError, ValueError):
     """A checkpoint that cannot be used or written. The message is one line: the file and the reason."""
 
     code = "checkpoint"
+
+
+KIND = container.Kind("knode-cosserat checkpoint", 1, CheckpointError)
+SUFFIX = ".checkpoint"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,16 +127,10 @@ class Checkpoints:
 
     def save(self, name: str, snapshot: dict[str, Any]) -> None:
         """Write the state of a part; replaces its earlier file. Raises `CheckpointError`."""
-        writer = Writer()
-        try:
-            header = {
-                "identity": json.loads(json.dumps(dataclasses.asdict(self.identity))),
-                "name": name,
-                "snapshot": writer.value(snapshot, "snapshot", {}),
-            }
-            container.write_container(self.path(name), writer.file(TITLE, header))
-        except ContainerError as error:
-            raise CheckpointError(f"{self.path(name)}: {error}") from None
+        identity = json.loads(json.dumps(dataclasses.asdict(self.identity)))
+        with KIND.naming(self.path(name)):
+            content = container.encoded(KIND, {"identity": identity, "name": name, "snapshot": snapshot})
+        container.write(self.path(name), content, KIND)
 
     def load(self, name: str) -> dict[str, Any] | None:
         """Read the state of a part; None if there is no checkpoint yet. Raises `CheckpointError`."""
@@ -148,13 +141,14 @@ class Checkpoints:
         if not path.exists():
             return None
         try:
-            reader = Reader(container.read(path), TITLE)
-            difference = self.identity.difference(reader.entry("identity", dict))
-            if reader.entry("name", str) != name:
-                difference = f"of {reader.header['name'][:60]!r}"
-            snapshot = reader.value(reader.entry("snapshot", dict), "snapshot", {})
-        except ContainerError as error:
-            raise CheckpointError(f"{path}: {error}; delete it to start again") from None
+            content = container.read(path, KIND)
+            with KIND.naming(path):
+                difference = self.identity.difference(content.fact("identity", dict))
+                if content.fact("name", str) != name:
+                    difference = f"of {content.facts['name'][:60]!r}"
+                snapshot = content.fact("snapshot", dict)
+        except CheckpointError as error:
+            raise CheckpointError(f"{error}; delete it to start again") from None
         if difference:
             raise CheckpointError(
                 f"{path}: it is {difference}; give this fit another folder, or delete it to start again"

@@ -1,0 +1,1 @@
+"""Files of this package: one container for arrays and facts."""
