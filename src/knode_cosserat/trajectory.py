@@ -489,12 +489,13 @@ def _trajectory(content: container.Content, system: System) -> Trajectory:
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise ContainerError(f"'settings' is not understood: {first_line(error)}") from None
     states = {name: content.fact(name, SolverState | None) for name in ("initial_state", "final_state")}
+    memory = 2 if settings is None else settings.memory
     for name, state in states.items():
         history = state.history if state is not None else None
         if history is not None and not (
             isinstance(history, StateHistory)
             and np.shape(history.t0) == rows[:-1]
-            and np.shape(history.records)[:-2] == (*rows[:-1], 2)
+            and np.shape(history.records)[:-2] == (*rows[:-1], memory)
             and np.shape(history.y)[:-2] == (*rows[:-1], GUESS_STATES)
         ):
             raise ContainerError(f"{name!r} is no state of the solver of these rows")
