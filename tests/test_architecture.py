@@ -101,7 +101,7 @@ def layer_of(name: str) -> int:
 def test_the_graph_is_that_of_the_package() -> None:
     assert len(GRAPH) > 200
     assert {"rods.system", "solvers.initial", "trajectory"} <= GRAPH["solvers.simulate"]
-    assert "recordings.health" in GRAPH["recordings"]  # within a function
+    assert "recordings.recording" in GRAPH["evaluation.recording_figures"]  # within a function
     assert "_jax" in GRAPH[""]
 
 

@@ -18,7 +18,7 @@ from typing import Any
 #: modules that register functions
 PROVIDERS = (
     "knode_cosserat.trajectory_file",
-    "knode_cosserat.recordings",
+    "knode_cosserat.recordings.health",
     "knode_cosserat.learning.files.model_file",
 )
 

@@ -19,7 +19,7 @@ from knode_cosserat.hardware.clock import HostClock
 from knode_cosserat.hardware.emulation import EmulatedPort, EmulatedRobot
 from knode_cosserat.hardware.middleware.simulated_capture import SimulatedCapture
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.encoder import MessageEncoder
+from knode_cosserat.recordings.write import MessageEncoder
 
 #: time between commands (s); time at rest before a motion, and duration of the motion (s)
 DT, REST, SECONDS = 0.05, 1.5, 3.5

@@ -13,7 +13,7 @@ from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings import Recording
-    from knode_cosserat.recordings.quality import Health, StreamHealth
+    from knode_cosserat.recordings.health import Health, StreamHealth
 
 
 @app.command(

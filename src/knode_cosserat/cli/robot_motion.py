@@ -153,8 +153,13 @@ def _body_names(machine: OpenedDriver, poses: Any) -> list[str]:
 
 def _recording_config(count: int, names: list[str], machine: OpenedDriver) -> Any:
     """Return the topics of a bag: tensions, commands, and bodies at even fractions of the length."""
-    from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.sources import BaseSource, CommandSource, MarkerSource, TensionSource
+    from knode_cosserat.recordings.config import (
+        BaseSource,
+        CommandSource,
+        MarkerSource,
+        RecordingConfig,
+        TensionSource,
+    )
 
     order = tuple(range(1, count + 1))
     # a configuration has one body or more: without motion capture its topic has no messages

@@ -21,8 +21,8 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from knode_cosserat.recordings.health import Health
     from knode_cosserat.recordings.measurements import Measurements
-    from knode_cosserat.recordings.quality import Health
     from knode_cosserat.recordings.recording import Body, Recording
 
 #: markers of events: text in the finding, colour and label

@@ -14,10 +14,12 @@ from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
-from knode_cosserat.recordings.encoder import BagTopic
-from knode_cosserat.recordings.formats.ros1 import BAG, CHUNK, CHUNK_INFO, CONNECTION, INDEX, MESSAGE, VERSION
 from knode_cosserat.recordings.messages import typestore
+from knode_cosserat.recordings.write import BagTopic
 
+VERSION = b"#ROSBAG V2.0\n"
+#: record types
+MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 #: size of the bag's first record (bytes), which is written again at the end
 FIRST_SIZE = 4096
 _long = struct.Struct("<I").pack

@@ -17,7 +17,7 @@ from knode_cosserat.hardware.clock import HostClock
 from knode_cosserat.hardware.driver import Driver, HardwareError, Reading
 from knode_cosserat.hardware.middleware.mocap import MotionCapture, PoseFrame
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.encoder import Encoded, MessageEncoder
+from knode_cosserat.recordings.write import Encoded, MessageEncoder
 
 #: default time between two writes to the disk (s)
 INTERVAL = 0.5

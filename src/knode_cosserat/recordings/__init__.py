@@ -1,23 +1,13 @@
-"""Recordings of robots: measured data, on one clock and in the robot's frame."""
+"""Recordings of robots: measured data, on one clock and in the robot's frame.
 
-from typing import Any
+A file goes one way: `formats` reads it to messages or columns (`messages`, `table`), the configuration says
+what these are (`config`), `streams` puts them on one clock, `checks` removes errors, `frame` turns them to
+the robot's frame. The result is a `Recording`, whose `sampled` gives `Measurements` on a grid.
+"""
 
-from knode_cosserat._registry import provide
-from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
-from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.load import load_example, load_recording, proposed_config
-from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.recording import Body, Recording, Tensions
-from knode_cosserat.recordings.sources import (
-    BaseSource,
-    ColumnMap,
-    CommandSource,
-    MarkerSource,
-    MotorSource,
-    TableSource,
-    TensionSource,
-)
+from typing import TYPE_CHECKING
+
+from knode_cosserat._lazy import make_lazy
 
 __all__ = [
     "BaseSource",
@@ -41,28 +31,32 @@ __all__ = [
     "proposed_config",
 ]
 
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.config import (
+        BaseSource,
+        ColumnMap,
+        CommandSource,
+        MarkerSource,
+        MotorSource,
+        RecordingConfig,
+        TableSource,
+        TensionSource,
+    )
+    from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
+    from knode_cosserat.recordings.findings import Finding, RecordingError
+    from knode_cosserat.recordings.load import load_example, load_recording, proposed_config
+    from knode_cosserat.recordings.measurements import Measurements
+    from knode_cosserat.recordings.recording import Body, Recording, Tensions
 
-# these modules import SciPy's optimisation and tables: only when they are needed
-
-
-def _health(recording: Recording) -> Any:
-    from knode_cosserat.recordings.health import health_of
-
-    return health_of(recording)
-
-
-def _measured(*args: Any) -> Any:
-    from knode_cosserat.recordings.exchange import measurement_fields
-
-    return measurement_fields(*args)
-
-
-def _save(*args: Any) -> None:
-    from knode_cosserat.recordings.exchange import save
-
-    save(*args)
-
-
-provide(Recording, "health", _health)
-provide(Measurements, "of", _measured)
-provide(Measurements, "save", _save)
+make_lazy(
+    __name__,
+    {
+        f"{__name__}.config": "BaseSource ColumnMap CommandSource MarkerSource MotorSource RecordingConfig "
+        "TableSource TensionSource",
+        f"{__name__}.estimation.estimate": "estimate_parts estimate_states",
+        f"{__name__}.findings": "Finding RecordingError",
+        f"{__name__}.load": "load_example load_recording proposed_config",
+        f"{__name__}.measurements": "Measurements",
+        f"{__name__}.recording": "Body Recording Tensions",
+    },
+)

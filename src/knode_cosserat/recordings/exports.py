@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._files import csv_rows
@@ -78,6 +77,8 @@ def export_table(
     Raises:
         RecordingError: no body is there, or too many.
     """
+    import pandas as pd  # type: ignore[import-untyped]
+
     if not tracks:
         raise RecordingError(f"{path}: it has no bodies and no markers with positions")
     if reason := excess(3 * len(tracks), MOST_COLUMNS, "columns"):

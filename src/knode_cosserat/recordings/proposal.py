@@ -11,8 +11,18 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.config import UP, RecordingConfig
-from knode_cosserat.recordings.container import Container
+from knode_cosserat.recordings.config import (
+    MAPPED,
+    UP,
+    BaseSource,
+    ColumnMap,
+    CommandSource,
+    MarkerSource,
+    MotorSource,
+    RecordingConfig,
+    TableSource,
+    TensionSource,
+)
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import (
     NUMBERS,
@@ -20,19 +30,9 @@ from knode_cosserat.recordings.messages import (
     POSES,
     STATIC,
     TRANSFORMS,
+    Bag,
     decoded,
     joint_names,
-    messages_of,
-)
-from knode_cosserat.recordings.sources import (
-    MAPPED,
-    BaseSource,
-    ColumnMap,
-    CommandSource,
-    MarkerSource,
-    MotorSource,
-    TableSource,
-    TensionSource,
 )
 from knode_cosserat.recordings.table import TIME, Table, columns_of, position_titles, stated_time_unit
 
@@ -77,42 +77,42 @@ class _Body(NamedTuple):
 # bags
 
 
-def useful_topics(container: Container) -> set[str]:
+def useful_topics(bag: Bag) -> set[str]:
     """Return the topics whose messages are poses or numbers."""
     kinds = {*POSES, *NUMBERS, POSE_ARRAY, *TRANSFORMS}
-    return {name for name, topic in container.topics.items() if topic.type in kinds}
+    return {name for name, topic in bag.topics.items() if topic.type in kinds}
 
 
-def config_of_bag(container: Container, path: str) -> tuple[RecordingConfig, tuple[str, ...]]:
+def config_of_bag(bag: Bag, path: str) -> tuple[RecordingConfig, tuple[str, ...]]:
     """Return a configuration of a bag's topics, and remarks. Raises `RecordingError` without poses."""
     names: dict[str, str] = {}
-    for topic in container.topics.values():
+    for topic in bag.topics.values():
         if topic.type in POSES:
             words = [
                 word for word in topic.name.split("/") if word and not re.fullmatch(r"pose|odom|tf", word)
             ]
             names[topic.name] = words[-1] if words else topic.name
         elif topic.type == POSE_ARRAY or (topic.type in TRANSFORMS and topic.name != STATIC):
-            for part in _parts(container, topic.name):
+            for part in _parts(bag, topic.name):
                 names[f"{topic.name}[{part}]"] = part if topic.type in TRANSFORMS else f"body {part}"
     bodies: list[_Body] = []
     for name, word in names.items():
-        stream = decoded(container, MarkerSource(word, name, 1.0), "pose", path)
+        stream = decoded(bag, MarkerSource(word, name, 1.0), "pose", path)
         if len(stream.values):
             is_new = word not in [body.name for body in bodies]
             bodies.append(_Body(word if is_new else name, name, stream.values[:, :3]))
     if not bodies:
         listed = ", ".join(
-            f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in container.topics.values()
+            f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in bag.topics.values()
         )
         raise RecordingError(f"{path}: no topic has poses; the bag has {listed or 'no topics'}")
     found: dict[str, tuple[str, tuple[str, ...]]] = {}
     remarks: list[str] = []
     singles: dict[tuple[str, str], list[str]] = {}
-    for topic in container.topics.values():
+    for topic in bag.topics.values():
         if topic.type not in NUMBERS or not topic.raw:
             continue
-        messages = (message for _, message in messages_of(topic, container.ros) if message is not None)
+        messages = (message for _, message in topic.messages() if message is not None)
         first = next(messages, None)
         count = 0 if first is None else len(NUMBERS[topic.type](first))
         if count == 1 and (numbered := re.fullmatch(r"(.*?)(\d+)(\D*)", topic.name)):
@@ -143,10 +143,10 @@ def _role(topic: str) -> str:
     return "command" if _COMMAND.search(topic) else "tension"
 
 
-def _parts(container: Container, name: str) -> list[str]:
+def _parts(bag: Bag, name: str) -> list[str]:
     """Return the parts of a topic's messages: numbers of poses, or frames."""
-    topic, parts = container.topics[name], dict[str, None]()
-    for _, message in messages_of(topic, container.ros):
+    topic, parts = bag.topics[name], dict[str, None]()
+    for _, message in topic.messages():
         if message is None:
             continue
         if topic.type == POSE_ARRAY:

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -17,7 +17,9 @@ from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.quality import Health
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.health import Health
 
 #: largest number of rows of a grid: more rows are a mistake
 MOST_ROWS = 10_000_000

@@ -21,27 +21,28 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean, shown
-from knode_cosserat.recordings.clocks import FAR
-from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.config_values import PLACE
-from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.messages import Stream
-from knode_cosserat.recordings.plausibility import SLOW
-from knode_cosserat.recordings.sources import (
+from knode_cosserat.recordings.config import (
+    PLACE,
     TIME_UNITS,
     ColumnMap,
     CommandSource,
     MarkerSource,
+    RecordingConfig,
     TableSource,
     TensionSource,
 )
+from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.outgoing import Outgoing
+from knode_cosserat.recordings.streams import FAR, SLOW, Stream
+
+if TYPE_CHECKING:
+    import pandas as pd  # type: ignore[import-untyped]
 
 TIME = "time [s]"
 #: default prefixes of the columns of tensions
@@ -85,6 +86,8 @@ def numbered(numbers: Sequence[int], one: str, several: str) -> str:
 
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     """Return the columns as numbers, NaN where they are empty; a column with other text stays text."""
+    import pandas as pd
+
     numbers = table.apply(pd.to_numeric, errors="coerce")
     values = numbers.to_numpy(dtype=float, na_value=np.nan)
     is_text = (~table.isna().to_numpy() & ~np.isfinite(values)).any(axis=0)
@@ -103,11 +106,13 @@ def _is_missing(cells: pd.Series) -> pd.Series:
 
 def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[np.ndarray, "n places"]:
     """Return columns of numbers by their places. Raises `RecordingError` for one that has text."""
+    import pandas as pd
+
     for place in places:
         cells = table.iloc[:, place]
         if cells.dtype.kind not in "fiub":
-            given = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
-            row = int(np.argmax(~np.isfinite(given) & ~_is_missing(cells).to_numpy()))
+            numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+            row = int(np.argmax(~np.isfinite(numbers) & ~_is_missing(cells).to_numpy()))
             raise RecordingError(
                 f"{path}: row {row + 1}: {table.columns[place]} is {shown(str(cells.iloc[row]).strip())}; "
                 "allowed is a finite number"
@@ -210,7 +215,7 @@ def tension_titles(topic: str, unit: str, count: int) -> list[str]:
     return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
 
 
-def streams(
+def streams_of(
     table: pd.DataFrame, config: RecordingConfig, path: str
 ) -> tuple[dict[str, Stream], list[Finding]]:
     """Return the measured rows of each topic, and findings on rows that have no time.
@@ -345,13 +350,30 @@ def _stream(topic: str, time: Float[np.ndarray, " n"], values: Float[np.ndarray,
     return Stream(topic, stamps, stamps, values[there])
 
 
-def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
-    """Return a table from columns with different times: a row for each time in any of them.
+def columns_and_metadata(outgoing: Outgoing) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Return a table to be written, with a row for each time of any topic, and its metadata."""
+    import pandas as pd
 
-    Args:
-        columns: times (s) and numbers by title.
-    """
-    parts = {title: pd.Series(values, index=time) for title, (time, values) in columns.items()}
+    config, columns = outgoing.config, dict[str, pd.Series]()
+    for stream in outgoing.streams:
+        if stream.role == "pose":
+            titles = position_titles(stream.topic, config.position_unit)
+            titles += quaternion_titles(stream.topic) if np.shape(stream.values)[1] == 7 else []
+        else:
+            titles = tension_titles(stream.topic, stream.source.unit, len(stream.source.order))
+        columns |= {
+            title: pd.Series(values, index=stream.time)
+            for title, values in zip(titles, stream.values.T, strict=True)
+        }
+    said = {f"fraction {marker.topic}": repr(marker.fraction) for marker in config.markers}
+    if config.description:
+        said["source"] = " ".join(config.description.split())
+    if config.simulated is not None:
+        said["simulated"] = "true" if config.simulated else "false"
+    if config.initial_tension is not None:
+        said[INITIAL] = " ".join(map(repr, config.initial_tension))
+    if config.command is not None and config.command.latency:
+        said["latency"] = repr(config.command.latency)
     # one concatenation, because repeated merges would sort the rows each time
-    table = pd.concat(parts, axis=1).sort_index()
-    return table.rename_axis(TIME).reset_index()
+    table = pd.concat(columns, axis=1).sort_index()
+    return table.rename_axis(TIME).reset_index(), said

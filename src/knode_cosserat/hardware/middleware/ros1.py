@@ -30,7 +30,7 @@ from knode_cosserat.hardware.middleware.commands import CommandGate
 from knode_cosserat.hardware.middleware.dds import Source
 from knode_cosserat.hardware.middleware.mocap import MotionCapture, PoseFrame
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.encoder import Encoded, MessageEncoder
+from knode_cosserat.recordings.write import Encoded, MessageEncoder
 
 #: folder of Debian's Python packages
 DEBIAN = Path("/usr/lib/python3/dist-packages")

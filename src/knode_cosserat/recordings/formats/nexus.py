@@ -25,7 +25,6 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings.exports import LENGTHS, Cells, Channels, Track, export_table, text_lines
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -144,6 +143,8 @@ def _tracks(
 
 
 def _of_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+    from scipy.spatial.transform import Rotation
+
     known = np.isfinite(vectors).all(axis=1)
     quaternion = np.full((len(vectors), 4), np.nan)
     quaternion[known] = Rotation.from_rotvec(vectors[known]).as_quat(scalar_first=True)
