@@ -28,6 +28,7 @@ from knode_cosserat.cli.robot_options import (
     opened,
     tip_source,
 )
+from knode_cosserat.recordings.formats import written_suffixes
 
 if TYPE_CHECKING:
     from knode_cosserat.hardware.driver import Driver
@@ -223,7 +224,10 @@ def run(
     ] = None,
     recording: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write tip and controls as a recording: .csv, .bag, .mcap, .db3."),
+        typer.Option(
+            metavar="FILE",
+            help=f"Write tip and controls as a recording: {', '.join(written_suffixes())}.",
+        ),
     ] = None,
     yes: Yes = False,
     as_json: Json = False,
