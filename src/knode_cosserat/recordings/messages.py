@@ -22,8 +22,7 @@ import numpy as np
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.recordings.config import PLACE, MotorSource, TensionSource
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.outgoing import OutgoingStream
-from knode_cosserat.recordings.streams import Stream
+from knode_cosserat.recordings.streams import OutgoingStream, Stream
 
 Role = Literal["pose", "tension", "command"]
 #: stamp and recording time (ns), and the numbers

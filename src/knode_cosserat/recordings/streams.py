@@ -1,13 +1,15 @@
-"""Raw numbers of a recording by topic, and their times on one clock: order, duplicates, jumps, drift."""
+"""Raw numbers of a recording by topic, read or to be written, and their times on one clock."""
 
 from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, counted
 
 #: largest disagreement of equal clocks, and smallest jump of a clock (s)
@@ -40,6 +42,40 @@ class Stream:
     values: Float[np.ndarray, "n size"]
     broken: int = 0
     remarks: tuple[Finding, ...] = ()
+
+
+class OutgoingStream(NamedTuple):
+    """Numbers of a topic to be written.
+
+    Attributes:
+        topic: name of the topic.
+        role: role of the numbers.
+        time: times (s).
+        values: poses (position, and quaternion if known), tensions or commands.
+        source: the topic's entry in the configuration; None for poses.
+    """
+
+    topic: str
+    role: Literal["pose", "tension", "command"]
+    time: Any
+    values: Any
+    source: Any = None
+
+
+class Outgoing(NamedTuple):
+    """Recording to be written.
+
+    Attributes:
+        config: configuration of its topics.
+        streams: numbers of the topics.
+        start: time zero on a bag's clock (s since 1970); tables begin at zero.
+        delays: delay from stamp to recording (s) by topic; zero by default.
+    """
+
+    config: RecordingConfig
+    streams: list[OutgoingStream]
+    start: int
+    delays: Mapping[str, float]
 
 
 def offsets(streams: Sequence[Stream]) -> dict[str, float]:

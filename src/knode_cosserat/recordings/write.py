@@ -21,7 +21,7 @@ from knode_cosserat.recordings.config import (
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import formats, written_suffixes
 from knode_cosserat.recordings.messages import encoder_of, message_type
-from knode_cosserat.recordings.outgoing import Outgoing, OutgoingStream
+from knode_cosserat.recordings.streams import Outgoing, OutgoingStream
 
 #: default of time zero on the clock of a bag (s since 1970)
 START = 1_720_000_000

@@ -20,7 +20,7 @@ from knode_cosserat.recordings.content import beginning
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.messages import Bag
-    from knode_cosserat.recordings.outgoing import Outgoing
+    from knode_cosserat.recordings.streams import Outgoing
     from knode_cosserat.recordings.table import Table
 
 

@@ -28,7 +28,7 @@ from knode_cosserat.recordings.content import EXPANDED, Decompression
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.messages import Bag, Topic, encoder_of, message_type, typestore
-from knode_cosserat.recordings.outgoing import Outgoing, OutgoingStream
+from knode_cosserat.recordings.streams import Outgoing, OutgoingStream
 
 ROS1_MAGIC, ROS1_VERSION = b"#ROSBAG V", b"#ROSBAG V2.0\n"
 MCAP_MAGIC = b"\x89MCAP0\r\n"

@@ -20,7 +20,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
-from knode_cosserat.recordings.outgoing import Outgoing
+from knode_cosserat.recordings.streams import Outgoing
 from knode_cosserat.recordings.table import ALLOWED, Table, columns_and_metadata, numbered, numbers_of
 
 if TYPE_CHECKING:

@@ -11,7 +11,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
-from knode_cosserat.recordings.outgoing import Outgoing
+from knode_cosserat.recordings.streams import Outgoing
 from knode_cosserat.recordings.table import Table, columns_and_metadata, numbers_of
 
 MAGIC = b"PAR1"
