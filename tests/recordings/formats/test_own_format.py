@@ -6,8 +6,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import formats, load_example
-from knode_cosserat.recordings.formats import RecordingFormat, register
-from knode_cosserat.recordings.table import Table, columns_and_metadata
+from knode_cosserat.recordings.formats import RecordingFormat, Table, register
+from knode_cosserat.recordings.table import columns_and_metadata
 from tests.commands import succeeded
 
 MARK = "tip path\n"

@@ -17,11 +17,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
 from knode_cosserat.recordings.content import beginning
+from knode_cosserat.recordings.table import Table
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.messages import Bag
     from knode_cosserat.recordings.streams import Outgoing
-    from knode_cosserat.recordings.table import Table
+
+__all__ = [
+    "RecordingFormat",
+    "Table",
+    "format_of",
+    "formats",
+    "read_suffixes",
+    "register",
+    "written_suffixes",
+]
 
 
 class RecordingFormat(NamedTuple):
