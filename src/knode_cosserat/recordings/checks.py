@@ -348,16 +348,23 @@ def swaps_undone(
 # plausibility
 
 
-def implausible_units(
+def implausible_sizes(
     bodies: Sequence[Body],
-    tension: Tensions | None,
-    command: Tensions | None,
+    tensions: tuple[Tensions | None, Tensions | None],
     at_rest: Float[np.ndarray, "M 3"] | None,
+    *,
+    is_static: bool,
 ) -> list[Finding]:
-    """Return findings on implausible units, with the likely error; `at_rest` are positions (m)."""
-    findings = []
-    sizes = []
-    for stream in (tension, command):
+    """Return findings on implausible times and units, with the likely error.
+
+    Args:
+        bodies: bodies in the robot's frame.
+        tensions: measured and commanded tensions.
+        at_rest: positions of the bodies at rest (m), if known.
+        is_static: True if rows are equilibria, whose times are arbitrary.
+    """
+    findings, sizes = [], []
+    for stream, is_measured in zip(tensions, (True, False), strict=True):
         if stream is None:
             continue
         size = float(np.median(np.abs(stream.tension)))
@@ -366,36 +373,29 @@ def implausible_units(
             hint = "newtons read as grams-force" if size < SLACK else "grams-force read as newtons"
             what = f"tensions of {size:.3g} N are not plausible: are {hint}?"
             findings.append(Finding("problem", stream.topic, what))
-        elif stream is tension and np.median(stream.tension.min(axis=1)) < -SLACK:
+        elif is_measured and np.median(stream.tension.min(axis=1)) < -SLACK:
             findings.append(Finding("warning", stream.topic, "tensions are below zero: is the sign right?"))
     if len(sizes) == 2 and min(sizes) > 0.0 and max(sizes) > FACTOR * min(sizes):
         what = (
             f"measured tensions are {sizes[0]:.3g} N and commanded ones {sizes[1]:.3g} N: not the same unit?"
         )
         findings.append(Finding("problem", "", what))
-    if at_rest is None:
-        at_rest = np.array([np.median(body.position, axis=0) for body in bodies])
-    far = float(np.linalg.norm(at_rest, axis=1).max())
+    places = [np.median(body.position, axis=0) for body in bodies] if at_rest is None else at_rest
+    far = float(np.linalg.norm(places, axis=1).max())
     if not SHORT < far < LONG:
         what = (
             f"the bodies are up to {far:.3g} m from the clamped end: are positions in the unit that is said?"
         )
         findings.append(Finding("problem", "", what))
-    return findings
-
-
-def implausible_times(bodies: Sequence[Body]) -> list[Finding]:
-    """Return a finding on poses that are too far apart for a motion, with the likely error."""
     time = min((body.time for body in bodies), key=period)
-    step = period(time)
-    if not SLOW <= step < np.inf:
-        return []
-    hours = (time[-1] - time[0]) / 3600.0
-    what = (
-        f"poses are {step:.3g} s apart, and the recording takes {hours:.2g} h: are the times in ms? "
-        "(Rows of shapes at rest need static: true.)"
-    )
-    return [Finding("problem", "", what)]
+    if not is_static and SLOW <= period(time) < np.inf:
+        what = (
+            f"poses are {period(time):.3g} s apart, and the recording takes "
+            f"{(time[-1] - time[0]) / 3600.0:.2g} h: are the times in ms? "
+            "(Rows of shapes at rest need static: true.)"
+        )
+        findings.append(Finding("problem", "", what))
+    return findings
 
 
 def implausible_tensions(newtons: Float[np.ndarray, "n tendons"]) -> Bool[np.ndarray, " n"]:

@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import dataclasses
 import fractions
+import functools
 import itertools
 import math
 from collections.abc import Callable, Mapping
@@ -564,39 +565,17 @@ class RecordingConfig(_Settings):
     @classmethod
     def paper_robot(cls) -> Self:
         """Return the configuration of the paper's bags: five bodies, tensions in gf, commands in the log."""
-        wire = (4, 1, 2, 3)
-        return cls(
-            markers=tuple(
-                MarkerSource(f"rib {k + 1}", f"/vicon/continuum_{k}/pose", ninths / 9)
-                for k, ninths in enumerate((3, 5, 7, 9))
-            ),
-            tension=TensionSource("/tension", wire, "gf"),
-            command=CommandSource("/rosout", wire, "gf", text="Serial Command: {}", latency=0.06),
-            base=BaseSource("/vicon/continuum_base/pose", height=0.0635),
-            description="the paper's tendon robot, or one with the same topics",
-        )
+        return cls._included("paper_robot.yaml")
 
     @classmethod
     def asl_trunk(cls) -> Self:
-        """Return the configuration of the ASL trunk (Stanford): six motor angles (deg), three disks, 100 Hz.
+        """Return the configuration of the ASL trunk (Stanford): six motor angles, three disks, 100 Hz."""
+        return cls._included("asl_trunk.yaml")
 
-        Its frame has gravity along -y and the clamped end near (0.1, 0, 0.1) m. The robot's z axis points
-        down. The disks' orientations, present in
-        some files, are unreliable (axes flip) and are not read.
-        """
-        return cls(
-            markers=tuple(
-                MarkerSource(f"disk {k + 1}", f"{k + 1}", fraction)
-                for k, fraction in enumerate((0.338, 0.636, 1.0))
-            ),
-            motors=MotorSource("phi", (1, 2, 3, 4, 5, 6), "deg"),
-            table=TableSource(rate=100.0, position=("x{}", "y{}", "z{}"), motor="phi{}"),
-            origin=(0.1, 0.1, 0.0),
-            rotation=(math.sqrt(0.5), -math.sqrt(0.5), 0.0, 0.0),
-            repeats="drop",
-            simulated=False,
-            description="ASL trunk of Stanford, StanfordASL/trunk-stack, MIT",
-        )
+    @classmethod
+    @functools.cache
+    def _included(cls, name: str) -> Self:
+        return cls.load(Path(__file__).parent / "data" / name)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some settings changed. Raises `RecordingError`."""

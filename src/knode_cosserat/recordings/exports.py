@@ -84,18 +84,19 @@ def export_table(
     if reason := excess(3 * len(tracks), MOST_COLUMNS, "columns"):
         raise RecordingError(f"{path}: {reason}")
     columns: dict[str, np.ndarray] = {TIME: time}
-    found, names = list(findings), []
+    remarks, names = list(findings), []
     for track in sorted(tracks, key=lambda track: track.quaternion is None):
         spellings = [track.name, f"{track.name} ({track.kind})"]
         numbered = (f"{track.name} ({k})" for k in itertools.count(2))
-        name = next(each for each in itertools.chain(spellings, numbered) if f"{each}_x [m]" not in columns)
+        names_tried = itertools.chain(spellings, numbered)
+        name = next(name for name in names_tried if f"{name}_x [m]" not in columns)
         names.append((name, track.quaternion is not None))
         position = np.array(track.position, dtype=float)
         # no measured coordinate is exactly zero three times over
         nowhere = np.all(position == 0.0, axis=1)
         if nowhere.any():
             frames = "frame is" if nowhere.sum() == 1 else "frames are"
-            found.append(
+            remarks.append(
                 Finding("warning", name, f"{int(nowhere.sum())} {frames} at exactly 0, 0, 0; left out")
             )
             position[nowhere] = np.nan
@@ -105,7 +106,9 @@ def export_table(
             columns |= dict(zip(quaternion_titles(name), turned.T, strict=True))
     parts = [pd.DataFrame(columns)]
     # channels have rows of their own: cells of other rows are empty
-    parts += [pd.DataFrame({TIME: each.time, **each.values}) for each in channels if len(each.values)]
+    parts += [
+        pd.DataFrame({TIME: channel.time, **channel.values}) for channel in channels if len(channel.values)
+    ]
     table = (
         pd.concat(parts).sort_values(TIME, kind="stable", ignore_index=True) if len(parts) > 1 else parts[0]
     )
@@ -113,7 +116,7 @@ def export_table(
     known = [name for name, _ in names if not name.rpartition(":")[2].lower().startswith(_UNKNOWN)]
     bodies = oriented or known or [name for name, _ in names]
     said = {"source": f"{path.name}: {source}"} if source else {}
-    return Table(said, table, tuple(found), tuple(bodies), up)
+    return Table(said, table, tuple(remarks), tuple(bodies), up)
 
 
 def length_unit(word: str, path: Path, default: str, findings: list[Finding]) -> float:

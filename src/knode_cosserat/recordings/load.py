@@ -183,9 +183,8 @@ def _assembled(
     bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
     at_rest = frame.rest_positions(bodies, rest)
     findings += about_tensions + about_frame
-    findings += checks.implausible_units(bodies, None if config.motors else tension, command, at_rest)
-    if not config.static:
-        findings += checks.implausible_times(bodies)
+    both = (None if config.motors else tension, command)
+    findings += checks.implausible_sizes(bodies, both, at_rest, is_static=config.static)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
     return Recording(

@@ -377,9 +377,9 @@ def joint_names(
             f"{where}: the joints {', '.join(first)} have the same names; allowed is each once"
         )
     listed = ", ".join(first)
-    found = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in first]
-    numbers = [int(match[2]) for match in found if match]
-    stems = {(match[1], match[3]) for match in found if match}
+    matches = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in first]
+    numbers = [int(match[2]) for match in matches if match]
+    stems = {(match[1], match[3]) for match in matches if match}
     lowest = min(numbers, default=0)
     if len(stems) != 1 or sorted(numbers) != list(range(lowest, lowest + len(first))) or lowest > 1:
         return first, f"its joints {listed} are taken in this order; `names` in the configuration states it"

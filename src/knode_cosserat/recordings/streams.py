@@ -114,8 +114,8 @@ def measurement_times(
             )
             findings.append(Finding("warning", stream.topic, what))
         else:
-            times[stream.topic], found = _without_jumps(stream)
-            findings += found
+            times[stream.topic], about_jumps = _without_jumps(stream)
+            findings += about_jumps
     return times, [*findings, *_about_drift(streams, times)]
 
 

@@ -73,14 +73,14 @@ def estimate_states(
         RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, or has
             too few bodies or no orientations; or the method or a time is not allowed.
     """
-    found = _parts(recording, robot, method, dt, start, end)
-    if len(found) > 1:
-        times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in found)
+    parts = _parts(recording, robot, method, dt, start, end)
+    if len(parts) > 1:
+        times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in parts)
         raise RecordingError(
-            f"{found[0].rows.source}: the recording is in {len(found)} parts ({times}); choose one by start "
+            f"{parts[0].rows.source}: the recording is in {len(parts)} parts ({times}); choose one by start "
             "and end, or take all of them by estimate_parts"
         )
-    return _estimated(found[0], robot, method)
+    return _estimated(parts[0], robot, method)
 
 
 def estimate_parts(

@@ -60,12 +60,12 @@ def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
     time, tracks, channels, findings = None, [], [], list[Finding]()
     for section in sections:
         at = section.frame / rate + section.sample / section.rate
-        found, others = _tracks(section, findings, path)
-        if found and (time is None or np.array_equal(at, time)):
+        bodies, others = _tracks(section, findings, path)
+        if bodies and (time is None or np.array_equal(at, time)):
             time = at
-            tracks += found
-        elif found:
-            names = ", ".join(track.name for track in found)
+            tracks += bodies
+        elif bodies:
+            names = ", ".join(track.name for track in bodies)
             findings.append(Finding("warning", "", f"{names:.200}: of another rate than the first; left out"))
         channels.append(Channels(at, others))
     return export_table(
