@@ -46,11 +46,8 @@ class Track(NamedTuple):
     kind: str = "marker"
 
 
-class Channels(NamedTuple):
-    """Analog channels: their times (s), and values by title."""
-
-    time: Float[np.ndarray, " n"]
-    values: Mapping[str, Float[np.ndarray, " n"]]
+#: analog channels: their times (s), and values by title
+Channels = tuple[Float[np.ndarray, " n"], Mapping[str, Float[np.ndarray, " n"]]]
 
 
 def export_table(
@@ -88,8 +85,8 @@ def export_table(
     for track in sorted(tracks, key=lambda track: track.quaternion is None):
         spellings = [track.name, f"{track.name} ({track.kind})"]
         numbered = (f"{track.name} ({k})" for k in itertools.count(2))
-        names_tried = itertools.chain(spellings, numbered)
-        name = next(name for name in names_tried if f"{name}_x [m]" not in columns)
+        candidates = itertools.chain(spellings, numbered)
+        name = next(name for name in candidates if f"{name}_x [m]" not in columns)
         names.append((name, track.quaternion is not None))
         position = np.array(track.position, dtype=float)
         # no measured coordinate is exactly zero three times over
@@ -106,17 +103,15 @@ def export_table(
             columns |= dict(zip(quaternion_titles(name), turned.T, strict=True))
     parts = [pd.DataFrame(columns)]
     # channels have rows of their own: cells of other rows are empty
-    parts += [
-        pd.DataFrame({TIME: channel.time, **channel.values}) for channel in channels if len(channel.values)
-    ]
+    parts += [pd.DataFrame({TIME: at, **values}) for at, values in channels if values]
     table = (
         pd.concat(parts).sort_values(TIME, kind="stable", ignore_index=True) if len(parts) > 1 else parts[0]
     )
     oriented = [name for name, has_orientation in names if has_orientation]
     known = [name for name, _ in names if not name.rpartition(":")[2].lower().startswith(_UNKNOWN)]
     bodies = oriented or known or [name for name, _ in names]
-    said = {"source": f"{path.name}: {source}"} if source else {}
-    return Table(said, table, tuple(remarks), tuple(bodies), up)
+    metadata = {"source": f"{path.name}: {source}"} if source else {}
+    return Table(metadata, table, tuple(remarks), tuple(bodies), up)
 
 
 def length_unit(word: str, path: Path, default: str, findings: list[Finding]) -> float:

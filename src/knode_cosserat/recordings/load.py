@@ -129,18 +129,18 @@ def _from_bag(path: Path, bag: Bag, config: RecordingConfig) -> Recording:
 
 def _from_table(name: str, path: str, content: Table, config: RecordingConfig | None) -> Recording:
     findings = list(content.findings)
-    simulated = table.said_simulated(content.said, path)
+    simulated = table.is_simulated(content.metadata, path)
     if config is None and content.bodies:
         config, remarks = config_of_table(content, path)
         findings += [Finding("warning", "", remark) for remark in remarks]
-    config = config or table.configured(content.said, list(map(str, content.numbers.columns)), path)
+    config = config or table.configured(content.metadata, list(map(str, content.numbers.columns)), path)
     if content.bodies:
         # the file states its unit and its axes
         config = config.replace(position_unit="m", up=config.up or content.up)
     numbers, about_times = table.streams_of(content.numbers, config, path)
     if config.simulated is None:
         config = config.replace(simulated=simulated)
-    source = content.said.get("source", name)
+    source = content.metadata.get("source", name)
     return _assembled(path, source, config, numbers, [*findings, *about_times])
 
 

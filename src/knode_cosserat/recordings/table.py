@@ -61,7 +61,7 @@ class Table(NamedTuple):
     """Content of a table.
 
     Attributes:
-        said: metadata.
+        metadata: texts by key, such as the source.
         numbers: columns by title. A column that is not of numbers is text.
         findings: findings from reading it.
         bodies: bodies of an export of motion capture, whose format states names, units and axes; its columns
@@ -69,7 +69,7 @@ class Table(NamedTuple):
         up: axis of the file that points up.
     """
 
-    said: dict[str, str]
+    metadata: dict[str, str]
     numbers: pd.DataFrame
     findings: tuple[Finding, ...] = ()
     bodies: tuple[str, ...] = ()
@@ -121,7 +121,7 @@ def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[n
 # meaning of the columns
 
 
-def configured(said: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
+def configured(metadata: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
     """Return the configuration derived from a table's titles and metadata. Raises `RecordingError`."""
     others = [name for name in columns if name != TIME]
     tendons = {
@@ -144,15 +144,15 @@ def configured(said: Mapping[str, str], columns: list[str], path: str) -> Record
     markers = []
     for body in bodies:
         key = f"fraction {body}"
-        if key not in said and len(bodies) > 1:
+        if key not in metadata and len(bodies) > 1:
             raise RecordingError(
                 f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a "
                 "number from 0 to 1, or a configuration"
             )
-        (fraction,) = _said_numbers(key, said, path) or (1.0,)
+        (fraction,) = _metadata_numbers(key, metadata, path) or (1.0,)
         markers.append(MarkerSource(body, body, fraction, rotation=(1.0, 0.0, 0.0, 0.0)))
     order = {prefix: tuple(range(1, count + 1)) for prefix, count in tendons.items()}
-    (latency,) = _said_numbers("latency", said, path) or (0.0,)
+    (latency,) = _metadata_numbers("latency", metadata, path) or (0.0,)
     tension = command = None
     try:
         if order[measured]:
@@ -164,27 +164,27 @@ def configured(said: Mapping[str, str], columns: list[str], path: str) -> Record
             tension=tension,
             command=command,
             tensions="measured" if tension else "commanded",
-            initial_tension=_said_numbers(INITIAL, said, path),
+            initial_tension=_metadata_numbers(INITIAL, metadata, path),
         )
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _said_numbers(key: str, said: Mapping[str, str], path: str) -> tuple[float, ...] | None:
+def _metadata_numbers(key: str, metadata: Mapping[str, str], path: str) -> tuple[float, ...] | None:
     """Return the numbers of the metadata under a key, one except of tensions; None without the key."""
-    if key not in said:
+    if key not in metadata:
         return None
-    words = said[key].replace(",", " ").split() if key == INITIAL else [said[key]]
+    words = metadata[key].replace(",", " ").split() if key == INITIAL else [metadata[key]]
     try:
         return tuple(map(float, words))
     except ValueError:
         kind = "numbers (N)" if key == INITIAL else "a number"
-        raise RecordingError(f"{path}: {key} is {shown(said[key])}; allowed is {kind}") from None
+        raise RecordingError(f"{path}: {key} is {shown(metadata[key])}; allowed is {kind}") from None
 
 
-def said_simulated(said: Mapping[str, str], path: str) -> bool | None:
+def is_simulated(metadata: Mapping[str, str], path: str) -> bool | None:
     """True if a table states that the robot was a simulation; None if not stated. Raises `RecordingError`."""
-    word = said.get("simulated")
+    word = metadata.get("simulated")
     if word not in (None, "true", "false"):
         raise RecordingError(f"{path}: simulated is {shown(word)}; allowed is true or false")
     return None if word is None else word == "true"
@@ -335,15 +335,15 @@ def columns_and_metadata(outgoing: Outgoing) -> tuple[pd.DataFrame, dict[str, st
             title: pd.Series(values, index=stream.time)
             for title, values in zip(titles, stream.values.T, strict=True)
         }
-    said = {f"fraction {marker.topic}": repr(marker.fraction) for marker in config.markers}
+    metadata = {f"fraction {marker.topic}": repr(marker.fraction) for marker in config.markers}
     if config.description:
-        said["source"] = " ".join(config.description.split())
+        metadata["source"] = " ".join(config.description.split())
     if config.simulated is not None:
-        said["simulated"] = "true" if config.simulated else "false"
+        metadata["simulated"] = "true" if config.simulated else "false"
     if config.initial_tension is not None:
-        said[INITIAL] = " ".join(map(repr, config.initial_tension))
+        metadata[INITIAL] = " ".join(map(repr, config.initial_tension))
     if config.command is not None and config.command.latency:
-        said["latency"] = repr(config.command.latency)
+        metadata["latency"] = repr(config.command.latency)
     # one concatenation, because repeated merges would sort the rows each time
     table = pd.concat(columns, axis=1).sort_index()
-    return table.rename_axis(TIME).reset_index(), said
+    return table.rename_axis(TIME).reset_index(), metadata

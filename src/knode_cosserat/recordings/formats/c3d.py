@@ -114,7 +114,7 @@ class _C3D:
         names, units = self._texts("ANALOG:LABELS", count, "channel"), self._texts("ANALOG:UNITS", count)
         at = (time[:, None] + np.arange(per_frame) / (rate * per_frame)).ravel()
         titles = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
-        return [Channels(at, dict(zip(titles, values.T, strict=True)))]
+        return [(at, dict(zip(titles, values.T, strict=True)))]
 
     def _frames(self, first: int, last: int) -> tuple[int, int]:
         """Return the first frame's number and the stated number of frames."""

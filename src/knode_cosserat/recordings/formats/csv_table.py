@@ -44,13 +44,13 @@ def read_csv(data: bytes, path: str) -> Table:
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    said, first = _comments(lines)
+    metadata, first = _comments(lines)
     delimiter = delimiter_of(lines[first : first + 10 * _SAMPLE])
     # a quoted cell can have line breaks, so that the header may not be one of the lines
     columns = 1 + max((line.count(delimiter) for line in itertools.islice(lines, first, None)), default=0)
     _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"), path)
     table, about_units = _titled(cells_of(text, delimiter, path), path)
-    return Table(said, numbers_of(table), (*_about_comments(lines, first), *about_units))
+    return Table(metadata, numbers_of(table), (*_about_comments(lines, first), *about_units))
 
 
 def delimiter_of(lines: Sequence[str]) -> str:
@@ -76,14 +76,14 @@ def _require(reason: str, path: str) -> None:
 
 def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:
     """Return the metadata from the lines `# key: value` before the header, and the header's index."""
-    said: dict[str, str] = {}
+    metadata: dict[str, str] = {}
     for index, line in enumerate(lines):
         if line.strip() and not line.startswith("#"):
-            return said, index
+            return metadata, index
         key, colon, value = line.removeprefix("#").partition(":")
         if colon:
-            said[key.strip()] = value.strip()
-    return said, len(lines)
+            metadata[key.strip()] = value.strip()
+    return metadata, len(lines)
 
 
 def _about_comments(lines: Sequence[str], header: int) -> tuple[Finding, ...]:
@@ -161,8 +161,8 @@ def _titled(cells: pd.DataFrame, path: str) -> tuple[pd.DataFrame, tuple[Finding
 
 def write_csv(path: Path, outgoing: Outgoing) -> None:
     """Write a recording as a CSV table, with its metadata as comments."""
-    table, said = columns_and_metadata(outgoing)
-    comments = "".join(f"# {key}: {value}\n" for key, value in said.items())
+    table, metadata = columns_and_metadata(outgoing)
+    comments = "".join(f"# {key}: {value}\n" for key, value in metadata.items())
     with replacing(path) as temporary:
         temporary.write_text(comments + table.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
 

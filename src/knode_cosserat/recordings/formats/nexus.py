@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.recordings.exports import LENGTHS, Cells, Channels, Track, export_table, text_lines
+from knode_cosserat.recordings.exports import LENGTHS, Cells, Track, export_table, text_lines
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.formats.csv_table import delimiter_of
@@ -67,7 +67,7 @@ def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
         elif bodies:
             names = ", ".join(track.name for track in bodies)
             findings.append(Finding("warning", "", f"{names:.200}: of another rate than the first; left out"))
-        channels.append(Channels(at, others))
+        channels.append((at, others))
     return export_table(
         path, np.zeros(0) if time is None else time, tracks, up="z", channels=channels, findings=findings
     )

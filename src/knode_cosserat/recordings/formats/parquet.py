@@ -35,7 +35,7 @@ def read_parquet(path: Path) -> Table:
                 _check_column(file.metadata.schema.column(k), path)
             parquet_file.require_limited_expansion(file.metadata, path)
             table = file.read()
-            said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+            metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except ReadError as error:
         raise RecordingError(f"{path}: {error}") from None
     numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_null)
@@ -47,14 +47,14 @@ def read_parquet(path: Path) -> Table:
     frame = pd.DataFrame({name: table.column(k).to_numpy() for k, name in enumerate(table.column_names)})
     if frame.empty:
         raise RecordingError(f"{path}: no rows")
-    return Table(said, numbers_of(frame))
+    return Table(metadata, numbers_of(frame))
 
 
 def write_parquet(path: Path, outgoing: Outgoing) -> None:
     """Write a recording as a Parquet file. Raises `ImportError` if pyarrow is not installed."""
     pyarrow = _pyarrow()
-    table, said = columns_and_metadata(outgoing)
-    columns = pyarrow.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(said)
+    table, metadata = columns_and_metadata(outgoing)
+    columns = pyarrow.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(metadata)
     with replacing(path) as temporary:
         pyarrow.parquet.write_table(columns, temporary)
 
