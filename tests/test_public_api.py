@@ -58,7 +58,7 @@ def test_every_public_name_is_there_and_says_what_it_is(module):
         assert said and said.split()[0] not in VAGUE, f"{module.__name__}.{name}: {said}"
 
 
-@pytest.mark.parametrize("space", [kc, kc.solvers, kc.learning, kch])
+@pytest.mark.parametrize("space", [kc, kc.solvers, kc.learning, kc.recordings, kch])
 def test_a_lazy_package_has_the_names_that_it_lists(space):
     assert dir(space) == sorted(space.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):

@@ -202,9 +202,9 @@ def test_a_disk_that_is_really_full(tmp_path):
         with pytest.raises(HardwareError, match="No space left"):
             record()
         recorder.close()
-        from knode_cosserat.recordings.formats.ros1 import read_ros1
+        from knode_cosserat.recordings.formats.bag import read_ros1
 
-        bag = read_ros1(recorder.active_path.read_bytes(), ["/tension"], "bag")
+        bag = read_ros1(recorder.active_path, ["/tension"])
         assert len(bag.topics["/tension"].received) == recorder.written > 100
         assert bag.lost == 0
     finally:

@@ -8,6 +8,7 @@ from rosbags import rosbag1
 from rosbags.highlevel import AnyReader
 
 import knode_cosserat as kc
+import knode_cosserat.recordings.health  # its import is not timed
 from knode_cosserat.recordings import RecordingConfig, RecordingError
 from tests.recordings.made import PAPER, made, write
 

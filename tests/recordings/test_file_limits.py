@@ -98,7 +98,7 @@ def sqlite_bag_size(folder, patch):
 def columns_file(folder):
     pytest.importorskip("pyarrow")
     path = folder / "it.parquet"
-    parquet.write_parquet(path, pd.DataFrame({f"c{k}": np.arange(50.0) for k in range(5)}), {})
+    pd.DataFrame({f"c{k}": np.arange(50.0) for k in range(5)}).to_parquet(path)
     return path
 
 

@@ -8,8 +8,8 @@ import typer.testing
 
 from knode_cosserat.cli import app
 from knode_cosserat.recordings import RecordingError, load_recording
-from knode_cosserat.recordings.container import ALLOWANCE
-from knode_cosserat.recordings.plausibility import implausible_tensions
+from knode_cosserat.recordings.checks import implausible_tensions
+from knode_cosserat.recordings.content import ALLOWANCE
 
 ROWS = 40
 

@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import MarkerSource, RecordingConfig, TensionSource, cleaning
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings import MarkerSource, RecordingConfig, TensionSource, checks
+from knode_cosserat.recordings.formats import bag
+from knode_cosserat.recordings.write import START, MocapPoses, Pulls, write_recording
 from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
 TIP = "/vicon/continuum_3/pose"
@@ -62,7 +63,7 @@ def test_every_swap_of_axes_is_undone(streams):
     assert len(CUBE) == 23
     for by in CUBE:
         wrong = swapped(streams, 150, by)[0]["rib 4"].quaternion
-        mended, swaps, unclear = cleaning.swaps_undone(time, wrong)
+        mended, swaps, unclear = checks.swaps_undone(time, wrong)
         assert [swap.row for swap in swaps] == [150]
         assert unclear == []
         np.testing.assert_allclose(np.abs(np.sum(mended * quaternion, axis=1)), 1.0, rtol=0, atol=1e-9)
@@ -100,7 +101,7 @@ def test_motion_is_no_swap():
     turning = Rotation.from_rotvec(np.outer(time, [0.0, np.radians(900.0), 0.0]))
     quaternion = turning.as_quat(scalar_first=True)
     for kept in (slice(None), np.r_[0:100, 109:200], np.r_[0:50, 60:200]):
-        mended, swaps, _ = cleaning.swaps_undone(time[kept], quaternion[kept])
+        mended, swaps, _ = checks.swaps_undone(time[kept], quaternion[kept])
         assert swaps == []
         np.testing.assert_array_equal(mended, quaternion[kept])
 
@@ -149,7 +150,7 @@ def test_no_frame_of_a_motion_is_an_outlier():
         ):
             seen = np.stack([course, 0.5 * course, 0.0 * course], axis=1)
             seen += rng.normal(0.0, noise, seen.shape)
-            found = cleaning.outliers(np.diff(seen, axis=0), time, floor=5e-3, longest=4)
+            found = checks.outliers(np.diff(seen, axis=0), time, floor=5e-3, longest=4)
             # a square course that is seen five times a second does come back after two frames
             assert not found.any() or rate == 5.0
 
@@ -202,20 +203,16 @@ def test_messages_out_of_order_and_twice_are_sorted(tmp_path, streams):
 def test_a_clock_that_is_set_meanwhile_is_told_by_the_times_of_recording(
     tmp_path, streams, jump, monkeypatch
 ):
-    from knode_cosserat.recordings import write as module
+    original = bag.encoder_of
 
-    original = module._messages
+    def restamped(stream, ros):
+        encode = original(stream, ros)
+        first = (START + 2) * 10**9 - 3_000_000 if stream.topic == TIP else np.inf
+        return lambda stamp, row, values: encode(
+            stamp + round(jump * 1e9) if stamp >= first else stamp, row, values
+        )
 
-    def restamped(*arguments):
-        for topic, kind, received, message in original(*arguments):
-            if topic == TIP and received >= (module.START + 2) * 10**9:
-                stamp = message.header.stamp
-                time = stamp.sec * 10**9 + stamp.nanosec + round(jump * 1e9)
-                object.__setattr__(stamp, "sec", time // 10**9)
-                object.__setattr__(stamp, "nanosec", time % 10**9)
-            yield topic, kind, received, message
-
-    monkeypatch.setattr(module, "_messages", restamped)
+    monkeypatch.setattr(bag, "encoder_of", restamped)
     recording = read(tmp_path, streams, delays={TIP: 0.003})
     finding = said(recording, "the clock of its stamps jumped")
     assert f"{jump:+.3f} s" in finding.message
@@ -225,19 +222,15 @@ def test_a_clock_that_is_set_meanwhile_is_told_by_the_times_of_recording(
 
 @pytest.mark.parametrize(("topics", "rate"), [((TIP,), 0.01), ((TIP,), -0.008), ((TIP,), 0.001), ((), 0.01)])
 def test_a_clock_that_drifts_against_the_others_is_named(tmp_path, streams, topics, rate, monkeypatch):
-    from knode_cosserat.recordings import write as module
-
-    original = module._messages
+    original = bag.encoded_messages
 
     def restamped(*arguments):
-        for topic, kind, received, message in original(*arguments):
+        for topic, received, message in original(*arguments):
             # without topics, all clocks drift alike against the recorder's
-            if topic in topics or not topics:
-                late = round(rate * (received - module.START * 10**9))
-                received += late
-            yield topic, kind, received, message
+            late = round(rate * (received - START * 10**9)) if topic in topics or not topics else 0
+            yield topic, received + late, message
 
-    monkeypatch.setattr(module, "_messages", restamped)
+    monkeypatch.setattr(bag, "encoded_messages", restamped)
     recording = read(tmp_path, streams)
     found = [each for each in recording.findings if "its clock drifts" in each.message]
     if not topics or abs(rate) < 0.005:

@@ -494,8 +494,8 @@ def test_damaged_compressed_messages_are_counted(tmp_path):
 
 def test_compressed_messages_stay_within_the_limits(tmp_path, monkeypatch):
     path = write(tmp_path / "it", [*poses(), *joint_states()], 2, rosbag2.CompressionMode.MESSAGE)
-    monkeypatch.setattr("knode_cosserat.recordings.container.RATIO", 0)
-    monkeypatch.setattr("knode_cosserat.recordings.container.ALLOWANCE", 4000)
+    monkeypatch.setattr("knode_cosserat.recordings.content.RATIO", 0)
+    monkeypatch.setattr("knode_cosserat.recordings.content.ALLOWANCE", 4000)
     recording = load_recording(path, config())
     assert len(recording.bodies[0].time) < len(TIME)
     assert any("KNODE_COSSERAT_LIMITS" in each.message for each in recording.findings)

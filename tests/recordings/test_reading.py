@@ -17,7 +17,8 @@ from knode_cosserat.recordings import (
     TensionSource,
     messages,
 )
-from knode_cosserat.recordings.write import FORMATS, MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.formats import written_suffixes
+from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 from tests.recordings.made import LAG, PAPER, SMALL, changed, moved, write
 
 
@@ -29,7 +30,7 @@ def turned_by(quaternion, rotation):
 # round trips
 
 
-@pytest.mark.parametrize("ending", FORMATS)
+@pytest.mark.parametrize("ending", written_suffixes())
 def test_the_papers_robot_comes_back(tmp_path, exact, ending):
     recording = kc.load_recording(write(tmp_path / f"it{ending}", exact), PAPER)
     _, tension, command = exact
@@ -47,7 +48,7 @@ def test_the_papers_robot_comes_back(tmp_path, exact, ending):
     assert [finding for finding in recording.findings if finding.severity != "note"] == []
 
 
-@pytest.mark.parametrize("ending", FORMATS)
+@pytest.mark.parametrize("ending", written_suffixes())
 def test_another_robot_of_three_tendons_and_one_body_that_has_no_orientation_comes_back(tmp_path, ending):
     time = np.round(np.arange(0.0, 2.0, 0.02), 6)
     position, _ = moved(time, 1.0)

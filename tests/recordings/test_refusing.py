@@ -13,7 +13,8 @@ from knode_cosserat.recordings import (
     TensionSource,
     messages,
 )
-from knode_cosserat.recordings.write import FORMATS, Pulls, write_recording
+from knode_cosserat.recordings.formats import written_suffixes
+from knode_cosserat.recordings.write import Pulls, write_recording
 from tests.recordings.made import PAPER, changed, write
 
 
@@ -125,7 +126,7 @@ def test_what_cannot_be_written_is_said(tmp_path, exact):
         write_recording(tmp_path / "it.bag", PAPER, {"tip": poses["rib 4"]}, tension, command)
     with pytest.raises(RecordingError, match=r"tension of shape \(150, 3\); the configuration has 4 tendons"):
         write_recording(tmp_path / "it.bag", PAPER, poses, Pulls(tension.time, tension.tension[:, :3]))
-    for ending in FORMATS:
+    for ending in written_suffixes():
         with pytest.raises(RecordingError, match="cannot be written"):
             write_recording(tmp_path / "nowhere" / f"it{ending}", PAPER, poses, tension, command)
     assert list(tmp_path.iterdir()) == []

@@ -7,7 +7,7 @@ import dataclasses
 import os
 import struct
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from io import BytesIO
 from pathlib import Path
 from types import TracebackType
@@ -16,12 +16,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.config import POSITION_UNITS, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.formats.ros1 import BAG, CHUNK, CHUNK_INFO, CONNECTION, INDEX, MESSAGE, VERSION
-from knode_cosserat.recordings.messages import typestore
-from knode_cosserat.recordings.sources import POSITION_UNITS, TensionSource
-from knode_cosserat.recordings.write import WireStream, message_maker, message_type, sent_tensions
+from knode_cosserat.recordings.messages import encoder_of, message_type, typestore
+from knode_cosserat.recordings.streams import OutgoingStream
+from knode_cosserat.recordings.write import sent_tensions
 from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
 
@@ -38,12 +37,6 @@ class Encoded(NamedTuple):
 
     topic: str
     data: bytes
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class _Coder:
-    topic: BagTopic
-    encode: Callable[[int, Any], Encoded]
 
 
 class MessageEncoder:
@@ -63,20 +56,24 @@ class MessageEncoder:
         self.config = config
         #: names of the bodies, in the order of poses: the base, where there is one, then the markers
         self.bodies: tuple[str, ...] = tuple(marker.name for marker in config.markers)
-        sources = [marker.topic for marker in config.markers]
+        topics = [marker.topic for marker in config.markers]
         if config.base is not None:
-            self.bodies, sources = ("base", *self.bodies), [config.base.topic, *sources]
-        self._scale = POSITION_UNITS[config.position_unit]
-        self._poses = [_coder(WireStream(topic, "pose", [], np.zeros((0, 7)))) for topic in sources]
-        self._tension, self._command = (
-            None if source is None else _coder(_numbers(role, source))
+            self.bodies, topics = ("base", *self.bodies), [config.base.topic, *topics]
+        self._poses = [OutgoingStream(topic, "pose", [], np.zeros((0, 7))) for topic in topics]
+        self._numbers = {
+            role: OutgoingStream(source.topic, role, [], np.zeros((0, len(source.order))), source)  # type: ignore[arg-type]
             for role, source in (("tension", config.tension), ("command", config.command))
-        )
+            if source is not None
+        }
+        streams = [*self._poses, *self._numbers.values()]
+        self._encode = {stream.topic: encoder_of(stream, 1) for stream in streams}
+        #: topics of all messages
+        self.topics = [BagTopic(stream.topic, message_type(stream, 1)) for stream in streams]
 
     @property
-    def topics(self) -> list[BagTopic]:
-        """Topics of all messages."""
-        return [coder.topic for coder in (*self._poses, self._tension, self._command) if coder]
+    def command_topic(self) -> str | None:
+        """Topic of commands; None without commands."""
+        return self.config.command.topic if self.config.command else None
 
     def poses(
         self, stamp: int, position: Float[np.ndarray, "bodies 3"], quaternion: Float[np.ndarray, "bodies 4"]
@@ -91,13 +88,14 @@ class MessageEncoder:
         Raises:
             RecordingError: the number of bodies is wrong.
         """
-        values = np.concatenate([np.asarray(position) / self._scale, np.asarray(quaternion)], axis=1)
+        scale = POSITION_UNITS[self.config.position_unit]
+        values = np.concatenate([np.asarray(position) / scale, np.asarray(quaternion)], axis=1)
         if values.shape != (len(self.bodies), 7):
             raise RecordingError(
                 f"poses must be of {len(self.bodies)} bodies: {', '.join(self.bodies)} (got {len(values)})"
             )
         pairs = zip(self._poses, values, strict=True)
-        return [coder.encode(stamp, row) for coder, row in pairs if np.all(np.isfinite(row))]
+        return [self._message(stream, stamp, row) for stream, row in pairs if np.all(np.isfinite(row))]
 
     def tension(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
         """Return the message of measured tensions (N).
@@ -107,9 +105,7 @@ class MessageEncoder:
         Raises:
             RecordingError: the number of tensions is wrong.
         """
-        if not np.all(np.isfinite(tension)):
-            return []
-        return self._encoded(self._tension, self.config.tension, stamp, tension)
+        return self._tensions("tension", stamp, tension) if np.all(np.isfinite(tension)) else []
 
     def command(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
         """Return the message of commanded tensions (N); none if the configuration has no topic for it.
@@ -119,44 +115,36 @@ class MessageEncoder:
         Raises:
             RecordingError: the number of tensions is wrong, or one is not finite.
         """
-        return self._encoded(self._command, self.config.command, stamp, tension)
+        return self._tensions("command", stamp, tension)
 
     def simulation(self, stamp: int) -> list[Encoded]:
         """Return the line of the log on a simulated robot; none if commands are not text."""
-        source = self.config.command
-        if self._command is None or source is None or source.text is None:
+        source, stream = self.config.command, self._numbers.get("command")
+        if source is None or stream is None or source.text is None:
             return []
-        return [self._command.encode(stamp, np.full(len(source.order), np.nan))]
+        return [self._message(stream, stamp, np.full(len(source.order), np.nan))]
 
-    @staticmethod
-    def _encoded(
-        coder: _Coder | None, source: TensionSource | None, stamp: int, tension: Any
-    ) -> list[Encoded]:
-        if coder is None or source is None:
+    def _tensions(self, role: str, stamp: int, tension: Any) -> list[Encoded]:
+        stream = self._numbers.get(role)
+        if stream is None:
             return []
         values = np.asarray(tension, dtype=float)
-        if values.shape != (len(source.order),):
+        if values.shape != (len(stream.source.order),):
             raise RecordingError(
-                f"topic {source.topic} has {len(source.order)} tendons (got tensions of shape {values.shape})"
+                f"topic {stream.topic} has {len(stream.source.order)} tendons (got tensions of shape "
+                f"{values.shape})"
             )
         if not np.all(np.isfinite(values)):
-            raise RecordingError(f"topic {source.topic}: tensions must be finite (got {values.tolist()})")
-        return [coder.encode(stamp, sent_tensions(source, values[None])[0])]
+            raise RecordingError(f"topic {stream.topic}: tensions must be finite (got {values.tolist()})")
+        return [self._message(stream, stamp, sent_tensions(stream.source, values[None])[0])]
+
+    def _message(self, stream: OutgoingStream, stamp: int, values: Any) -> Encoded:
+        return Encoded(stream.topic, self._encode[stream.topic](stamp, 0, values))
 
 
-def _numbers(role: str, source: TensionSource) -> WireStream:
-    return WireStream(source.topic, role, [], np.zeros((0, len(source.order))), source)
-
-
-def _coder(stream: WireStream) -> _Coder:
-    kind, make, store = message_type(stream, 1), message_maker(stream, 1), typestore(1)
-
-    def encode(stamp: int, values: Any) -> Encoded:
-        return Encoded(stream.topic, bytes(store.serialize_ros1(make(stamp, 0, values), kind)))
-
-    return _Coder(BagTopic(stream.topic, kind), encode)
-
-
+VERSION = b"#ROSBAG V2.0\n"
+#: record types
+MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
 #: size of the bag's first record (bytes), which is written again at the end
 FIRST_SIZE = 4096
 _long = struct.Struct("<I").pack

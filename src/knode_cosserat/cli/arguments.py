@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from knode_cosserat._numbers import numbers_in
+from knode_cosserat.recordings.formats import read_suffixes
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.ensemble import Ensemble
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 #: endings of figure files
 FORMATS = (".png", ".pdf", ".svg")
 #: endings of recordings
-RECORDINGS = (".bag", ".mcap", ".db3", ".csv", ".parquet", ".csv.gz", ".bag.active")
+RECORDINGS = read_suffixes()
 #: kinds of files, see `io.container.kind_of`
 TRAJECTORY, MODEL = "knode-cosserat trajectory", "knode-cosserat model"
 
@@ -279,8 +280,7 @@ def load_recordings(paths: Sequence[Path], config: Path | None, *, proposals: bo
     for path in paths:
         if is_trajectory(str(path)):
             raise ValueError(
-                f"{path}: this is a trajectory; allowed is a recording (.bag, .mcap, .db3, .csv, .parquet, "
-                f".trc, .c3d). "
+                f"{path}: this is a trajectory; allowed is a recording ({', '.join(RECORDINGS)}). "
                 f"To draw a trajectory, type: {command_line('plot', path, '--out', path.stem + '.png')}. "
                 f"To learn a model from it, type: {command_line('fit', 'ROBOT', path, '--out', 'model')}"
             )

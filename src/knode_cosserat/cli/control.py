@@ -13,6 +13,7 @@ from knode_cosserat._files.csv_rows import size_excess
 from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, parse_limits, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.recordings.formats import written_suffixes
 
 #: distance from the nearest tip at rest at which a warning is given, as part of the length
 OUT_OF_REACH = 2e-3
@@ -143,7 +144,7 @@ def control(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Write the measured tip and the controls as a recording: .csv, .bag, .mcap or .db3.",
+            help=f"Write the measured tip and the controls as a recording: {', '.join(written_suffixes())}.",
         ),
     ] = None,
     states: Annotated[

@@ -23,13 +23,14 @@ from knode_cosserat.cli.arguments import (
 )
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.recordings.formats import read_suffixes
 
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
 
 Recordings = Annotated[
     list[Path],
-    typer.Argument(metavar="RECORDING", help="Bags (.bag, .mcap, .db3) or tables (.csv, .parquet)."),
+    typer.Argument(metavar="RECORDING", help=f"Recordings ({', '.join(read_suffixes())})."),
 ]
 Config = Annotated[
     Path | None,

@@ -10,10 +10,11 @@ import typer
 from knode_cosserat.cli.arguments import Json, Picture, figures, load_recordings, require_writable
 from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.recordings.formats import formats
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings import Recording
-    from knode_cosserat.recordings.quality import Health, StreamHealth
+    from knode_cosserat.recordings.health import Health, StreamHealth
 
 
 @app.command(
@@ -28,8 +29,7 @@ def inspect(
         Path,
         typer.Argument(
             metavar="RECORDING",
-            help="ROS 1 or ROS 2 bag (a file or a folder), CSV or Parquet table, or export of motion "
-            "capture: CSV of Motive or Nexus, TRC, C3D.",
+            help=f"File or folder of one of these formats: {', '.join(kind.name for kind in formats())}.",
         ),
     ],
     config: Annotated[

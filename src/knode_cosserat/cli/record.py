@@ -11,6 +11,7 @@ import typer
 from knode_cosserat.cli.arguments import Json, NetCDF, require_trajectory_name, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.recordings.formats import written_suffixes
 
 
 @app.command(
@@ -34,7 +35,7 @@ def record_virtual(
         Path,
         typer.Option(
             metavar="FILE",
-            help="Write this bag (.bag, .mcap, .db3) or table (.csv, .parquet).",
+            help=f"Write this recording: {', '.join(written_suffixes())}.",
         ),
     ],
     seconds: Annotated[float, typer.Option(metavar="S", help="Duration (s).")] = 16.0,

@@ -21,8 +21,8 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from knode_cosserat.recordings.health import Health
     from knode_cosserat.recordings.measurements import Measurements
-    from knode_cosserat.recordings.quality import Health
     from knode_cosserat.recordings.recording import Body, Recording
 
 #: markers of events: text in the finding, colour and label
@@ -153,8 +153,8 @@ def _with_breaks(body: Body, longest: float) -> tuple[np.ndarray, np.ndarray]:
 
 def _draw_frames(axes: Any, recording: Recording) -> None:
     """Draw missing frames and events, a row per stream."""
-    from knode_cosserat.recordings.quality import period
     from knode_cosserat.recordings.recording import bridge
+    from knode_cosserat.recordings.streams import period
 
     streams = [(body.name, body.topic, body.time) for body in (*recording.bodies, recording.base) if body]
     if recording.tension is not None:

@@ -1,15 +1,14 @@
-"""Content of a recording's file: its beginning, and all of its bytes, decompressed, within limits."""
+"""Content of a recording's file: its beginning, its bytes, and compressed parts, within limits."""
 
 from __future__ import annotations
 
-import gzip
-import io
+import bz2
 import zlib
 from pathlib import Path
+from typing import Any
 
 from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._files.reading import ReadError, read_bytes
-from knode_cosserat.recordings.container import ALLOWANCE, RATIO
 from knode_cosserat.recordings.findings import RecordingError
 
 GZIP_MAGIC = b"\x1f\x8b"
@@ -17,8 +16,15 @@ GZIP_MAGIC = b"\x1f\x8b"
 LARGEST_BAG = 4 << 30
 #: bytes that a format is recognised by
 HEAD = 4096
-#: bytes that are decompressed at a time
-_PIECE = 1 << 20
+#: largest decompressed size of one compressed part (bytes): a larger stated size is more likely an error
+LARGEST_CHUNK = 1 << 30
+#: most bytes that all compressed parts of a file may have together: so many times the file, and these
+#: besides. Recorded messages become 2 to 20 times smaller
+RATIO, ALLOWANCE = 200, 1 << 24
+#: damage of a file whose parts expand beyond a limit
+EXPANDED = "its chunks expand beyond the limit for a file of this size"
+#: compressed bytes passed to a library at a time, and bytes of output that it may allocate at a time
+_PIECE, _OUTPUT = 1 << 14, 1 << 24
 
 
 def beginning(path: Path) -> bytes:
@@ -48,27 +54,96 @@ def file_bytes(path: Path, limit: int) -> bytes:
     """
     try:
         data = read_bytes(path, limit)
-        return _gunzipped(data, path, limit) if data.startswith(GZIP_MAGIC) else data
     except ReadError as error:
         raise RecordingError(f"{path}: {error}") from None
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
-
-
-def _gunzipped(data: bytes, path: Path, limit: int) -> bytes:
+    if not data.startswith(GZIP_MAGIC):
+        return data
     ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
-    most, words = ratio * len(data) + allowance, f"{ratio} times the file and {allowance}"
-    if allowed(limit) < most:
-        most = allowed(limit)
-        words = str(most)
-    parts, size = [], 0
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-        # in pieces, because all bytes that are asked for would be allocated
-        while size <= most and (part := file.read(_PIECE)):
-            parts.append(part)
-            size += len(part)
+    most = min(ratio * len(data) + allowance, allowed(limit))
+    parts, size, rest = [], 0, data
+    try:
+        while len(rest) > 0 and size <= most:
+            file = zlib.decompressobj(zlib.MAX_WBITS | 16)
+            while size <= most:
+                part = file.decompress(rest, _OUTPUT)
+                rest = file.unconsumed_tail
+                parts.append(part)
+                size += len(part)
+                if file.eof:
+                    break
+                if not rest and len(part) < _OUTPUT:
+                    raise RecordingError(f"{path}: cannot be decompressed: the file was cut")
+            # further members follow; zeros may fill the last block
+            rest = file.unused_data.lstrip(b"\0")
+    except zlib.error as error:
+        raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
     if size > most:
+        words = f"{ratio} times the file and {allowance}" if most < allowed(limit) else str(most)
         raise RecordingError(
             f"{path}: it has more than {most} bytes when decompressed; allowed are {words}; {MORE}"
         )
     return b"".join(parts)
+
+
+class Decompression:
+    """Decompression of a file's parts, whose sizes are limited together.
+
+    Args:
+        size: size of the file (bytes).
+    """
+
+    def __init__(self, size: int) -> None:
+        self._remaining = allowed(RATIO) * size + allowed(ALLOWANCE)
+        #: true if a limit was reached: bytes may be missing
+        self.is_limited = False
+
+    def records(self, data: bytes | memoryview, compression: str, size: int = 0) -> bytes:
+        """Return the decompressed bytes of a part, as far as they are readable and allowed.
+
+        Args:
+            data: compressed bytes; other bytes may follow them.
+            compression: bz2, lz4 or zstd; of any other one nothing is readable.
+            size: decompressed size (bytes); zero if unknown.
+
+        Raises:
+            ImportError: the library for this compression is not installed.
+        """
+        limit = min(allowed(LARGEST_CHUNK), self._remaining)
+        most = min(size or limit, limit)
+        decompressor, parts, count = _decompressor(compression), list[bytes](), 0
+        # in pieces, so that the data before a damaged byte are recovered
+        for begin in range(0, len(data) if decompressor else 0, _PIECE):
+            piece = bytes(data[begin : begin + _PIECE])
+            try:
+                while count < most and not decompressor.eof:
+                    # a library may allocate all bytes that it is asked for
+                    wanted = min(most - count, _OUTPUT)
+                    part = decompressor.decompress(piece, wanted)
+                    parts.append(part)
+                    count += len(part)
+                    if len(part) < wanted:
+                        break
+                    piece = b""
+            # each of the three libraries has its own errors
+            except Exception:
+                break
+        self._remaining -= count
+        self.is_limited |= count >= limit != size
+        return b"".join(parts)
+
+
+def _decompressor(compression: str) -> Any:
+    """Return a new decompressor of a library; None for an unknown compression."""
+    if compression == "bz2":
+        return bz2.BZ2Decompressor()
+    if compression == "lz4":
+        import lz4.frame  # type: ignore[import-untyped]
+
+        return lz4.frame.LZ4FrameDecompressor()
+    if compression == "zstd":
+        try:
+            from compression import zstd  # type: ignore[import-not-found, unused-ignore]
+        except ImportError:
+            from backports import zstd  # type: ignore[no-redef, import-not-found, import-untyped, unused-ignore]
+        return zstd.ZstdDecompressor()
+    return None

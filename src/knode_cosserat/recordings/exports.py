@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._files import csv_rows
@@ -47,11 +46,8 @@ class Track(NamedTuple):
     kind: str = "marker"
 
 
-class Channels(NamedTuple):
-    """Analog channels: their times (s), and values by title."""
-
-    time: Float[np.ndarray, " n"]
-    values: Mapping[str, Float[np.ndarray, " n"]]
+#: analog channels: their times (s), and values by title
+Channels = tuple[Float[np.ndarray, " n"], Mapping[str, Float[np.ndarray, " n"]]]
 
 
 def export_table(
@@ -78,23 +74,26 @@ def export_table(
     Raises:
         RecordingError: no body is there, or too many.
     """
+    import pandas as pd  # type: ignore[import-untyped]
+
     if not tracks:
         raise RecordingError(f"{path}: it has no bodies and no markers with positions")
     if reason := excess(3 * len(tracks), MOST_COLUMNS, "columns"):
         raise RecordingError(f"{path}: {reason}")
     columns: dict[str, np.ndarray] = {TIME: time}
-    found, names = list(findings), []
+    remarks, names = list(findings), []
     for track in sorted(tracks, key=lambda track: track.quaternion is None):
         spellings = [track.name, f"{track.name} ({track.kind})"]
         numbered = (f"{track.name} ({k})" for k in itertools.count(2))
-        name = next(each for each in itertools.chain(spellings, numbered) if f"{each}_x [m]" not in columns)
+        candidates = itertools.chain(spellings, numbered)
+        name = next(name for name in candidates if f"{name}_x [m]" not in columns)
         names.append((name, track.quaternion is not None))
         position = np.array(track.position, dtype=float)
         # no measured coordinate is exactly zero three times over
         nowhere = np.all(position == 0.0, axis=1)
         if nowhere.any():
             frames = "frame is" if nowhere.sum() == 1 else "frames are"
-            found.append(
+            remarks.append(
                 Finding("warning", name, f"{int(nowhere.sum())} {frames} at exactly 0, 0, 0; left out")
             )
             position[nowhere] = np.nan
@@ -104,15 +103,15 @@ def export_table(
             columns |= dict(zip(quaternion_titles(name), turned.T, strict=True))
     parts = [pd.DataFrame(columns)]
     # channels have rows of their own: cells of other rows are empty
-    parts += [pd.DataFrame({TIME: each.time, **each.values}) for each in channels if len(each.values)]
+    parts += [pd.DataFrame({TIME: at, **values}) for at, values in channels if values]
     table = (
         pd.concat(parts).sort_values(TIME, kind="stable", ignore_index=True) if len(parts) > 1 else parts[0]
     )
     oriented = [name for name, has_orientation in names if has_orientation]
     known = [name for name, _ in names if not name.rpartition(":")[2].lower().startswith(_UNKNOWN)]
     bodies = oriented or known or [name for name, _ in names]
-    said = {"source": f"{path.name}: {source}"} if source else {}
-    return Table(said, table, tuple(found), tuple(bodies), up)
+    metadata = {"source": f"{path.name}: {source}"} if source else {}
+    return Table(metadata, table, tuple(remarks), tuple(bodies), up)
 
 
 def length_unit(word: str, path: Path, default: str, findings: list[Finding]) -> float:

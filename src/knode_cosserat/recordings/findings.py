@@ -35,3 +35,8 @@ class Finding:
 
     def __str__(self) -> str:
         return ": ".join(part for part in (self.severity, self.topic, self.message) if part)
+
+
+def counted(count: int, one: str, several: str) -> str:
+    """Return a count with its words in the singular or plural."""
+    return f"{count} {one if count == 1 else several}"

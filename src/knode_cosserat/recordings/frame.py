@@ -1,19 +1,17 @@
-"""Transformation to the robot's frame: the clamped end, and the axes of bodies calibrated at rest."""
+"""Transformation to the robot's frame: the clamped end, the axes of bodies calibrated at rest, and checks."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.config import UP, RecordingConfig
+from knode_cosserat.recordings.config import POSITION_UNITS, UP, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
-from knode_cosserat.recordings.orientation import misread_orientation
-from knode_cosserat.recordings.sources import POSITION_UNITS
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.recording import Body
@@ -36,6 +34,18 @@ BENT = np.radians(10.0)
 PIECES = 16
 #: largest relative spread of the rod's lengths estimated from its bodies
 UNEQUAL = 0.05
+#: smallest bending (rad, root mean square) that shows how orientations are meant
+SMALLEST_BEND = np.radians(3.0)
+#: largest error of another reading, as a fraction of the error as read, and of the bending
+BETTER, EXPLAINED = 0.5, 0.5
+#: number of rows that stand for the rest, where none is known
+_FIRST_ROWS = 5
+#: other meanings of four numbers that were read as w, x, y, z
+_READINGS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "scalar last (x, y, z, w) under titles of w, x, y, z": lambda q: q[:, [3, 0, 1, 2]],
+    "scalar first (w, x, y, z) under titles of x, y, z, w": lambda q: q[:, [1, 2, 3, 0]],
+    "the inverse rotation (from the frame to the body)": lambda q: q * [1.0, -1.0, -1.0, -1.0],
+}
 
 
 def rest_of(bodies: Sequence[Body]) -> tuple[float, float] | None:
@@ -76,19 +86,18 @@ def bodies_in_robot_frame(
             findings.append(Finding("warning", base.topic, what))
         base = dataclasses.replace(base, position=base.position - origin)
     bodies = [dataclasses.replace(body, position=body.position - origin) for body in bodies]
-    given = None if config.rest is None else (config.rest[0], config.rest[1])
-    rest = given or rest_of(bodies)
+    rest = rest_of(bodies) if config.rest is None else (config.rest[0], config.rest[1])
     findings += _judged(bodies, rest)
-    placed_bodies = []
+    placed = []
     directions = _frames_at_rest(bodies, rest)
     for body, marker, quaternion, at_rest in zip(bodies, config.markers, recorded, directions, strict=True):
         if quaternion is not None and not config.static:
-            misread = misread_orientation(quaternion, turn, body, rest_mask(body.time, rest))
+            misread = _misread_orientation(quaternion, turn, body, rest_mask(body.time, rest))
             findings += [misread] if misread else []
-        placed_body, found = _of_the_rod(body, marker.rotation, rest, at_rest)
-        placed_bodies.append(placed_body)
-        findings += found
-    return placed_bodies, base, rest, findings
+        body, lost = _of_the_rod(body, marker.rotation, rest, at_rest)
+        placed.append(body)
+        findings += [lost] if lost else []
+    return placed, base, rest, findings
 
 
 def _turned(body: Body, turn: Rotation, scale: float) -> Body:
@@ -132,11 +141,11 @@ def _frames_at_rest(bodies: Sequence[Body], rest: tuple[float, float] | None) ->
 
 def _of_the_rod(
     body: Body, rotation: Sequence[float] | None, rest: tuple[float, float] | None, at_rest: Rotation
-) -> tuple[Body, list[Finding]]:
-    """Return the body with the rod's local orientation in place of its own, and the findings."""
+) -> tuple[Body, Finding | None]:
+    """Return the body with the rod's local orientation in place of its own; a finding if it is unknown."""
     if body.quaternion is None:
-        return body, []
-    own = Rotation.from_quat(body.quaternion, scalar_first=True)
+        return body, None
+    turned = Rotation.from_quat(body.quaternion, scalar_first=True)
     if rotation is not None:
         constant = Rotation.from_quat(rotation, scalar_first=True)
     else:
@@ -146,10 +155,10 @@ def _of_the_rod(
                 "how its axes are turned is not known, because it was not seen at rest; its orientations are "
                 "left out (the configuration can state the rest or the marker's rotation)"
             )
-            return dataclasses.replace(body, quaternion=None), [Finding("problem", body.topic, what)]
-        constant = at_rest.inv() * own[np.flatnonzero(still)].mean()
-    turned = (own * constant.inv()).as_quat(scalar_first=True)
-    return dataclasses.replace(body, quaternion=turned), []
+            return dataclasses.replace(body, quaternion=None), Finding("problem", body.topic, what)
+        constant = at_rest.inv() * turned[np.flatnonzero(still)].mean()
+    quaternion = (turned * constant.inv()).as_quat(scalar_first=True)
+    return dataclasses.replace(body, quaternion=quaternion), None
 
 
 def rest_mask(time: Float[np.ndarray, " n"], rest: tuple[float, float] | None) -> np.ndarray:
@@ -223,3 +232,56 @@ def rod_lengths(bodies: Sequence[Body], where: Float[np.ndarray, "M 3"]) -> Floa
 def leans_of(where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
     """Return the angles (rad) between the z axis and the lines from the clamped end to the positions."""
     return np.asarray(np.arctan2(np.linalg.norm(where[:, :2], axis=1), where[:, 2]))
+
+
+# orientations against positions
+
+
+def _misread_orientation(
+    quaternion: Float[np.ndarray, "n 4"], turn: Rotation, placed: Body, still: Bool[np.ndarray, " n"]
+) -> Finding | None:
+    """Return a finding if a body's quaternions agree with its positions in another reading only.
+
+    An arc that leaves the clamped end along z determines the tangent at each position. The body's rotation
+    since the rest has to turn the tangent at rest to it.
+
+    Args:
+        quaternion: recorded orientations, in the frame of motion capture, read as scalar first.
+        turn: rotation from motion capture's frame to the robot's.
+        placed: the body, with positions in the robot's frame (m).
+        still: mask of the rows at rest.
+    """
+    distance = np.linalg.norm(placed.position, axis=1)
+    seen = distance > 1e-9
+    if seen.sum() <= _FIRST_ROWS:
+        return None
+    chord = placed.position[seen] / distance[seen, None]
+    tangent = 2.0 * chord[:, 2:] * chord - [0.0, 0.0, 1.0]
+    start = np.flatnonzero(still[seen])
+    start = start if len(start) >= _FIRST_ROWS else np.arange(_FIRST_ROWS)
+    first = tangent[start].mean(axis=0)
+    first /= np.linalg.norm(first) or 1.0
+    bend = _rms_angle(tangent, np.tile(first, (len(tangent), 1)))
+    if bend < SMALLEST_BEND:
+        return None
+
+    def error(numbers: np.ndarray) -> float:
+        rotation = turn * Rotation.from_quat(numbers, scalar_first=True)
+        return _rms_angle(tangent, (rotation * rotation[start].mean().inv()).apply(first))
+
+    as_read = error(quaternion[seen])
+    errors = {words: error(read(quaternion[seen])) for words, read in _READINGS.items()}
+    words = min(errors, key=errors.__getitem__)
+    if errors[words] > min(BETTER * as_read, EXPLAINED * bend):
+        return None
+    what = (
+        f"its rotation contradicts its positions by {np.degrees(as_read):.0f} degrees; read as {words} it "
+        f"agrees to {np.degrees(errors[words]):.0f} degrees: are its quaternions in this order?"
+    )
+    return Finding("problem", placed.topic, what)
+
+
+def _rms_angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> float:
+    """Return the root mean square of the angles (rad) between unit vectors."""
+    angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
+    return float(np.sqrt(np.mean(angle**2)))

@@ -1,7 +1,8 @@
-"""Quality report of a recording (`quality`): rates, gaps, noise, latency and errors of the tensions."""
+"""Quality report of a recording: rates, gaps, noise, latency and errors of the tensions."""
 
 from __future__ import annotations
 
+import dataclasses
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -9,10 +10,10 @@ import scipy.optimize
 import scipy.signal
 from jaxtyping import Float
 
-from knode_cosserat.recordings.cleaning import rotation_steps
+from knode_cosserat.recordings.checks import NORMAL, rotation_steps
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import rest_mask, rest_positions, rod_lengths
-from knode_cosserat.recordings.quality import Health, Latency, StreamHealth, TensionError, period
+from knode_cosserat.recordings.streams import period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.recording import Body, Recording, Tensions
@@ -25,7 +26,98 @@ LONGEST_LATENCY, _FINE = 0.5, 0.002
 _ENOUGH = 20
 #: smallest difference from the configuration's latency that is reported (s)
 _OFF = 0.03
-_NORMAL = 1.4826
+
+
+@dataclasses.dataclass(frozen=True)
+class StreamHealth:
+    """Quality of one topic.
+
+    Attributes:
+        topic: name of the topic.
+        what: the body's name, or "measured tensions", or "commands".
+        rows: number of usable rows.
+        rate: usual rate of rows (Hz); None for commands, which are irregular.
+        jitter: standard deviation of the time from row to row, without gaps (s); None for commands.
+        missing: fraction of missing rows; None for commands.
+        gaps: number of gaps; None for commands.
+        longest_gap: longest time from row to row (s).
+        delay: median delay from stamp to recording (s); None without stamps.
+        noise: standard deviation of a coordinate (m), or of a tension (N); None if it cannot be estimated.
+        turn_noise: standard deviation of orientation about an axis (rad); None without orientations.
+    """
+
+    topic: str
+    what: str
+    rows: int
+    rate: float | None
+    jitter: float | None
+    missing: float | None
+    gaps: int | None
+    longest_gap: float
+    delay: float | None
+    noise: float | None
+    turn_noise: float | None
+
+
+@dataclasses.dataclass(frozen=True)
+class Latency:
+    """Latency of tensions after commands.
+
+    Attributes:
+        shift: delay of commands that fits the measured tensions best (s).
+        delay: dead time of a fitted model with dead time and first-order lag (s).
+        lag: time constant of that lag (s).
+    """
+
+    shift: float
+    delay: float
+    lag: float
+
+    @property
+    def total(self) -> float:
+        """Mean delay of a change of commands: dead time plus lag (s)."""
+        return self.delay + self.lag
+
+
+@dataclasses.dataclass(frozen=True)
+class TensionError:
+    """Measured minus commanded tension of one tendon (N), with commands delayed by their latency."""
+
+    tendon: int
+    bias: float
+    rms: float
+
+
+@dataclasses.dataclass(frozen=True)
+class Health:
+    """Quality report of a recording.
+
+    Attributes:
+        source: description of the recording.
+        simulated: True if the robot was a simulation; None: not stated.
+        duration: time from the start for which all poses and tensions are known (s).
+        rest: interval in which the robot rests (s), or None.
+        rod_length: estimates (m) from each body away from the clamped end, at rest; none from bodies that
+            lean by more than 10 degrees, and none without a rest.
+        streams: quality of each topic.
+        latency: latency of tensions after commands, or None if it cannot be estimated.
+        tension_errors: errors of each tendon; empty without both tensions.
+        findings: errors and repairs, the gravest first.
+    """
+
+    source: str
+    simulated: bool | None
+    duration: float
+    rest: tuple[float, float] | None
+    rod_length: tuple[float, ...]
+    streams: tuple[StreamHealth, ...]
+    latency: Latency | None
+    tension_errors: tuple[TensionError, ...]
+    findings: tuple[Finding, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the report as plain values for JSON."""
+        return dataclasses.asdict(self)
 
 
 def health_of(recording: Recording) -> Health:
@@ -54,49 +146,39 @@ def health_of(recording: Recording) -> Health:
 
 
 def _of_body(body: Body, recording: Recording) -> StreamHealth:
-    noise = _noise(body.time, body.position, recording.rest)
-    turned = None
+    turn_noise = None
     if body.quaternion is not None:
         # cumulative sum of small rotations, whose differences are differences of angles
         turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_steps(body.quaternion), axis=0)])
-        turned = _noise(body.time, turns, recording.rest)
-    return _stream(body.topic, body.name, body.time, recording, noise, turned)
+        turn_noise = _noise(body.time, turns, recording.rest)
+    report = _stream(body.topic, body.name, body.time, recording)
+    noise = _noise(body.time, body.position, recording.rest)
+    return dataclasses.replace(report, noise=noise, turn_noise=turn_noise)
 
 
 def _of_tensions(what: str, tensions: Tensions, recording: Recording) -> StreamHealth:
+    report = _stream(tensions.topic, what, tensions.time, recording)
     if what == "commands":
-        return _stream(tensions.topic, what, tensions.time, recording, None, None, regular=False)
-    noise = _noise(tensions.time, tensions.tension, recording.rest)
-    return _stream(tensions.topic, what, tensions.time, recording, noise, None)
+        return dataclasses.replace(report, rate=None, jitter=None, missing=None, gaps=None)
+    return dataclasses.replace(report, noise=_noise(tensions.time, tensions.tension, recording.rest))
 
 
-def _stream(
-    topic: str,
-    what: str,
-    time: Float[np.ndarray, " n"],
-    recording: Recording,
-    noise: float | None,
-    turn_noise: float | None,
-    *,
-    regular: bool = True,
-) -> StreamHealth:
+def _stream(topic: str, what: str, time: Float[np.ndarray, " n"], recording: Recording) -> StreamHealth:
     steps, usual = np.diff(time), period(time)
-    regular = regular and usual > 0.0
-    whole = steps[steps <= 1.5 * usual]
-    expected = int(np.sum(np.round(steps / usual))) + 1 if regular else len(time)
     delay = recording.delays.get(topic, float("nan"))
-    return StreamHealth(
-        topic=topic,
-        what=what,
-        rows=len(time),
-        rate=round(1.0 / usual, 6) if regular else None,
-        jitter=float(np.std(whole)) if regular else None,
-        missing=max(0.0, 1.0 - len(time) / expected) if regular else None,
-        gaps=int(np.sum(steps > 1.5 * usual)) if regular else None,
-        longest_gap=float(np.max(steps, initial=0.0)),
-        delay=delay if np.isfinite(delay) else None,
-        noise=noise,
-        turn_noise=turn_noise,
+    report = StreamHealth(
+        topic, what, len(time), None, None, None, None, float(np.max(steps, initial=0.0)),
+        delay if np.isfinite(delay) else None, None, None,
+    )  # fmt: skip
+    if not usual > 0.0:
+        return report
+    expected = int(np.sum(np.round(steps / usual))) + 1
+    return dataclasses.replace(
+        report,
+        rate=round(1.0 / usual, 6),
+        jitter=float(np.std(steps[steps <= 1.5 * usual])),
+        missing=max(0.0, 1.0 - len(time) / expected),
+        gaps=int(np.sum(steps > 1.5 * usual)),
     )
 
 
@@ -109,7 +191,7 @@ def _noise(
     if len(known) < _ENOUGH:
         return None
     # third differences remove smooth motion and multiply the noise by √20
-    return float(_NORMAL * np.median(np.abs(np.diff(known, 3, axis=0))) / np.sqrt(20.0))
+    return float(NORMAL * np.median(np.abs(np.diff(known, 3, axis=0))) / np.sqrt(20.0))
 
 
 # tensions and commands
@@ -129,25 +211,25 @@ def latency_of(recording: Recording) -> Latency | None:
     def missed(delay: float, lag: float) -> float:
         expected = _followed(command, fine, delay, lag)
         seen = expected[np.clip(np.searchsorted(fine, tension.time - 1e-9), 0, len(fine) - 1)]
-        left = tension.tension - seen
-        return float(np.sqrt(np.mean((left - left.mean(axis=0)) ** 2)))
+        error = tension.tension - seen
+        return float(np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)))
 
     shifts = np.arange(0.0, LONGEST_LATENCY, 5 * _FINE)
     by_shift = [missed(shift, 0.0) for shift in shifts]
     shift = float(shifts[int(np.argmin(by_shift))])
     lags = (0.0, 0.01, 0.02, 0.04, 0.08, 0.16)
     delays = (0.0, 0.02, 0.04, 0.06, 0.08, 0.1, 0.15, 0.2)
-    first = min(((missed(delay, lag), delay, lag) for delay in delays for lag in lags), key=lambda it: it[0])
+    first = min((missed(delay, lag), delay, lag) for delay in delays for lag in lags)
     simplex = np.array(first[1:]) + np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]])
     options: Any = {"xatol": 5e-4, "fatol": 1e-6, "maxiter": 80, "initial_simplex": simplex}
     minimize: Any = scipy.optimize.minimize
-    found = minimize(
-        lambda it: missed(abs(float(it[0])), abs(float(it[1]))),
+    best = minimize(
+        lambda pair: missed(abs(float(pair[0])), abs(float(pair[1]))),
         np.array(first[1:]),
         method="Nelder-Mead",
         options=options,
     )
-    delay, lag = np.abs(found.x)
+    delay, lag = np.abs(best.x)
     return Latency(shift, round(float(delay), 4), round(float(lag), 4))
 
 
@@ -176,8 +258,8 @@ def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[Tens
     last = np.searchsorted(command.time, tension.time[known] - late + 1e-9, side="right") - 1
     error = tension.tension[known] - command.tension[np.maximum(last, 0)]
     return tuple(
-        TensionError(k + 1, float(each.mean()), float(np.sqrt(np.mean(each**2))))
-        for k, each in enumerate(error.T)
+        TensionError(k + 1, float(column.mean()), float(np.sqrt(np.mean(column**2))))
+        for k, column in enumerate(error.T)
     )
 
 

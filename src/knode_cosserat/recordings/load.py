@@ -1,27 +1,26 @@
-"""Recordings from files: bags of ROS 1 and 2, tables, and exports of motion capture.
-
-Slow imports (pandas, scipy) are deferred, because this module is imported with the package.
-"""
+"""Reading of recordings: from a file of any format to a `Recording` on one clock and in the robot's frame."""
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.resources
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from knode_cosserat._files.limits import MORE
+from knode_cosserat.recordings import checks, frame, streams, table
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.container import Container
-from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
 from knode_cosserat.recordings.formats import format_of
-from knode_cosserat.recordings.messages import SIMULATED, STATIC, Role, Stream, decoded, topics_of
+from knode_cosserat.recordings.formats.csv_table import read_csv
+from knode_cosserat.recordings.messages import SIMULATED, STATIC, Bag, Role, decoded, topics_of
+from knode_cosserat.recordings.proposal import config_of_bag, config_of_table, useful_topics
 from knode_cosserat.recordings.recording import Recording
-
-if TYPE_CHECKING:
-    from knode_cosserat.recordings.table import Table
+from knode_cosserat.recordings.streams import Stream
+from knode_cosserat.recordings.table import Table
 
 #: file name of the package's own recording
 EXAMPLE = "sine_1p0.csv"
@@ -32,10 +31,10 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
 
     Bags are of ROS 1 (.bag, also .bag.active) or ROS 2 (.mcap, .db3, a folder). Tables are CSV (delimiters
     `,`, `;` or tab; decimal point or comma) or Parquet. Exports are CSV of OptiTrack Motive and Vicon Nexus,
-    TRC and C3D. A text file may be compressed (.csv.gz).
+    TRC and C3D. A text file may be compressed (.csv.gz). `formats` lists all formats and takes new ones.
 
     The content of the file decides its format; the name does only if the first bytes are damaged. A bag
-    that was cut, or whose recorder was killed, is read as far as possible. Errors and repairs are reported
+    that was cut, or whose recorder was killed, is read up to that point. Errors and repairs are reported
     in the recording's `findings`.
 
     Args:
@@ -48,12 +47,12 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
         ImportError: a library for this kind of file is not installed.
     """
     path = Path(path)
-    kind = format_of(path)
     meaning = config or RecordingConfig.paper_robot()
-    content = kind.read(path, _wanted(meaning))
-    if isinstance(content, Container):
-        return _from_bag(path, content, meaning)
-    return _from_table(path.name, str(path), content, config)
+    wanted = {STATIC, *(topic for source in _roles(meaning) for topic in topics_of(source))}
+    content = format_of(path).read(path, wanted)
+    if isinstance(content, Table):
+        return _from_table(path.name, str(path), content, config)
+    return _from_bag(path, content, meaning)
 
 
 def load_example() -> Recording:
@@ -61,8 +60,6 @@ def load_example() -> Recording:
 
     The robot was simulated with PyElastica as a stand-in for the paper's robot; it is not a physical one.
     """
-    from knode_cosserat.recordings.formats.csv_table import read_csv
-
     file = importlib.resources.files("knode_cosserat.recordings") / "data" / EXAMPLE
     return _from_table(EXAMPLE, EXAMPLE, read_csv(file.read_bytes(), EXAMPLE), None)
 
@@ -79,91 +76,132 @@ def proposed_config(path: str | Path) -> tuple[RecordingConfig, tuple[str, ...]]
     Raises:
         RecordingError: the file cannot be read, or nothing in it looks like the poses of a body.
     """
-    from knode_cosserat.recordings import proposal
-
     path = Path(path)
     kind = format_of(path)
     content = kind.read(path, ())
-    if isinstance(content, Container):
-        topics = proposal.useful_topics(content)
-        return proposal.config_of_bag(kind.read(path, topics), str(path))  # type: ignore[arg-type]
-    return proposal.config_of_table(content, str(path))
+    if isinstance(content, Table):
+        return config_of_table(content, str(path))
+    bag = kind.read(path, useful_topics(content))
+    assert isinstance(bag, Bag)
+    return config_of_bag(bag, str(path))
 
 
 # bags
 
 
-def _wanted(config: RecordingConfig) -> Collection[str]:
-    return {STATIC, *(topic for source in _roles(config) for topic in topics_of(source))}
-
-
 def _roles(config: RecordingConfig) -> dict[Any, Role]:
-    roles: dict[Any, Role] = dict.fromkeys(config.markers, "pose")
-    if config.base is not None:
-        roles[config.base] = "pose"
-    if config.measured is not None:
-        roles[config.measured] = "tension"
-    if config.command is not None:
-        roles[config.command] = "command"
-    return roles
+    roles: dict[Any, Role] = dict.fromkeys((*config.markers, config.base), "pose")
+    roles |= {config.measured: "tension", config.command: "command"}
+    return {source: role for source, role in roles.items() if source is not None}
 
 
-def _from_bag(path: Path, container: Container, config: RecordingConfig) -> Recording:
-    from knode_cosserat.recordings import assembly
-
+def _from_bag(path: Path, bag: Bag, config: RecordingConfig) -> Recording:
     unused = config.command if config.tensions == "measured" else config.measured
-    found: dict[str, Stream] = {}
+    numbers: dict[str, Stream] = {}
     findings: list[Finding] = []
     for source, role in _roles(config).items():
-        missing = [name for name in topics_of(source) if name not in container.topics]
-        if missing and unused is not None and source.topic == unused.topic:
+        missing = [name for name in topics_of(source) if name not in bag.topics]
+        if missing and source is unused:
             findings.append(Finding("note", missing[0], f"there is no such topic, and so no {role}s"))
             continue
         if missing:
-            there = ", ".join(sorted(container.topics)) or "none"
-            raise RecordingError(f"{path}: topic {missing[0]} ({role}) is missing; the bag has {there}")
-        found[source.topic] = decoded(container, source, role, str(path))
+            listed = ", ".join(sorted(bag.topics)) or "none"
+            raise RecordingError(f"{path}: topic {missing[0]} ({role}) is missing; the bag has {listed}")
+        numbers[source.topic] = decoded(bag, source, role, str(path))
         # messages contain text verbatim
-        raw = container.topics[topics_of(source)[0]].raw
-        if config.simulated is None and any(SIMULATED.encode() in bytes(each) for each in raw[:100]):
+        raw = bag.topics[topics_of(source)[0]].raw
+        if config.simulated is None and any(SIMULATED.encode() in bytes(message) for message in raw[:100]):
             config = config.replace(simulated=True)
-    if container.damage:
-        findings.append(_said_damage(container, found.values()))
-    return assembly.assembled(str(path), path.name, config, found, findings)
-
-
-def _said_damage(container: Container, streams: Iterable[Stream]) -> Finding:
-    received = [stream.received for stream in streams if len(stream.received)]
-    reached = (
-        (max(int(np.max(each)) for each in received) - min(int(np.min(each)) for each in received)) * 1e-9
-        if received
-        else 0.0
-    )
-    lost = f", {container.lost} bytes could not be read" if container.lost else ""
-    more = f"; {MORE}" if container.is_limited else ""
-    return Finding("warning", "", f"{container.damage}: recovered up to {reached:.3f} s{lost}{more}")
+    if bag.damage:
+        received = [stream.received for stream in numbers.values() if len(stream.received)]
+        duration = 0.0
+        if received:
+            duration = (max(int(at.max()) for at in received) - min(int(at.min()) for at in received)) * 1e-9
+        lost = f", {bag.lost} bytes could not be read" if bag.lost else ""
+        more = f"; {MORE}" if bag.is_limited else ""
+        what = f"{bag.damage}: recovered up to {duration:.3f} s{lost}{more}"
+        findings.append(Finding("warning", "", what))
+    return _assembled(str(path), path.name, config, numbers, findings)
 
 
 # tables
 
 
 def _from_table(name: str, path: str, content: Table, config: RecordingConfig | None) -> Recording:
-    from knode_cosserat.recordings import assembly, table
-
     findings = list(content.findings)
-    simulated = table.said_simulated(content.said, path)
+    simulated = table.is_simulated(content.metadata, path)
     if config is None and content.bodies:
-        from knode_cosserat.recordings import proposal
-
-        config, remarks = proposal.config_of_table(content, path)
+        config, remarks = config_of_table(content, path)
         findings += [Finding("warning", "", remark) for remark in remarks]
-    config = config or table.configured(content.said, list(map(str, content.numbers.columns)), path)
+    config = config or table.configured(content.metadata, list(map(str, content.numbers.columns)), path)
     if content.bodies:
         # the file states its unit and its axes
         config = config.replace(position_unit="m", up=config.up or content.up)
-    found, about_times = table.streams(content.numbers, config, path)
+    numbers, about_times = table.streams_of(content.numbers, config, path)
     if config.simulated is None:
         config = config.replace(simulated=simulated)
-    return assembly.assembled(
-        path, content.said.get("source", name), config, found, [*findings, *about_times]
+    source = content.metadata.get("source", name)
+    return _assembled(path, source, config, numbers, [*findings, *about_times])
+
+
+# streams
+
+
+def _assembled(
+    path: str, name: str, config: RecordingConfig, numbers: Mapping[str, Stream], findings: list[Finding]
+) -> Recording:
+    """Return the recording of raw streams by topic. Raises `RecordingError` if one has no usable data."""
+    for stream in numbers.values():
+        findings.extend(stream.remarks)
+        if stream.broken:
+            what = f"{stream.broken} messages could not be understood, and are left out"
+            findings.append(Finding("warning", stream.topic, what))
+    times, about_clocks = streams.measurement_times(list(numbers.values()), config.clock)
+    rows = {}
+    for topic in numbers:
+        rows[topic], about_order = streams.ordered(topic, times[topic])
+        about_clocks += about_order
+    zero = _zero(config, {topic: times[topic][kept] for topic, kept in rows.items()})
+    if zero is None:
+        raise RecordingError(f"{path}: no poses and no tensions in this recording")
+    seconds = {topic: np.round((times[topic][kept] - zero) * 1e-9, 9) for topic, kept in rows.items()}
+    values = {topic: stream.values[rows[topic]] for topic, stream in numbers.items()}
+    findings += [
+        dataclasses.replace(finding, times=tuple((time - zero) * 1e-9 for time in finding.times))
+        for finding in about_clocks
+    ]
+    bodies, base = [], None
+    sources = [(marker.name, marker.topic, marker.fraction) for marker in config.markers]
+    for source in [*sources, *([("base", config.base.topic, float("nan"))] if config.base else [])]:
+        topic = source[1]
+        body, about_body = checks.cleaned_body(config, source, seconds[topic], values[topic], path)
+        findings += about_body
+        bodies.append(body)
+    if config.base:
+        base = bodies.pop()
+    tension, command, about_tensions = checks.cleaned_tensions(config, seconds, values, path)
+    bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
+    at_rest = frame.rest_positions(bodies, rest)
+    findings += about_tensions + about_frame
+    both = (None if config.motors else tension, command)
+    findings += checks.implausible_sizes(bodies, both, at_rest, is_static=config.static)
+    if config.simulated:
+        findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
+    return Recording(
+        source=f"{name}: {config.description}" if config.description else name,
+        config=config,
+        bodies=tuple(bodies),
+        base=base,
+        tension=tension,
+        command=command,
+        rest=rest,
+        simulated=config.simulated,
+        findings=tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))),
+        delays=streams.offsets(list(numbers.values())),
     )
+
+
+def _zero(config: RecordingConfig, times: Mapping[str, Collection[Any]]) -> Any:
+    """Return the time of the first pose or measured tension (ns); commands may start much earlier."""
+    later = config.command.topic if config.command is not None and config.measured is not None else None
+    return min((next(iter(at)) for topic, at in times.items() if len(at) and topic != later), default=None)

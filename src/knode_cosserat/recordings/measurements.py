@@ -10,8 +10,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import count_of, wrapped
+from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.table import HELD
+from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording, writer_of
+from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
@@ -54,7 +59,7 @@ class Measurements:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
         kind = "equilibria" if self.static else "rows"
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
-        places = ", ".join(f"{each:.4g}" for each in self.fractions)
+        places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions)
         return wrapped(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
             f"{count_of(self.tension.shape[-1], 'tendon')}; "
@@ -74,15 +79,83 @@ class Measurements:
             AttributeError: the system has no positions.
             ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
         """
-        from knode_cosserat.recordings.exchange import measurement_fields
-
-        return cls(**measurement_fields(trajectory, fractions))
+        y, system = np.asarray(trajectory.y), trajectory.system
+        if y.ndim == 4:
+            raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
+        held, initial = np.array(trajectory.held_control), np.asarray(trajectory.control)[0]
+        if "tension" in system.control_layout.names:
+            held, initial = (system.control_layout.get(control, "tension") for control in (held, initial))
+        # the last row has no following tension; without a value it would not count as complete
+        held[-1] = held[-2] if len(held) > 1 else initial
+        along = np.array(fractions, dtype=float)
+        places = places_at(along, system.nodes)
+        position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
+        try:
+            quaternion = np.asarray(quaternions_at(system, y, places))
+        except AttributeError:
+            # the system has no orientations
+            quaternion = np.full((*position.shape[:2], 4), np.nan)
+        return cls(
+            time=np.asarray(trajectory.time, dtype=float),
+            tension=held,
+            fractions=along,
+            position=position,
+            quaternion=quaternion,
+            measured=np.isfinite(position).all(axis=-1),
+            simulated=True,
+            source=f"simulated {type(system).__name__}",
+            initial_tension=initial,
+        )
 
     def save(self, path: str | Path) -> None:
-        """Write a table or a bag (.csv, .parquet, .bag, .mcap, .db3); see `exchange.save`."""
-        from knode_cosserat.recordings.exchange import save
+        """Write a table or a bag (.csv, .parquet, .bag, .mcap, .db3), with tensions held to the next row.
 
-        save(self, path)
+        A table's titles state everything: `load_recording(path).sampled(measurements.dt)` gives the same
+        rows. Beside a bag its configuration is written, with the suffix .yaml, for
+        `load_recording(path, config)`. Planar positions are written as x and z. Bridged poses are not
+        written. Bodies are named `tip` and `body_1`, `body_2` and so on.
+
+        Raises:
+            RecordingError: the name's ending is not one of a format that is written, or a file cannot be
+                written.
+            ImportError: a library for this format is not installed.
+        """
+        path = Path(path)
+        writer_of(path)
+        is_table = path.suffix in (".csv", ".parquet")
+        root = "" if is_table else "/"
+        position = self.position
+        if position.shape[-1] == 2:
+            position = np.stack([position[..., 0], np.zeros(position.shape[:-1]), position[..., 1]], axis=-1)
+        names = ["tip" if place == 1.0 else f"body_{k + 1}" for k, place in enumerate(self.fractions)]
+        poses = {}
+        for k, name in enumerate(names):
+            rows = self.measured[:, k]
+            oriented = bool(np.isfinite(self.quaternion[rows, k]).any())
+            quaternion = self.quaternion[rows, k] if oriented else None
+            poses[name] = MocapPoses(self.time[rows], position[rows, k], quaternion)
+        initial = self.initial_tension
+        config = RecordingConfig(
+            markers=tuple(
+                MarkerSource(name, root + name, float(place), rotation=(1.0, 0.0, 0.0, 0.0))
+                for name, place in zip(names, self.fractions, strict=True)
+            ),
+            tension=TensionSource(root + HELD, tuple(range(1, self.tension.shape[1] + 1)), held=True),
+            simulated=self.simulated,
+            description=self.source,
+            initial_tension=None if initial is None else tuple(initial.tolist()),
+        )
+        tension = Pulls(self.time, self.tension)
+        if is_table:
+            write_recording(path, config, poses, tension)
+            return
+        # the configuration takes its name last: neither file is changed if the bag cannot be written
+        try:
+            with replacing(path.with_suffix(".yaml")) as beside:
+                config.save(beside)
+                write_recording(path, config, poses, tension)
+        except OSError as error:
+            raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
 
     @property
     def held_tension(self) -> Float[np.ndarray, "T tendons"]:

@@ -1,7 +1,7 @@
-"""Conversion of ROS messages to numbers: the types for poses, tensions and commands, and their fields.
+"""Messages of ROS 1 and 2, decoded to numbers and made from numbers: poses, tensions and commands.
 
-Messages are decoded with the definitions of rosbags. Definitions in a bag are not used, because rosbags
-turns definitions into Python code.
+Messages are decoded and encoded by rosbags with its own definitions. Definitions in a bag are not used,
+because rosbags turns definitions into Python code.
 
 A topic may name a part of its messages: `/poses[2]` is the third pose of a PoseArray, `/tf[tip]` the frame
 `tip` of transforms. In a topic of tensions, `{}` stands for the tendons' names or numbers, of which each has
@@ -18,34 +18,82 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
-from jaxtyping import Float, Int
 
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat.recordings.config_values import PLACE
-from knode_cosserat.recordings.container import Container, Topic
+from knode_cosserat.recordings.config import PLACE, MotorSource, TensionSource
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.sources import MotorSource, TensionSource
+from knode_cosserat.recordings.streams import OutgoingStream, Stream
 
 Role = Literal["pose", "tension", "command"]
 #: stamp and recording time (ns), and the numbers
 _Row = tuple[int, int, Any]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Stream:
-    """Numbers of one topic, in the units and the order of its messages."""
+@dataclasses.dataclass
+class Topic:
+    """Raw messages of one topic.
 
-    topic: str
-    #: measurement times from the headers (ns); -1 without a stamp
-    stamped: Int[np.ndarray, " n"]
-    #: recording times (ns)
-    received: Int[np.ndarray, " n"]
-    #: poses (position and, if known, quaternion, scalar first) or tensions
-    values: Float[np.ndarray, "n size"]
-    #: number of messages that could not be decoded
-    broken: int = 0
-    #: findings on the order of its numbers
-    remarks: tuple[Finding, ...] = ()
+    Attributes:
+        name: name of the topic.
+        type: message type as ROS 2 writes it: geometry_msgs/msg/PoseStamped.
+        ros: ROS version of the serialisation: 1 or 2.
+        digest: hash of the type's definition (ROS 1); empty if unknown.
+        received: recording time of each message (ns).
+        raw: encoded messages.
+    """
+
+    name: str
+    type: str
+    ros: int
+    digest: str = ""
+    received: list[int] = dataclasses.field(default_factory=list)
+    raw: list[bytes] = dataclasses.field(default_factory=list)
+    _decoded: list[Any] | None = None
+
+    def messages(self) -> Iterator[tuple[int, Any]]:
+        """Yield the recording time (ns) and the message, None for bytes that cannot be decoded."""
+        # messages about several bodies are decoded once and read for each of them
+        if self.type == POSE_ARRAY or self.type in TRANSFORMS:
+            if self._decoded is None:
+                self._decoded = list(self._decode())
+            return iter(zip(self.received, self._decoded, strict=True))
+        return zip(self.received, self._decode(), strict=True)
+
+    def _decode(self) -> Iterator[Any]:
+        store = typestore(self.ros)
+        deserialize = store.deserialize_ros1 if self.ros == 1 else store.deserialize_cdr
+        for raw in self.raw:
+            # rosbags raises various errors on damaged bytes
+            try:
+                message = deserialize(raw, self.type)
+            except Exception:
+                message = None
+            yield message
+
+
+@dataclasses.dataclass
+class Bag:
+    """Raw messages of a bag by topic.
+
+    Attributes:
+        ros: ROS version of the serialisation: 1 or 2.
+        topics: topics by name.
+        lost: number of bytes that could not be read.
+        damage: description of the damage to the file; empty: none.
+        is_limited: true if its chunks expand beyond a limit, so that a part was not read.
+    """
+
+    ros: int
+    topics: dict[str, Topic] = dataclasses.field(default_factory=dict)
+    lost: int = 0
+    damage: str = ""
+    is_limited: bool = False
+
+    def topic(self, name: str, kind: str, digest: str = "") -> Topic | None:
+        """Return the topic of that name, created if new; None if it exists with another type."""
+        kind = kind if kind.count("/") != 1 else kind.replace("/", "/msg/")
+        topic = self.topics.setdefault(name, Topic(name, kind, self.ros, digest))
+        return topic if topic.type == kind else None
 
 
 def _xyz(v: Any) -> tuple[float, ...]:
@@ -127,11 +175,11 @@ def topics_of(source: Any) -> list[str]:
     return [topic_and_part(source.topic)[0]]
 
 
-def decoded(container: Container, source: Any, role: Role, path: str) -> Stream:
+def decoded(bag: Bag, source: Any, role: Role, path: str) -> Stream:
     """Return the numbers of a source of a configuration; messages that cannot be decoded are counted.
 
     Args:
-        container: the messages of all topics.
+        bag: the messages of all topics.
         source: the topic's entry in the configuration.
         role: role of its numbers.
         path: the file's name in error messages.
@@ -140,54 +188,31 @@ def decoded(container: Container, source: Any, role: Role, path: str) -> Stream:
         RecordingError: a topic's message type is not allowed for this role, or has no such part.
     """
     names = topics_of(source)
-    if len(names) > 1 or PLACE in source.topic:
-        each = [_simple(container.topics[name], container.ros, NUMBERS, role, path) for name in names]
-        return _merged(source.topic, each, is_held=role == "command" or bool(getattr(source, "held", None)))
-    topic, part = container.topics[names[0]], topic_and_part(source.topic)[1]
+    if PLACE in source.topic:
+        parts = [_simple(bag.topics[name], NUMBERS, role, path) for name in names]
+        return _merged(source.topic, parts, is_held=role == "command" or bool(getattr(source, "held", None)))
+    topic, part = bag.topics[names[0]], topic_and_part(source.topic)[1]
     if role == "pose":
-        stream = _poses(container, topic, part, path)
+        stream = _poses(bag, topic, part, path)
     elif role == "command" and source.text is not None:
         kinds = {kind: functools.partial(_spoken, read, source.text) for kind, read in TEXTS.items()}
-        stream = _simple(topic, container.ros, kinds, "command in text", path)
+        stream = _simple(topic, kinds, "command in text", path)
     elif topic.type == JOINTS:
-        stream = _joints(topic, container.ros, source, path)
+        stream = _joints(topic, source, path)
     else:
-        stream = _simple(topic, container.ros, NUMBERS, role, path)
+        stream = _simple(topic, NUMBERS, role, path)
     return dataclasses.replace(stream, topic=source.topic)
 
 
-def messages_of(topic: Topic, ros: int) -> Iterator[tuple[int, Any]]:
-    """Yield the recording time (ns) and the message, None for bytes that cannot be decoded."""
-    # messages about several bodies are read for each of them
-    if topic.type == POSE_ARRAY or topic.type in TRANSFORMS:
-        if topic.messages is None:
-            topic.messages = list(_messages(topic, ros))
-        return iter(zip(topic.received, topic.messages, strict=True))
-    return zip(topic.received, _messages(topic, ros), strict=True)
-
-
-def _messages(topic: Topic, ros: int) -> Iterator[Any]:
-    store = typestore(ros)
-    deserialize = store.deserialize_ros1 if ros == 1 else store.deserialize_cdr
-    for raw in topic.raw:
-        # rosbags raises various errors on damaged bytes
-        try:
-            message = deserialize(raw, topic.type)
-        except Exception:
-            message = None
-        yield message
-
-
-def _simple(topic: Topic, ros: int, readers: Mapping[str, Any], role: str, path: str) -> Stream:
+def _simple(topic: Topic, readers: Mapping[str, Any], role: str, path: str) -> Stream:
     """Return the numbers of a topic with one row a message."""
-    _require_type(topic, ros, readers, role, path)
-    read = readers[topic.type]
+    _require_type(topic, readers, role, path)
     rows: list[_Row] = []
     broken = 0
-    for received, message in messages_of(topic, ros):
+    for received, message in topic.messages():
         # text with other words than numbers, too
         try:
-            values = read(message)
+            values = readers[topic.type](message)
         except Exception:
             broken += 1
             continue
@@ -196,48 +221,42 @@ def _simple(topic: Topic, ros: int, readers: Mapping[str, Any], role: str, path:
     return _stream(topic.name, rows, broken)
 
 
-def _require_type(topic: Topic, ros: int, kinds: Collection[str], role: str, path: str) -> None:
-    where = f"{path}: topic {topic.name}"
+def _require_type(topic: Topic, kinds: Collection[str], role: str, path: str) -> None:
+    name = topic.type.replace("/msg/", "/")
     if topic.type not in kinds:
+        listed = ", ".join(kind.replace("/msg/", "/") for kind in kinds)
         raise RecordingError(
-            f"{where}: its messages are {_short(topic.type)}; allowed for a {role} is "
-            f"{', '.join(map(_short, kinds))}"
+            f"{path}: topic {topic.name}: its messages are {name}; allowed for a {role} is {listed}"
         )
-    if ros == 1 and topic.digest not in ("", "*", typestore(1).generate_msgdef(topic.type)[1]):
+    if topic.ros == 1 and topic.digest not in ("", "*", typestore(1).generate_msgdef(topic.type)[1]):
         raise RecordingError(
-            f"{where}: its {_short(topic.type)} is not the type that ROS defines by this name"
+            f"{path}: topic {topic.name}: its {name} is not the type that ROS defines by this name"
         )
 
 
 # poses
 
 
-def _poses(container: Container, topic: Topic, part: str, path: str) -> Stream:
-    kinds = (*POSES, POSE_ARRAY, *TRANSFORMS)
-    _require_type(topic, container.ros, kinds, "pose", path)
+def _poses(bag: Bag, topic: Topic, part: str, path: str) -> Stream:
+    _require_type(topic, (*POSES, POSE_ARRAY, *TRANSFORMS), "pose", path)
+    if topic.type in TRANSFORMS:
+        return _frame(bag, topic, part, path)
     if topic.type in POSES:
         if part:
             raise RecordingError(
-                f"{path}: topic {topic.name}: a {_short(topic.type)} has no part [{part}]; allowed is "
-                f"{topic.name}"
+                f"{path}: topic {topic.name}: a {topic.type.replace('/msg/', '/')} has no part [{part}]; "
+                f"allowed is {topic.name}"
             )
-        return _simple(topic, container.ros, POSES, "pose", path)
-    if topic.type == POSE_ARRAY:
-        return _element(topic, container.ros, part, path)
-    return _frame(container, topic, part, path)
-
-
-def _element(topic: Topic, ros: int, part: str, path: str) -> Stream:
-    """Return one pose of each PoseArray."""
-    messages = list(messages_of(topic, ros))
+        return _simple(topic, POSES, "pose", path)
+    messages = list(topic.messages())
     most = max((len(message.poses) for _, message in messages if message is not None), default=0)
-    parts = [str(k) for k in range(most)]
-    number = int(_required_part(part, parts, topic.name, path)) if most else 0
-    rows: list[_Row] = []
-    for received, message in messages:
-        # a source that leaves lost bodies out changes the numbers of the others: such a message is not used
-        if message is not None and len(message.poses) == most:
-            rows.append((_stamp(message), received, _pose(message.poses[number])))
+    number = int(_required_part(part, list(map(str, range(most))), topic.name, path)) if most else 0
+    # a source that leaves lost bodies out changes the numbers of the others: such a message is not used
+    rows = [
+        (_stamp(message), received, _pose(message.poses[number]))
+        for received, message in messages
+        if message is not None and len(message.poses) == most
+    ]
     return _stream(topic.name, rows, len(messages) - len(rows))
 
 
@@ -246,27 +265,24 @@ def _required_part(part: str, parts: Sequence[str], topic: str, path: str) -> st
     if not part and len(parts) == 1:
         return parts[0]
     if part not in parts:
-        words = ", ".join(f"{topic}[{each}]" for each in parts[:20])
+        words = ", ".join(f"{topic}[{name}]" for name in parts[:20])
         what = f"has no part [{part}]" if part else f"has {len(parts)} bodies"
         raise RecordingError(f"{path}: topic {topic} {what}; allowed is {words or 'no part'}")
     return part
 
 
-def _frame(container: Container, topic: Topic, part: str, path: str) -> Stream:
+def _frame(bag: Bag, topic: Topic, part: str, path: str) -> Stream:
     """Return the pose of a frame in the frame at the root of its tree."""
     edges: dict[str, tuple[str, list[_Row]]] = {}
     broken = 0
     # transforms that do not change come from a topic of their own
-    for source in {topic.name: topic, STATIC: container.topics.get(STATIC, topic)}.values():
-        for received, message in messages_of(source, container.ros):
-            if message is None:
-                broken += 1
-                continue
-            for each in message.transforms:
-                child, parent = each.child_frame_id.strip("/"), each.header.frame_id.strip("/")
-                pose = POSES["geometry_msgs/msg/TransformStamped"](each)
-                size = math.hypot(*pose[3:])
-                if not (math.isfinite(math.fsum(pose)) and 0.5 < size < 2.0):
+    for source in {topic.name: topic, STATIC: bag.topics.get(STATIC, topic)}.values():
+        for received, message in source.messages():
+            broken += message is None
+            for transform in () if message is None else message.transforms:
+                child, parent = transform.child_frame_id.strip("/"), transform.header.frame_id.strip("/")
+                pose = POSES["geometry_msgs/msg/TransformStamped"](transform)
+                if not (math.isfinite(math.fsum(pose)) and 0.5 < math.hypot(*pose[3:]) < 2.0):
                     broken += 1
                     continue
                 if edges.setdefault(child, (parent, []))[0] != parent:
@@ -274,7 +290,7 @@ def _frame(container: Container, topic: Topic, part: str, path: str) -> Stream:
                         f"{path}: topic {topic.name}: the frame {child} has two parents, "
                         f"{edges[child][0]} and {parent}; allowed is one"
                     )
-                edges[child][1].append((_stamp(each), received, pose))
+                edges[child][1].append((_stamp(transform), received, pose))
     name = _required_part(part.strip("/"), sorted(edges), topic.name, path)
     stream, parent = _stream(topic.name, edges[name][1], broken), edges[name][0]
     above = [name]
@@ -299,7 +315,7 @@ def _seen_from(parent: Stream, child: Stream) -> Stream:
         inside = np.clip(at, known[0], known[-1])
         # ns since 1970 have more digits than a float
         seconds, grid = (inside - known[0]) * 1e-9, (known - known[0]) * 1e-9
-        position = np.stack([np.interp(seconds, grid, each) for each in poses[:, :3].T], axis=1)
+        position = np.stack([np.interp(seconds, grid, axis) for axis in poses[:, :3].T], axis=1)
         rotation = Slerp(grid, turned)(seconds)
     else:
         position, rotation = poses[:1, :3], turned[0]
@@ -311,29 +327,27 @@ def _seen_from(parent: Stream, child: Stream) -> Stream:
 # numbers
 
 
-def _joints(topic: Topic, ros: int, source: TensionSource | MotorSource, path: str) -> Stream:
+def _joints(topic: Topic, source: TensionSource | MotorSource, path: str) -> Stream:
     """Return the efforts, or the angles of motors, of named joints, in the order of the source."""
-    _require_type(topic, ros, (JOINTS,), "tension", path)
+    _require_type(topic, (JOINTS,), "tension", path)
     rows: list[tuple[int, int, list[str], Any]] = []
     broken = 0
-    for received, message in messages_of(topic, ros):
-        values = (
-            () if message is None else message.position if isinstance(source, MotorSource) else message.effort
-        )
+    for received, message in topic.messages():
         names = [] if message is None else list(message.name)
+        values: Any = () if message is None else message.effort
+        if message is not None and isinstance(source, MotorSource):
+            values = message.position
         if message is None or (names and len(names) != len(values)):
             broken += 1
         else:
             rows.append((_stamp(message), received, names, values))
     reference, remark = joint_names(source, [names for _, _, names, _ in rows], f"{path}: topic {topic.name}")
-    if not reference:
-        return _stream(topic.name, [(stamp, received, values) for stamp, received, _, values in rows], broken)
     chosen: list[_Row] = []
     for stamp, received, names, values in rows:
-        by_name = dict(zip(names, values, strict=True))
+        by_name = dict(zip(names, values, strict=True)) if reference else {}
         # messages about other joints only are not about tendons
-        if any(name in by_name for name in reference):
-            chosen.append((stamp, received, [by_name.get(name, math.nan) for name in reference]))
+        if not reference or any(name in by_name for name in reference):
+            chosen.append((stamp, received, [by_name.get(name, math.nan) for name in reference] or values))
     stream = _stream(topic.name, chosen, broken)
     return dataclasses.replace(stream, remarks=(Finding("note", topic.name, remark),) if remark else ())
 
@@ -363,9 +377,9 @@ def joint_names(
             f"{where}: the joints {', '.join(first)} have the same names; allowed is each once"
         )
     listed = ", ".join(first)
-    found = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in first]
-    numbers = [int(match[2]) for match in found if match]
-    stems = {(match[1], match[3]) for match in found if match}
+    matches = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in first]
+    numbers = [int(match[2]) for match in matches if match]
+    stems = {(match[1], match[3]) for match in matches if match}
     lowest = min(numbers, default=0)
     if len(stems) != 1 or sorted(numbers) != list(range(lowest, lowest + len(first))) or lowest > 1:
         return first, f"its joints {listed} are taken in this order; `names` in the configuration states it"
@@ -453,5 +467,73 @@ def _stamp(message: Any) -> int:
     return int(stamp.sec) * 10**9 + int(stamp.nanosec)
 
 
-def _short(kind: str) -> str:
-    return kind.replace("/msg/", "/")
+# encoding
+
+#: line types of the log, and message types by count of numbers; other counts are sent as arrays
+LOGS = {1: "rosgraph_msgs/msg/Log", 2: "rcl_interfaces/msg/Log"}
+_SENT = {3: "geometry_msgs/msg/Vector3Stamped", 4: "geometry_msgs/msg/QuaternionStamped"}
+_ARRAY = "std_msgs/msg/Float64MultiArray"
+
+
+def message_type(stream: OutgoingStream, ros: int) -> str:
+    """Return the message type of a stream, as ROS 2 writes it, for a ROS version.
+
+    Raises:
+        RecordingError: the topic is a part of messages, or stands for several topics.
+    """
+    if topic_and_part(stream.topic)[1] or PLACE in stream.topic:
+        raise RecordingError(
+            f"topic {stream.topic} cannot be written; allowed is one topic for each body, and one for all "
+            "tensions"
+        )
+    size = np.shape(stream.values)[1]
+    if stream.role == "pose":
+        return "geometry_msgs/msg/PoseStamped" if size == 7 else "geometry_msgs/msg/PointStamped"
+    return LOGS[ros] if _is_text(stream) else _SENT.get(size, _ARRAY)
+
+
+def _is_text(stream: OutgoingStream) -> bool:
+    return stream.role == "command" and stream.source.text is not None
+
+
+def encoder_of(stream: OutgoingStream, ros: int) -> Callable[[int, int, Any], bytes]:
+    """Return a function that encodes a message from a stamp (ns), a row's index and its values.
+
+    A row of NaN of text commands stands for the line that states a simulation.
+    """
+    store, kind = typestore(ros), message_type(stream, ros)
+    types = store.types
+    serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
+
+    def part(name: str, **fields: Any) -> Any:
+        return types[name](**fields)
+
+    def content(values: list[float], header: Any) -> dict[str, Any]:
+        if _is_text(stream):
+            numbers = " ".join(f"{value:.10g}" for value in values if math.isfinite(value))
+            said = stream.source.text.replace(PLACE, numbers) if numbers else SIMULATED
+            head = {"header": header, "topics": []} if ros == 1 else {"stamp": header.stamp}
+            return head | {"level": 2, "name": "/motors", "msg": said, "file": "", "function": "", "line": 0}
+        if kind == _ARRAY:
+            layout = part("std_msgs/msg/MultiArrayLayout", dim=[], data_offset=0)
+            return {"layout": layout, "data": np.array(values)}
+        xyz = dict(zip("xyz", values, strict=False))
+        if stream.role != "pose":
+            if len(values) == 3:
+                return {"header": header, "vector": part("geometry_msgs/msg/Vector3", **xyz)}
+            return {"header": header, "quaternion": part("geometry_msgs/msg/Quaternion", **xyz, w=values[3])}
+        point = part("geometry_msgs/msg/Point", **xyz)
+        if len(values) == 3:
+            return {"header": header, "point": point}
+        orientation = part("geometry_msgs/msg/Quaternion", **dict(zip("wxyz", values[3:], strict=True)))
+        pose = part("geometry_msgs/msg/Pose", position=point, orientation=orientation)
+        return {"header": header, "pose": pose}
+
+    def encode(stamp: int, row: int, values: Any) -> bytes:
+        time = part("builtin_interfaces/msg/Time", sec=stamp // 10**9, nanosec=stamp % 10**9)
+        number = {"seq": row} if ros == 1 else {}
+        frame = "world" if stream.role == "pose" else ""
+        header = part("std_msgs/msg/Header", stamp=time, frame_id=frame, **number)
+        return bytes(serialize(types[kind](**content([float(value) for value in values], header)), kind))
+
+    return encode

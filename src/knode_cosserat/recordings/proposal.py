@@ -4,15 +4,27 @@ from __future__ import annotations
 
 import itertools
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.config import UP, RecordingConfig
-from knode_cosserat.recordings.container import Container
+from knode_cosserat.recordings.config import (
+    MAPPED,
+    PLACE,
+    POSITION_UNITS,
+    UP,
+    BaseSource,
+    ColumnMap,
+    CommandSource,
+    MarkerSource,
+    MotorSource,
+    RecordingConfig,
+    TableSource,
+    TensionSource,
+)
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import (
     NUMBERS,
@@ -20,19 +32,9 @@ from knode_cosserat.recordings.messages import (
     POSES,
     STATIC,
     TRANSFORMS,
+    Bag,
     decoded,
     joint_names,
-    messages_of,
-)
-from knode_cosserat.recordings.sources import (
-    MAPPED,
-    BaseSource,
-    ColumnMap,
-    CommandSource,
-    MarkerSource,
-    MotorSource,
-    TableSource,
-    TensionSource,
 )
 from knode_cosserat.recordings.table import TIME, Table, columns_of, position_titles, stated_time_unit
 
@@ -63,9 +65,6 @@ _QUATERNIONS = (
 _ROWS = 20
 
 
-_Sources = tuple[TensionSource | None, CommandSource | None, MotorSource | None]
-
-
 class _Body(NamedTuple):
     name: str
     topic: str
@@ -77,83 +76,64 @@ class _Body(NamedTuple):
 # bags
 
 
-def useful_topics(container: Container) -> set[str]:
+def useful_topics(bag: Bag) -> set[str]:
     """Return the topics whose messages are poses or numbers."""
     kinds = {*POSES, *NUMBERS, POSE_ARRAY, *TRANSFORMS}
-    return {name for name, topic in container.topics.items() if topic.type in kinds}
+    return {name for name, topic in bag.topics.items() if topic.type in kinds}
 
 
-def config_of_bag(container: Container, path: str) -> tuple[RecordingConfig, tuple[str, ...]]:
+def config_of_bag(bag: Bag, path: str) -> tuple[RecordingConfig, tuple[str, ...]]:
     """Return a configuration of a bag's topics, and remarks. Raises `RecordingError` without poses."""
     names: dict[str, str] = {}
-    for topic in container.topics.values():
+    for topic in bag.topics.values():
+        messages = (message for _, message in topic.messages() if message is not None)
         if topic.type in POSES:
-            words = [
-                word for word in topic.name.split("/") if word and not re.fullmatch(r"pose|odom|tf", word)
-            ]
+            words = [part for part in topic.name.split("/") if part not in ("", "pose", "odom", "tf")]
             names[topic.name] = words[-1] if words else topic.name
-        elif topic.type == POSE_ARRAY or (topic.type in TRANSFORMS and topic.name != STATIC):
-            for part in _parts(container, topic.name):
-                names[f"{topic.name}[{part}]"] = part if topic.type in TRANSFORMS else f"body {part}"
+        elif topic.type == POSE_ARRAY:
+            most = max((len(message.poses) for message in messages), default=0)
+            names |= {f"{topic.name}[{k}]": f"body {k}" for k in range(most)}
+        elif topic.type in TRANSFORMS and topic.name != STATIC:
+            frames = [part.child_frame_id.strip("/") for message in messages for part in message.transforms]
+            names |= {f"{topic.name}[{frame}]": frame for frame in frames}
     bodies: list[_Body] = []
     for name, word in names.items():
-        stream = decoded(container, MarkerSource(word, name, 1.0), "pose", path)
+        stream = decoded(bag, MarkerSource(word, name, 1.0), "pose", path)
         if len(stream.values):
             is_new = word not in [body.name for body in bodies]
             bodies.append(_Body(word if is_new else name, name, stream.values[:, :3]))
     if not bodies:
-        listed = ", ".join(
-            f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in container.topics.values()
-        )
-        raise RecordingError(f"{path}: no topic has poses; the bag has {listed or 'no topics'}")
-    found: dict[str, tuple[str, tuple[str, ...]]] = {}
+        topics = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in bag.topics.values()]
+        raise RecordingError(f"{path}: no topic has poses; the bag has {', '.join(topics) or 'no topics'}")
     remarks: list[str] = []
+    sources: dict[str, Any] = {}
     singles: dict[tuple[str, str], list[str]] = {}
-    for topic in container.topics.values():
-        if topic.type not in NUMBERS or not topic.raw:
+    for topic in bag.topics.values():
+        if topic.type not in NUMBERS:
             continue
-        messages = (message for _, message in messages_of(topic, container.ros) if message is not None)
-        first = next(messages, None)
+        first = next((message for _, message in topic.messages() if message is not None), None)
         count = 0 if first is None else len(NUMBERS[topic.type](first))
-        if count == 1 and (numbered := re.fullmatch(r"(.*?)(\d+)(\D*)", topic.name)):
-            singles.setdefault((numbered[1], numbered[3]), []).append(numbered[2])
+        if count == 1 and (match := re.fullmatch(r"(.*?)(\d+)(\D*)", topic.name)):
+            singles.setdefault((match[1], match[3]), []).append(match[2])
         elif count:
             order = tuple(range(1, count + 1))
-            named = [list(getattr(first, "name", ()))]
-            joints = joint_names(TensionSource(topic.name, order), named, path)[0]
-            found.setdefault(_role(topic.name), (topic.name, tuple(joints) or ("",) * count))
+            joints = joint_names(TensionSource(topic.name, order), [list(getattr(first, "name", ()))], path)[
+                0
+            ]
+            _add_topic(sources, topic.name, order, tuple(joints) or None)
             if joints:
                 remarks.append(f"tendons 1 to {count} are taken to be the joints {', '.join(joints)}")
     for (before, after), numbers in singles.items():
-        found.setdefault(_role(before + after), (f"{before}{{}}{after}", tuple(sorted(numbers, key=int))))
-    sources: dict[str, dict[str, Any]] = {
-        role: {
-            "topic": name,
-            "order": tuple(range(1, len(names) + 1)),
-            "names": names if any(names) else None,
-        }
-        for role, (name, names) in found.items()
-    }
-    tension = TensionSource(**sources["tension"]) if "tension" in sources else None
-    command = CommandSource(**sources["command"]) if "command" in sources else None
-    return _config(bodies, (tension, command, None), None, None, remarks)
+        _add_topic(sources, f"{before}{PLACE}{after}", (), tuple(sorted(numbers, key=int)))
+    return _config(bodies, sources, remarks)
 
 
-def _role(topic: str) -> str:
-    return "command" if _COMMAND.search(topic) else "tension"
-
-
-def _parts(container: Container, name: str) -> list[str]:
-    """Return the parts of a topic's messages: numbers of poses, or frames."""
-    topic, parts = container.topics[name], dict[str, None]()
-    for _, message in messages_of(topic, container.ros):
-        if message is None:
-            continue
-        if topic.type == POSE_ARRAY:
-            parts |= dict.fromkeys(map(str, range(len(message.poses))))
-        else:
-            parts |= dict.fromkeys(each.child_frame_id.strip("/") for each in message.transforms)
-    return list(parts)
+def _add_topic(
+    sources: dict[str, Any], topic: str, order: tuple[int, ...], names: tuple[str, ...] | None
+) -> None:
+    """Add the first topic of commands, and the first of tensions."""
+    kind, role = (CommandSource, "command") if _COMMAND.search(topic) else (TensionSource, "tension")
+    sources.setdefault(role, kind(topic, order, names=names))
 
 
 # tables
@@ -167,59 +147,52 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
         for name in table.bodies:
             places = [titles.index(title) for title in position_titles(name, "m")]
             bodies.append(_Body(name, name, columns_of(table.numbers, places, path)))
-        taken = {title for title in titles if re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)}
-        sources = _number_columns(
-            [title for title in titles if title not in taken and title != TIME], remarks
-        )
-        mapped = ColumnMap.from_dict(sources) if sources else None
-        return _config(bodies, _sources(sources), mapped, table.up, remarks)
+        others = [title for title in titles if not re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)]
+        mapped, sources = _number_columns([title for title in others if title != TIME], remarks)
+        columns = ColumnMap.from_dict(mapped) if mapped else None
+        return _config(bodies, sources, remarks, columns=columns, up=table.up)
     time = next((title for title in titles if _TIME.match(title)), None)
-    rest = [title for title in titles if title != time]
-    bodies = _bodies(table, rest, path)
+    others = [title for title in titles if title != time]
+    bodies = _bodies(table, others, path)
     used = {title for body in bodies for title in body.titles}
-    sources = _number_columns([title for title in rest if title not in used], remarks)
-    rate = None
+    mapped, sources = _number_columns([title for title in others if title not in used], remarks)
     if time is None:
-        rate = TableSource(rate=100.0)
+        sources["table"] = TableSource(rate=100.0)
         remarks.append("no column looks like times: the rate of 100 Hz is a guess")
     elif stated_time_unit(time):
         remarks.append(f"times are in {stated_time_unit(time)} by their title")
-    places_of = {body.topic: body.titles for body in bodies}
-    mapped = ColumnMap.from_dict({"time": time, **sources, **places_of})
+    columns = ColumnMap.from_dict({"time": time, **mapped, **{body.topic: body.titles for body in bodies}})
     is_mm = any("mm" in re.findall(r"[a-z]+", title.lower()) for title in used)
-    return _config(bodies, _sources(sources), mapped, None, remarks, table=rate, is_mm=is_mm)
+    return _config(bodies, sources, remarks, columns=columns, unit="mm" if is_mm else "m")
 
 
 def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
     """Return the bodies whose coordinates have titles that differ in x, y and z only."""
     columns = list(map(str, table.numbers.columns))
-    found: dict[str, _Body] = {}
+    spelling = {title.lower(): title for title in reversed(titles)}
+    bodies: dict[str, _Body] = {}
     for title in titles:
         for match in re.finditer("x", title.lower()):
-            variants = [title[: match.start()] + axis + title[match.end() :] for axis in "xyz"]
-            variants = [next((each for each in titles if each.lower() == it.lower()), it) for it in variants]
-            before = title[: match.start()]
+            before, after = title[: match.start()], title[match.end() :]
+            axes = [before + axis + after for axis in "xyz"]
+            axes = [spelling.get(axis.lower(), axis) for axis in axes]
             # the x of a quaternion, or of a speed, is not that of a position
-            if not set(variants) <= set(titles) or _NO_PLACE.search(before):
+            if not set(axes) <= set(titles) or _NO_PLACE.search(before):
                 continue
-            name = re.sub(r"\[.*?\]|\(.*?\)", "", title[: match.start()] + title[match.end() :])
-            name = (
-                re.sub(r"(^|[_ .-])(pos(ition)?|p|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE).strip(
-                    "_ .-"
-                )
-                or "tip"
-            )
-            if name in found:
-                continue
-            position = columns_of(table.numbers, [columns.index(each) for each in variants], path)
-            found[name] = _Body(name, name, position, (*variants, *_quaternion(before, titles, len(found))))
-            break
-    if not found:
+            name = re.sub(r"\[.*?\]|\(.*?\)", "", before + after)
+            name = re.sub(r"(^|[_ .-])(pos(ition)?|p|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE)
+            name = name.strip("_ .-") or "tip"
+            if name not in bodies:
+                position = columns_of(table.numbers, [columns.index(axis) for axis in axes], path)
+                turned = _quaternion(before, titles, len(bodies))
+                bodies[name] = _Body(name, name, position, (*axes, *turned))
+                break
+    if not bodies:
         raise RecordingError(
             f"{path}: the columns are {', '.join(columns)}; none look like a body's position x, y, z; "
             "no map can be proposed. Write `columns: {time: …, tensions: […], tip: [x, y, z]}` in a YAML file"
         )
-    return list(found.values())
+    return list(bodies.values())
 
 
 def _quaternion(before: str, titles: Sequence[str], number: int) -> tuple[str, ...]:
@@ -233,41 +206,32 @@ def _quaternion(before: str, titles: Sequence[str], number: int) -> tuple[str, .
     return ()
 
 
-def _number_columns(titles: Sequence[str], remarks: list[str]) -> dict[str, list[str]]:
-    """Return the columns of tensions, commands and motors: those with names that differ in a number."""
+def _number_columns(titles: Sequence[str], remarks: list[str]) -> tuple[dict[str, list[str]], dict[str, Any]]:
+    """Return columns whose names differ in a number, of tensions, commands and motors, and their sources."""
     families: dict[str, list[tuple[int, str]]] = {}
     for title in titles:
-        match = re.fullmatch(r"(\D*?)[_ .-]?(\d+)(\D.*)?", title)
-        if match:
+        if match := re.fullmatch(r"(\D*?)[_ .-]?(\d+)(\D.*)?", title):
             families.setdefault(match[1], []).append((int(match[2]), title))
-    found: dict[str, list[str]] = {}
+    kinds = {"commands": _COMMAND, "tensions": _TENSION, "motors": _MOTOR}
+    mapped: dict[str, list[str]] = {}
     for stem, numbered in families.items():
-        columns = [title for _, title in sorted(numbered)]
-        if _COMMAND.search(stem):
-            found.setdefault("commands", columns)
-        elif _TENSION.search(stem):
-            found.setdefault("tensions", columns)
-        elif _MOTOR.search(stem) and "tensions" not in found:
-            found.setdefault("motors", columns)
-    if "motors" in found and ("tensions" in found or "commands" in found):
-        del found["motors"]
-    for name, columns in found.items():
-        remarks.append(f"{name} are taken to be the columns {', '.join(columns)}, in this order")
-    return found
-
-
-def _sources(
-    found: Mapping[str, Sequence[str]],
-) -> _Sources:
-    order = {name: tuple(range(1, len(columns) + 1)) for name, columns in found.items()}
-    gram = any(re.search(r"\[(gf|g)\]|\((gf|g)\)|_gf?$", title) for title in found.get("tensions", ()))
-    return (
-        TensionSource(MAPPED["tensions"], order["tensions"], "gf" if gram else "N")
-        if "tensions" in order
-        else None,
-        CommandSource(MAPPED["commands"], order["commands"]) if "commands" in order else None,
-        MotorSource(MAPPED["motors"], order["motors"], "deg") if "motors" in order else None,
-    )
+        kind = next((kind for kind, pattern in kinds.items() if pattern.search(stem)), None)
+        if kind:
+            mapped.setdefault(kind, [title for _, title in sorted(numbered)])
+    if len(mapped) > 1:
+        mapped.pop("motors", None)
+    sources: dict[str, Any] = {}
+    for kind, columns in mapped.items():
+        remarks.append(f"{kind} are taken to be the columns {', '.join(columns)}, in this order")
+        order = tuple(range(1, len(columns) + 1))
+        if kind == "tensions":
+            gram = any(re.search(r"\[(gf|g)\]|\((gf|g)\)|_gf?$", title) for title in columns)
+            sources["tension"] = TensionSource(MAPPED[kind], order, "gf" if gram else "N")
+        elif kind == "commands":
+            sources["command"] = CommandSource(MAPPED[kind], order)
+        else:
+            sources["motors"] = MotorSource(MAPPED[kind], order, "deg")
+    return mapped, sources
 
 
 # places on the rod
@@ -275,20 +239,19 @@ def _sources(
 
 def _config(
     bodies: Sequence[_Body],
-    sources: _Sources,
-    columns: ColumnMap | None,
-    up: str | None,
+    sources: dict[str, Any],
     remarks: list[str],
     *,
-    table: TableSource | None = None,
-    is_mm: bool = False,
+    columns: ColumnMap | None = None,
+    up: str | None = None,
+    unit: str = "m",
 ) -> tuple[RecordingConfig, tuple[str, ...]]:
     """Return the configuration of bodies whose places are guessed from distances at the start."""
     where = {}
     for body in bodies:
         seen = body.position[np.isfinite(body.position).all(axis=1)][:_ROWS]
         if len(seen):
-            where[body.topic] = np.median(seen, axis=0) * (1e-3 if is_mm else 1.0)
+            where[body.topic] = np.median(seen, axis=0) * POSITION_UNITS[unit]
     bodies = [body for body in bodies if body.topic in where]
     if not bodies:
         raise RecordingError("no body is ever seen")
@@ -313,8 +276,9 @@ def _config(
         remarks.append(
             "the rod is taken to point from the base to the last body: `rotation` turns this axis to z"
         )
-    tension, command, motors = sources
-    kinds = "measured" if tension or motors else "commanded" if command else "none"
+    kinds = "commanded" if "command" in sources else "none"
+    if "tension" in sources or "motors" in sources:
+        kinds = "measured"
     if kinds == "none":
         remarks.append("no tensions were found: `tensions: none` makes a recording of poses only")
     config = RecordingConfig(
@@ -322,14 +286,11 @@ def _config(
             MarkerSource(body.name, body.topic, fraction)
             for body, fraction in zip(others, fractions, strict=True)
         ),
-        tension=tension,
-        motors=motors,
-        command=command,
+        **sources,
         base=BaseSource(base.topic) if base else None,
-        table=table,
         columns=columns,
         tensions=kinds,  # type: ignore[arg-type]
-        position_unit="mm" if is_mm else "m",
+        position_unit=unit,  # type: ignore[arg-type]
         up=up,
         rotation=(1.0, 0.0, 0.0, 0.0) if rotation is None else rotation,
     )

@@ -6,17 +6,22 @@ import dataclasses
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy.interpolate import CubicSpline, PPoly
+from scipy.spatial.transform import Rotation, Slerp
 
 from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.quality import Health, period
+from knode_cosserat.recordings.streams import period
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.health import Health
 
 #: largest number of rows of a grid: more rows are a mistake
 MOST_ROWS = 10_000_000
@@ -261,26 +266,18 @@ def _averaged(
 ) -> Float[np.ndarray, "T tendons"]:
     """Return means from each time to `dt` later.
 
-    Tensions are interpolated linearly between messages up to `straight` (s) apart, otherwise held.
+    Tensions are interpolated linearly between messages up to `straight` (s) apart, otherwise held. They are
+    constant before the first and after the last message.
     """
     known, values = driver.time, driver.tension
     steps = np.diff(known)[:, None]
     rises = np.where(steps <= straight, np.diff(values, axis=0) / np.maximum(steps, _SAME), 0.0)
-    each = values[:-1] + 0.5 * steps * rises
-    integral = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(steps * each, axis=0)])
-
-    def until(at: np.ndarray) -> np.ndarray:
-        inside = np.clip(at, known[0], known[-1])
-        last = np.clip(np.searchsorted(known, inside, side="right") - 1, 0, max(len(known) - 2, 0))
-        since = (inside - known[last])[:, None]
-        rise = rises[last] if len(known) > 1 else 0.0
-        whole = integral[last] + since * (values[last] + 0.5 * since * rise)
-        # constant before the first and after the last message
-        return np.asarray(
-            whole + (at - inside)[:, None] * np.where(at[:, None] < known[0], values[0], values[-1])
-        )
-
-    return np.asarray((until(time + dt) - until(time)) / dt)
+    # a piece of constant tension before the first and after the last message
+    rises, starts = np.pad(rises, ((1, 1), (0, 0))), np.concatenate([values[:1], values])
+    far = dt + float(np.ptp(known)) + float(np.max(np.abs(time - known[0]), initial=0.0))
+    ends = np.concatenate([[known[0] - far], known, [known[-1] + far]])
+    integral = PPoly(np.stack([rises, starts]), ends).antiderivative()
+    return np.asarray((integral(time + dt) - integral(time)) / dt)
 
 
 def _interpolated(
@@ -290,14 +287,20 @@ def _interpolated(
     seen = body.time
     position, quaternion = np.full((len(time), 3), np.nan), np.full((len(time), 4), np.nan)
     limit = bridge(seen, longest)
-    for first, last in _runs(seen, limit):
-        reach = limit if first == 0 else _SAME
+    ends = [0, *(np.flatnonzero(np.diff(seen) > limit) + 1).tolist(), len(seen)]
+    for first, last in itertools.pairwise(ends):
         # before the very first frame its pose is used
+        reach = limit if first == 0 else _SAME
         inside = (time >= seen[first] - reach) & (time <= seen[last - 1] + _SAME)
-        at = np.clip(time[inside], seen[first], seen[last - 1])
-        position[inside] = _curve(seen[first:last], body.position[first:last], at)
-        if body.quaternion is not None:
-            quaternion[inside] = _turned(seen[first:last], body.quaternion[first:last], at)
+        at, piece = np.clip(time[inside], seen[first], seen[last - 1]), slice(first, last)
+        if last - first == 1:
+            position[inside] = body.position[first]
+            quaternion[inside] = np.nan if body.quaternion is None else body.quaternion[first]
+            continue
+        position[inside] = CubicSpline(seen[piece], body.position[piece], bc_type="natural")(at)
+        if body.quaternion is not None and len(at):
+            turns = Slerp(seen[piece], Rotation.from_quat(body.quaternion[piece], scalar_first=True))
+            quaternion[inside] = _continuous(turns(at).as_quat(scalar_first=True))
     following = np.clip(np.searchsorted(seen, time - _SAME), 0, len(seen) - 1)
     exact = np.abs(seen[following] - time) <= _SAME
     near = seen[following] - seen[np.maximum(following - 1, 0)] <= 1.5 * period(seen) + _SAME
@@ -305,32 +308,8 @@ def _interpolated(
     return position, quaternion, measured & np.isfinite(position).all(axis=1)
 
 
-def _runs(time: Float[np.ndarray, " n"], limit: float) -> list[tuple[int, int]]:
-    """Return the first and last (exclusive) rows of the pieces without a gap longer than `limit`."""
-    breaks = np.flatnonzero(np.diff(time) > limit) + 1
-    ends = [0, *breaks.tolist(), len(time)]
-    return [(first, last) for first, last in itertools.pairwise(ends) if last > first]
-
-
-def _curve(
-    time: Float[np.ndarray, " n"], position: Float[np.ndarray, "n 3"], at: Float[np.ndarray, " T"]
-) -> Float[np.ndarray, "T 3"]:
-    from scipy.interpolate import CubicSpline
-
-    if len(time) == 1:
-        return np.broadcast_to(position[0], (len(at), 3))
-    return np.asarray(CubicSpline(time, position, bc_type="natural")(at))
-
-
-def _turned(
-    time: Float[np.ndarray, " n"], quaternion: Float[np.ndarray, "n 4"], at: Float[np.ndarray, " T"]
-) -> Float[np.ndarray, "T 4"]:
-    from scipy.spatial.transform import Rotation, Slerp
-
-    if len(time) == 1 or len(at) == 0:
-        return np.broadcast_to(quaternion[0], (len(at), 4))
-    turned = Slerp(time, Rotation.from_quat(quaternion, scalar_first=True))(at).as_quat(scalar_first=True)
-    # q and -q are the same rotation: choose the sign that is continuous from row to row
-    flips = np.cumprod(np.where(np.sum(turned[1:] * turned[:-1], axis=1) < 0.0, -1.0, 1.0))
-    sign = 1.0 if turned[0, 0] >= 0.0 else -1.0
-    return np.asarray(turned * sign * np.concatenate([[1.0], flips])[:, None])
+def _continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
+    """Return the same rotations with the signs that are continuous from row to row."""
+    flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
+    sign = 1.0 if quaternion[0, 0] >= 0.0 else -1.0
+    return np.asarray(quaternion * sign * np.concatenate([[1.0], flips])[:, None])

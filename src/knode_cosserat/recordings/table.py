@@ -21,32 +21,31 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean, shown
-from knode_cosserat.recordings.clocks import FAR
-from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.config_values import PLACE
-from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.messages import Stream
-from knode_cosserat.recordings.plausibility import SLOW
-from knode_cosserat.recordings.sources import (
-    COMMAND,
-    HELD,
-    TENSION,
+from knode_cosserat.recordings.config import (
+    PLACE,
     TIME_UNITS,
     ColumnMap,
     CommandSource,
     MarkerSource,
+    RecordingConfig,
     TableSource,
     TensionSource,
 )
+from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.streams import FAR, SLOW, Outgoing, Stream
+
+if TYPE_CHECKING:
+    import pandas as pd  # type: ignore[import-untyped]
 
 TIME = "time [s]"
+#: default prefixes of the columns of tensions
+TENSION, HELD, COMMAND = "tension", "held_tension", "command"
 #: metadata key of the tensions before the first row
 INITIAL = "initial tension"
 ALLOWED = (
@@ -54,7 +53,6 @@ ALLOWED = (
     "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …; tensions that are held "
     "from a row to the next are held_tension_1 [N], … instead"
 )
-_QUATERNION = ("qw", "qx", "qy", "qz")
 #: largest plausible time (s)
 _LATEST = 9e9
 
@@ -63,7 +61,7 @@ class Table(NamedTuple):
     """Content of a table.
 
     Attributes:
-        said: metadata.
+        metadata: texts by key, such as the source.
         numbers: columns by title. A column that is not of numbers is text.
         findings: findings from reading it.
         bodies: bodies of an export of motion capture, whose format states names, units and axes; its columns
@@ -71,7 +69,7 @@ class Table(NamedTuple):
         up: axis of the file that points up.
     """
 
-    said: dict[str, str]
+    metadata: dict[str, str]
     numbers: pd.DataFrame
     findings: tuple[Finding, ...] = ()
     bodies: tuple[str, ...] = ()
@@ -86,6 +84,8 @@ def numbered(numbers: Sequence[int], one: str, several: str) -> str:
 
 def numbers_of(table: pd.DataFrame) -> pd.DataFrame:
     """Return the columns as numbers, NaN where they are empty; a column with other text stays text."""
+    import pandas as pd
+
     numbers = table.apply(pd.to_numeric, errors="coerce")
     values = numbers.to_numpy(dtype=float, na_value=np.nan)
     is_text = (~table.isna().to_numpy() & ~np.isfinite(values)).any(axis=0)
@@ -104,11 +104,13 @@ def _is_missing(cells: pd.Series) -> pd.Series:
 
 def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[np.ndarray, "n places"]:
     """Return columns of numbers by their places. Raises `RecordingError` for one that has text."""
+    import pandas as pd
+
     for place in places:
         cells = table.iloc[:, place]
         if cells.dtype.kind not in "fiub":
-            given = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
-            row = int(np.argmax(~np.isfinite(given) & ~_is_missing(cells).to_numpy()))
+            numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+            row = int(np.argmax(~np.isfinite(numbers) & ~_is_missing(cells).to_numpy()))
             raise RecordingError(
                 f"{path}: row {row + 1}: {table.columns[place]} is {shown(str(cells.iloc[row]).strip())}; "
                 "allowed is a finite number"
@@ -119,11 +121,12 @@ def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[n
 # meaning of the columns
 
 
-def configured(said: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
+def configured(metadata: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
     """Return the configuration derived from a table's titles and metadata. Raises `RecordingError`."""
     others = [name for name in columns if name != TIME]
-    titles = (TENSION, HELD, COMMAND)
-    tendons = {name: sum(each.startswith(f"{name}_") for each in others) for name in titles}
+    tendons = {
+        prefix: sum(name.startswith(f"{prefix}_") for name in others) for prefix in (TENSION, HELD, COMMAND)
+    }
     if tendons[TENSION] and tendons[HELD]:
         raise RecordingError(
             f"{path}: there are {TENSION}_1 (at the row's time) and {HELD}_1 (from its row to the next); "
@@ -131,69 +134,60 @@ def configured(said: Mapping[str, str], columns: list[str], path: str) -> Record
         )
     measured = HELD if tendons[HELD] else TENSION
     bodies = [name.removesuffix("_x [m]") for name in others if name.endswith("_x [m]")]
-    known = [f"{name}_{k + 1} [N]" for name, count in tendons.items() for k in range(count)]
+    known = [title for prefix, count in tendons.items() for title in tension_titles(prefix, "N", count)]
     for body in bodies:
-        known += position_titles(body, "m")
         oriented = quaternion_titles(body)
-        known += oriented if oriented[0] in columns else []
+        known += position_titles(body, "m") + (oriented if oriented[0] in columns else [])
     wrong = TIME not in columns or not bodies or not any(tendons.values()) or len(set(columns)) < len(columns)
     if wrong or sorted(known) != sorted(others):
         raise RecordingError(f"{path}: the columns are {', '.join(columns)}; allowed is {ALLOWED}, once each")
-    markers = [
-        MarkerSource(body, body, _fraction(body, said, len(bodies), path), rotation=(1.0, 0.0, 0.0, 0.0))
-        for body in bodies
-    ]
-    order = {name: tuple(range(1, count + 1)) for name, count in tendons.items()}
-    latency, before = _said_number("latency", said, 0.0, path), _said_tensions(said, path)
+    markers = []
+    for body in bodies:
+        key = f"fraction {body}"
+        if key not in metadata and len(bodies) > 1:
+            raise RecordingError(
+                f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a "
+                "number from 0 to 1, or a configuration"
+            )
+        (fraction,) = _metadata_numbers(key, metadata, path) or (1.0,)
+        markers.append(MarkerSource(body, body, fraction, rotation=(1.0, 0.0, 0.0, 0.0)))
+    order = {prefix: tuple(range(1, count + 1)) for prefix, count in tendons.items()}
+    (latency,) = _metadata_numbers("latency", metadata, path) or (0.0,)
+    tension = command = None
     try:
+        if order[measured]:
+            tension = TensionSource(measured, order[measured], held=True if measured == HELD else None)
+        if order[COMMAND]:
+            command = CommandSource(COMMAND, order[COMMAND], latency=latency)
         return RecordingConfig(
             markers=tuple(sorted(markers, key=lambda marker: marker.fraction)),
-            tension=(
-                TensionSource(measured, order[measured], held=True if measured == HELD else None)
-                if order[measured]
-                else None
-            ),
-            command=(CommandSource(COMMAND, order[COMMAND], latency=latency) if order[COMMAND] else None),
-            tensions="measured" if order[measured] else "commanded",
-            initial_tension=before,
+            tension=tension,
+            command=command,
+            tensions="measured" if tension else "commanded",
+            initial_tension=_metadata_numbers(INITIAL, metadata, path),
         )
     except RecordingError as error:
         raise RecordingError(f"{path}: {error}") from None
 
 
-def _fraction(body: str, said: Mapping[str, str], bodies: int, path: str) -> float:
-    key = f"fraction {body}"
-    if key not in said and bodies > 1:
-        raise RecordingError(
-            f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a number "
-            "from 0 to 1, or a configuration"
-        )
-    return _said_number(key, said, 1.0, path)
-
-
-def _said_number(key: str, said: Mapping[str, str], otherwise: float, path: str) -> float:
-    try:
-        return float(said.get(key, otherwise))
-    except ValueError:
-        raise RecordingError(f"{path}: {key} is {shown(said[key])}; allowed is a number") from None
-
-
-def _said_tensions(said: Mapping[str, str], path: str) -> tuple[float, ...] | None:
-    """Return the tensions before the first row (N), or None if the table does not state them."""
-    if INITIAL not in said:
+def _metadata_numbers(key: str, metadata: Mapping[str, str], path: str) -> tuple[float, ...] | None:
+    """Return the numbers of the metadata under a key, one except of tensions; None without the key."""
+    if key not in metadata:
         return None
+    words = metadata[key].replace(",", " ").split() if key == INITIAL else [metadata[key]]
     try:
-        return tuple(float(word) for word in said[INITIAL].replace(",", " ").split())
+        return tuple(map(float, words))
     except ValueError:
-        raise RecordingError(f"{path}: {INITIAL} is {shown(said[INITIAL])}; allowed is numbers (N)") from None
+        kind = "numbers (N)" if key == INITIAL else "a number"
+        raise RecordingError(f"{path}: {key} is {shown(metadata[key])}; allowed is {kind}") from None
 
 
-def said_simulated(said: Mapping[str, str], path: str) -> bool | None:
+def is_simulated(metadata: Mapping[str, str], path: str) -> bool | None:
     """True if a table states that the robot was a simulation; None if not stated. Raises `RecordingError`."""
-    given = said.get("simulated")
-    if given not in (None, "true", "false"):
-        raise RecordingError(f"{path}: simulated is {shown(given)}; allowed is true or false")
-    return None if given is None else given == "true"
+    word = metadata.get("simulated")
+    if word not in (None, "true", "false"):
+        raise RecordingError(f"{path}: simulated is {shown(word)}; allowed is true or false")
+    return None if word is None else word == "true"
 
 
 def position_titles(body: str, unit: str) -> list[str]:
@@ -203,7 +197,7 @@ def position_titles(body: str, unit: str) -> list[str]:
 
 def quaternion_titles(body: str) -> list[str]:
     """Return the titles of a body's orientation."""
-    return [f"{body}_{part}" for part in _QUATERNION]
+    return [f"{body}_{part}" for part in ("qw", "qx", "qy", "qz")]
 
 
 def tension_titles(topic: str, unit: str, count: int) -> list[str]:
@@ -211,7 +205,7 @@ def tension_titles(topic: str, unit: str, count: int) -> list[str]:
     return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
 
 
-def streams(
+def streams_of(
     table: pd.DataFrame, config: RecordingConfig, path: str
 ) -> tuple[dict[str, Stream], list[Finding]]:
     """Return the measured rows of each topic, and findings on rows that have no time.
@@ -219,43 +213,56 @@ def streams(
     Raises:
         RecordingError: a column is missing, or the times are not plausible seconds.
     """
-    columns, called = list(table.columns), config.table or TableSource()
-    mapped = config.columns or ColumnMap()
-    time = _times(table, called, mapped, path)
-    check_seconds(time, path)
-    bodies = dict(mapped.bodies)
-    wanted: dict[str, list[str]] = {}
+    columns, titles = list(table.columns), _titles_by_topic(config, list(table.columns), path)
+    time = _times(table, config.table or TableSource(), config.columns or ColumnMap(), path)
+    unused = config.command if config.tensions == "measured" else config.measured
+    streams = {}
+    for topic, named in titles.items():
+        # tensions that do not drive the robot may be missing
+        if unused is not None and topic == unused.topic and not any(title in columns for title in named):
+            continue
+        values = columns_of(table, [_place(title, columns, path) for title in named], path)
+        there = np.isfinite(time) & np.isfinite(values).any(axis=1)
+        stamps = np.round(time[there] * 1e9).astype(np.int64)
+        # received times may be negative, because a table may begin before zero
+        streams[topic] = Stream(topic, stamps, stamps, values[there])
+    rows = (np.flatnonzero(~np.isfinite(time)) + 1).tolist()
+    what = f"{numbered(rows, 'row has no time', 'rows have no time')}; left out"
+    return streams, [Finding("warning", "", what)] if rows else []
+
+
+def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> dict[str, list[str]]:
+    """Return the titles of each topic: from the map of columns, from templates, or the usual ones."""
+    mapped, templates = config.columns or ColumnMap(), config.table or TableSource()
+    titles: dict[str, list[str]] = {}
     for source in (*config.markers, config.base):
         if source is not None:
-            titles = _called(called.position, source.topic) or position_titles(
-                source.topic, config.position_unit
+            topic = source.topic
+            position, quaternion = (
+                [title.replace(PLACE, topic) for title in named or ()]
+                for named in (templates.position, templates.quaternion)
             )
-            turned = _called(called.quaternion, source.topic) or quaternion_titles(source.topic)
-            usual = titles + (turned if turned[0] in columns else [])
-            wanted[source.topic] = list(bodies.get(source.topic, usual))
-    roles = (
-        (config.tension, mapped.tensions), (config.motors, mapped.motors), (config.command, mapped.commands)
-    )  # fmt: skip
-    for tendons, named in roles:
+            quaternion = quaternion or quaternion_titles(topic)
+            usual = position or position_titles(topic, config.position_unit)
+            usual = usual + (quaternion if quaternion[0] in columns else [])
+            titles[topic] = list(dict(mapped.bodies).get(topic, usual))
+    for tendons, named in zip(
+        (config.tension, config.motors, config.command),
+        (mapped.tensions, mapped.motors, mapped.commands),
+        strict=True,
+    ):
         if tendons is not None:
             count = len(tendons.order)
-            titles = tension_titles(tendons.topic, tendons.unit, count)
-            if called.motor is not None:
-                titles = [called.motor.replace(PLACE, str(k + 1)) for k in range(count)]
+            usual = tension_titles(tendons.topic, tendons.unit, count)
+            if templates.motor is not None:
+                usual = [templates.motor.replace(PLACE, str(k + 1)) for k in range(count)]
             if named is not None and len(named) != count:
                 raise RecordingError(
                     f"{path}: {len(named)} columns are mapped and order has {count} tendons; allowed is the "
                     "same number"
                 )
-            wanted[tendons.topic] = list(named or titles)
-    optional = _optional(config)
-    found = {}
-    for topic, titles in wanted.items():
-        if topic in optional and not any(title in columns for title in titles):
-            continue
-        places = [_place(title, columns, path) for title in titles]
-        found[topic] = _stream(topic, time, columns_of(table, places, path))
-    return found, _about_times(time)
+            titles[tendons.topic] = list(named or usual)
+    return titles
 
 
 def _place(title: str, columns: Sequence[str], path: str) -> int:
@@ -269,19 +276,34 @@ def _place(title: str, columns: Sequence[str], path: str) -> int:
     raise RecordingError(f"{path}: the column {title} is {wrong}; the columns are {', '.join(columns)}{hint}")
 
 
-def _times(table: pd.DataFrame, called: TableSource, mapped: ColumnMap, path: str) -> Float[np.ndarray, " n"]:
-    """Return the rows' times (s). Raises `RecordingError`."""
+def _times(
+    table: pd.DataFrame, templates: TableSource, mapped: ColumnMap, path: str
+) -> Float[np.ndarray, " n"]:
+    """Return the rows' times (s). Raises `RecordingError` if they are not plausible seconds."""
     columns, title = list(table.columns), mapped.time or TIME
-    if called.rate is not None and mapped.time is None:
-        return np.arange(len(table)) / called.rate
-    if mapped.time is None and columns.count(TIME) != 1:
+    if templates.rate is not None and mapped.time is None:
+        time = np.arange(len(table)) / templates.rate
+    elif mapped.time is None and columns.count(TIME) != 1:
         raise RecordingError(
             f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once (the configuration "
             "names another title by `columns: {time: …}`, and the rate of rows without times by "
             "`table: {rate: …}`)"
         )
-    time = columns_of(table, [_place(title, columns, path)], path)[:, 0]
-    return time * TIME_UNITS[mapped.time_unit or stated_time_unit(title) or "s"]
+    else:
+        time = columns_of(table, [_place(title, columns, path)], path)[:, 0]
+        time = time * TIME_UNITS[mapped.time_unit or stated_time_unit(title) or "s"]
+    late = np.abs(time) > _LATEST
+    known = np.sort(time[np.isfinite(time)])
+    step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
+    if late.any() or step > FAR:
+        row = int(np.argmax(late))
+        what, most = f"its rows are {step:g} s apart; allowed is up to {FAR:g} s", step / SLOW
+        if late.any():
+            what = f"row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}"
+            most = abs(time[row]) / _LATEST
+        unit = next((unit for unit, size in (("ms", 1e3), ("µs", 1e6)) if most <= size), "ns")
+        raise RecordingError(f"{path}: {what}. Are the times in {unit}?")
+    return time
 
 
 #: spellings of units of time in titles
@@ -298,61 +320,30 @@ def stated_time_unit(title: str) -> str:
     return next((unit for unit, spellings in _SPELLINGS.items() if words & set(spellings)), "")
 
 
-def check_seconds(time: Float[np.ndarray, " n"], path: str) -> None:
-    """Raise `RecordingError` for times that are too late, or too far apart, to be seconds."""
-    late = np.abs(time) > _LATEST
-    if late.any():
-        row = int(np.argmax(late))
-        hint = _likely_unit(abs(time[row]), _LATEST)
-        raise RecordingError(
-            f"{path}: row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}. {hint}"
-        )
-    known = np.sort(time[np.isfinite(time)])
-    step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
-    if step > FAR:
-        raise RecordingError(
-            f"{path}: its rows are {step:g} s apart; allowed is up to {FAR:g} s. {_likely_unit(step, SLOW)}"
-        )
+def columns_and_metadata(outgoing: Outgoing) -> tuple[pd.DataFrame, dict[str, str]]:
+    """Return a table to be written, with a row for each time of any topic, and its metadata."""
+    import pandas as pd
 
-
-def _likely_unit(time: float, most: float) -> str:
-    """Return the question for the unit in which a time becomes at most so many seconds."""
-    unit = next((unit for unit, size in (("ms", 1e-3), ("µs", 1e-6)) if time * size <= most), "ns")
-    return f"Are the times in {unit}?"
-
-
-def _about_times(time: Float[np.ndarray, " n"]) -> list[Finding]:
-    """Return a finding on rows without a time."""
-    rows = (np.flatnonzero(~np.isfinite(time)) + 1).tolist()
-    what = f"{numbered(rows, 'row has no time', 'rows have no time')}; left out"
-    return [Finding("warning", "", what)] if rows else []
-
-
-def _called(titles: tuple[str, ...] | None, topic: str) -> list[str]:
-    """Return a body's titles from the configuration's templates; empty without templates."""
-    return [title.replace(PLACE, topic) for title in titles or ()]
-
-
-def _optional(config: RecordingConfig) -> set[str]:
-    """Return the topic of the tensions that do not drive the robot; its columns may be missing."""
-    unused = config.command if config.tensions == "measured" else config.measured
-    return {unused.topic} if unused is not None else set()
-
-
-def _stream(topic: str, time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"]) -> Stream:
-    there = np.isfinite(time) & np.isfinite(values).any(axis=1)
-    stamps = np.round(time[there] * 1e9).astype(np.int64)
-    # received times may be negative, because a table may begin before zero
-    return Stream(topic, stamps, stamps, values[there])
-
-
-def frame_of(columns: Mapping[str, Any]) -> pd.DataFrame:
-    """Return a table from columns with different times: a row for each time in any of them.
-
-    Args:
-        columns: times (s) and numbers by title.
-    """
-    parts = {title: pd.Series(values, index=time) for title, (time, values) in columns.items()}
+    config, columns = outgoing.config, dict[str, pd.Series]()
+    for stream in outgoing.streams:
+        if stream.role == "pose":
+            titles = position_titles(stream.topic, config.position_unit)
+            titles += quaternion_titles(stream.topic) if np.shape(stream.values)[1] == 7 else []
+        else:
+            titles = tension_titles(stream.topic, stream.source.unit, len(stream.source.order))
+        columns |= {
+            title: pd.Series(values, index=stream.time)
+            for title, values in zip(titles, stream.values.T, strict=True)
+        }
+    metadata = {f"fraction {marker.topic}": repr(marker.fraction) for marker in config.markers}
+    if config.description:
+        metadata["source"] = " ".join(config.description.split())
+    if config.simulated is not None:
+        metadata["simulated"] = "true" if config.simulated else "false"
+    if config.initial_tension is not None:
+        metadata[INITIAL] = " ".join(map(repr, config.initial_tension))
+    if config.command is not None and config.command.latency:
+        metadata["latency"] = repr(config.command.latency)
     # one concatenation, because repeated merges would sort the rows each time
-    table = pd.concat(parts, axis=1).sort_index()
-    return table.rename_axis(TIME).reset_index()
+    table = pd.concat(columns, axis=1).sort_index()
+    return table.rename_axis(TIME).reset_index(), metadata

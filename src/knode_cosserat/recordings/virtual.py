@@ -15,10 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.sources import TENSION_UNITS
-from knode_cosserat.recordings.write import FORMATS, MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording, writer_of
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -107,8 +106,7 @@ def record_virtual(
         SimulationError: the simulation fails, for example at too large tensions.
     """
     path = Path(path)
-    if path.suffix not in FORMATS:
-        raise RecordingError(f"{path}: allowed is a name that ends in {', '.join(FORMATS)}")
+    writer_of(path)
     if not 1.5 <= seconds <= LONGEST:
         raise RecordingError(f"seconds is {seconds:g}; allowed is 1.5 to {LONGEST:g} s")
     if not 0 <= seed < 2**32:

@@ -16,6 +16,7 @@ from knode_cosserat.cli.arguments import Json, load_system, parse_limits, requir
 from knode_cosserat.cli.control import CONTROLLERS, parsed_reference
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import examples
+from knode_cosserat.recordings.formats import written_suffixes
 from knode_cosserat_hardware.cli.maintenance import tension_text
 from knode_cosserat_hardware.cli.options import (
     Capture,
@@ -154,8 +155,13 @@ def _body_names(machine: OpenedDriver, poses: Any) -> list[str]:
 
 def _recording_config(count: int, names: list[str], machine: OpenedDriver) -> Any:
     """Return the topics of a bag: tensions, commands, and bodies at even fractions of the length."""
-    from knode_cosserat.recordings.config import RecordingConfig
-    from knode_cosserat.recordings.sources import BaseSource, CommandSource, MarkerSource, TensionSource
+    from knode_cosserat.recordings.config import (
+        BaseSource,
+        CommandSource,
+        MarkerSource,
+        RecordingConfig,
+        TensionSource,
+    )
 
     order = tuple(range(1, count + 1))
     # a configuration has one body or more: without motion capture its topic has no messages
@@ -219,7 +225,10 @@ def run(
     ] = None,
     recording: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Write tip and controls as a recording: .csv, .bag, .mcap, .db3."),
+        typer.Option(
+            metavar="FILE",
+            help=f"Write tip and controls as a recording: {', '.join(written_suffixes())}.",
+        ),
     ] = None,
     yes: Yes = False,
     as_json: Json = False,

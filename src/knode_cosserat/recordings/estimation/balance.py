@@ -65,12 +65,13 @@ def _loads(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[Any, "T
     where = robot.y_layout.indices(LOADS)
 
     def one(t: Any, control: Any, y: Any, y_t: Any, z: Any, z_t: Any) -> Any:
-        def slope(j: Any, loads: Any) -> Any:
+        def known_history(j: Any) -> History:
             # the rates are known, not computed from c0 and the history
-            history = History(jnp.zeros(()), y_t[j], z_t[j], jnp.zeros_like(y_t[j]))
-            return semi_discrete.rates(
-                robot, Point(s[j], t, y[j].at[where].set(loads), control, history), z[j]
-            )[where]
+            return History(jnp.zeros(()), y_t[j], z_t[j], jnp.zeros_like(y_t[j]))
+
+        def slope(j: Any, loads: Any) -> Any:
+            point = Point(s[j], t, y[j].at[where].set(loads), control, known_history(j))
+            return semi_discrete.rates(robot, point, z[j])[where]
 
         def segment(after: Any, j: Any) -> Any:
             ds = s[j] - s[j + 2]
@@ -82,9 +83,7 @@ def _loads(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[Any, "T
             before = after + ds / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
             return before, jnp.stack([before, middle])
 
-        last = _at_tip(
-            robot, t, control, y[-1], History(jnp.zeros(()), y_t[-1], z_t[-1], jnp.zeros_like(y_t[-1]))
-        )
+        last = _at_tip(robot, t, control, y[-1], known_history(-1))
         starts = jnp.arange(s.shape[0] - 3, -1, -2)
         _, pairs = jax.lax.scan(segment, last, starts)
         loads = jnp.concatenate([pairs[::-1].reshape(-1, last.shape[0]), last[None]])
@@ -97,11 +96,11 @@ def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> An
     """Return n and m that satisfy the boundary conditions at the tip."""
     where = robot.y_layout.indices(LOADS)
 
-    def left(loads: Any) -> Any:
+    def residual(loads: Any) -> Any:
         return semi_discrete.tip(robot, t, control, y.at[where].set(loads), history)
 
     def corrected(_: Any, loads: Any) -> Any:
-        return loads - jnp.linalg.solve(jax.jacfwd(left)(loads), left(loads))
+        return loads - jnp.linalg.solve(jax.jacfwd(residual)(loads), residual(loads))
 
     return jax.lax.fori_loop(0, _CORRECTIONS, corrected, jnp.zeros(len(where)))
 
@@ -130,10 +129,10 @@ def _strains(robot: System, rows: KnownRows, coefficients: Float[Any, "4"]) -> F
     nothing = jnp.zeros(rows.z.shape[1:])
     first = at_nodes(jnp.zeros(()), rows.t[0], rows.control[0], rows.y[0], rows.y_t[0], nothing)
 
-    def step(past: Any, row: Any) -> Any:
-        last, before, rate = past
+    def step(history: Any, row: Any) -> Any:
+        last, earlier, rate = history
         t, control, y, y_t = row
-        hz = c1 * last + c2 * before + d1 * rate
+        hz = c1 * last + c2 * earlier + d1 * rate
         z = at_nodes(c0, t, control, y, y_t, hz)
         return (z, last, c0 * z + hz), z
 

@@ -1,21 +1,37 @@
 """Maximum a posteriori curvature of a rod, over arclength and time, from motion capture.
 
-The curvature's coefficients are curves in time (`smoothing`), the bodies' poses follow from them
-(`kinematics`), and Gauss-Newton's method finds the curves. The smoothness and the noise level maximise the
-evidence of the poses by MacKay's fixed point. The prior determines modes that are poorly observed.
+The curvature's coefficients are curves in time, c(t) = Σ_l B_l(t) c_l with B-splines B_l and K numbers in
+each c_l. The bodies' poses follow from them (`kinematics`), and Gauss-Newton's method finds the curves. Frame
+i contributes ½ aᵀ H_i a - g_iᵀ a with the curve's value a = c(t_i). The prior is, with ''' the third
+derivative,
+
+    ½ Σ_k τ_k ∫ (c_k''')² + Ω⁶ c_k² dt.
+
+Above the frequency Ω it is the prior of a motion with white-noise jerk of the intensity 1/τ_k. Below Ω the
+spectrum is flat, so that slow motion stays near zero. Data and prior form a banded system. The smoothness and
+the noise level maximise the evidence of the poses by MacKay's fixed point. The prior determines modes that
+are poorly observed.
 """
 
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import numpy as np
+import scipy.sparse
 from jaxtyping import Bool, Float
+from scipy.interpolate import BSpline
+from scipy.linalg import cho_solve_banded, cholesky_banded
+from scipy.ndimage import gaussian_filter1d
 
 from knode_cosserat.recordings.estimation import kinematics
-from knode_cosserat.recordings.estimation.kinematics import MODES, RodGeometry, RodShape, Sensitivity
-from knode_cosserat.recordings.estimation.smoothing import ORDER, Banded, Splines
+from knode_cosserat.recordings.estimation.kinematics import MODES, RodGeometry
 
+#: degree of the splines: the rate of the accelerations is smooth
+DEGREE = 5
+#: derivative penalised by the prior, and frequency below which the value itself is penalised (Hz)
+ORDER, CORNER = 3, 0.6
 #: largest spacing of knots (s); the frame period if that is longer
 SPACING = 0.04
 #: minimum number of Gauss-Newton iterations, and further iterations at most
@@ -87,66 +103,48 @@ def fitted(rod: RodGeometry, poses: BodyPoses, stretch: float, noise: tuple[floa
     curves = np.zeros((splines.count, rod.modes))
     precision: np.ndarray | None = None
     profile = np.ones(splines.points)
+    frames, size = len(poses.time), 3 * len(rod.bodies)
+    # rotations (rad) of all bodies, then shifts (m); zero where nothing was seen
+    seen = np.repeat(np.concatenate([poses.turned, poses.placed], axis=1), 3, axis=1)
     for correction in range(CORRECTIONS + CHOICES):
         a = np.asarray(design @ curves)
-        it = kinematics.rod_shape(rod, a, stretch)
-        left = _left(rod, it, poses)
-        moves = kinematics.sensitivity(rod, it)
-        H, g = _normal(moves, left, poses, noise, a)
+        shape = kinematics.rod_shape(rod, a, stretch)
+        turns = kinematics.turn_between(poses.quaternion, shape.h[:, rod.bodies])
+        shifts = poses.position - shape.p[:, rod.bodies]
+        residual = seen * np.concatenate([turns.reshape(frames, -1), shifts.reshape(frames, -1)], axis=1)
+        moves = [part.reshape(frames, size, -1) for part in kinematics.sensitivity(rod, shape)]
+        J = seen[..., None] * np.concatenate(moves, axis=1)
+        sigma = np.repeat(noise[::-1], size)
+        rows = J / sigma[:, None]
+        wanted = residual / sigma + (rows @ a[..., None])[..., 0]
+        back = np.swapaxes(rows, 1, 2)
+        H, g = back @ rows, (back @ wanted[..., None])[..., 0]
         system = Banded(splines, design, H, g, splines.roots_of(profile))
         if precision is None:
             share = np.einsum("fkk->k", H) / len(H) / usual
-            precision = share / (2 * np.pi * BEGIN) ** (2 * ORDER)
-            precision = _decaying(_shared(precision, groups), BEGIN_DECAY)[groups]
+            shared = _shared(share / (2 * np.pi * BEGIN) ** (2 * ORDER), groups)
+            precision = _decaying(shared, BEGIN_DECAY)[groups]
         system.factorise(precision, ridge)
         new = system.curve()
         if correction >= 2:
             # after the first iterations the residual is noise
             precision, effective = _likelier(system, new, precision, groups)
             profile = _profile(splines, new, precision)
-            after = _after(moves, left, poses, np.asarray(design @ new) - a)
-            noise = _noise(after, poses, effective, noise)
-            stretch += _stretching(rod, it, after[1])
+            rest = residual - (J @ (np.asarray(design @ new) - a)[..., None])[..., 0]
+            turns, shifts = rest[:, :size], rest[:, size:]
+            kept = max(0.2, 1.0 - effective / seen.sum())
+            counts = np.array([seen[:, size:].sum(), seen[:, :size].sum()])
+            squares = np.array([np.sum(shifts**2), np.sum(turns**2)])
+            level = np.maximum(np.sqrt(squares / np.maximum(counts * kept, 1.0)), LEAST_NOISE)
+            noise = tuple(np.where(counts > 0, level, noise).tolist())
+            # least-squares correction of the stretch from the shifts along the position
+            along = (shape.p[:, rod.bodies] - rod.origin).reshape(frames, -1)
+            stretch += float(np.sum(along * shifts) / np.sum(along**2))
         change = np.max(np.abs(np.asarray(design @ new) - a))
         curves = new
         if correction >= CORRECTIONS and change < CLOSE:
             break
     return CurvatureFit(splines, curves, stretch, noise)
-
-
-def _left(rod: RodGeometry, it: RodShape, poses: BodyPoses) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residuals of poses: rotations (rad) and shifts (m), zero where nothing was seen."""
-    turns = kinematics.turn_between(poses.quaternion, it.h[:, rod.bodies])
-    shifts = poses.position - it.p[:, rod.bodies]
-    return turns * poses.turned[..., None], shifts * poses.placed[..., None]
-
-
-def _stretching(rod: RodGeometry, it: RodShape, shifts: Float[np.ndarray, "F M 3"]) -> float:
-    """Return the least-squares correction of the stretch from the residual shifts along the position."""
-    along = it.p[:, rod.bodies] - rod.origin
-    return float(np.sum(along * shifts) / np.sum(along**2))
-
-
-def _normal(
-    moves: Sensitivity,
-    left: tuple[np.ndarray, np.ndarray],
-    poses: BodyPoses,
-    noise: tuple[float, float],
-    a: Float[np.ndarray, "F K"],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return H and g of every frame, as defined in `smoothing`."""
-    F, _, _, K = moves.turn.shape
-    rows = np.concatenate(
-        [
-            (moves.turn * poses.turned[..., None, None] / noise[1]).reshape(F, -1, K),
-            (moves.shift * poses.placed[..., None, None] / noise[0]).reshape(F, -1, K),
-        ],
-        axis=1,
-    )
-    wanted = np.concatenate([left[0].reshape(F, -1) / noise[1], left[1].reshape(F, -1) / noise[0]], axis=1)
-    wanted = wanted + (rows @ a[..., None])[..., 0]
-    back = np.swapaxes(rows, 1, 2)
-    return back @ rows, (back @ wanted[..., None])[..., 0]
 
 
 def _shared(values: Float[np.ndarray, " K"], groups: np.ndarray) -> Float[np.ndarray, " groups"]:
@@ -199,33 +197,112 @@ def _profile(
     splines: Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
 ) -> Float[np.ndarray, " points"]:
     """Return the prior's relative precision over time: lower where the jerk is large, as after a step."""
-    from scipy.ndimage import gaussian_filter1d
-
     jerk = splines.roots[: splines.points] @ curves
     size = np.sum(jerk**2 * precision, axis=1)
     size = gaussian_filter1d(size, WIDTH)
     return (1.0 + QUIET) / (size / size.mean() + QUIET)
 
 
-def _after(
-    moves: Sensitivity,
-    left: tuple[np.ndarray, np.ndarray],
-    poses: BodyPoses,
-    change: Float[np.ndarray, "F K"],
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the residual rotations (rad) and shifts (m) after a change of the coefficients."""
-    by = change[:, None, :, None]
-    turns = left[0] - (moves.turn @ by)[..., 0] * poses.turned[..., None]
-    return turns, left[1] - (moves.shift @ by)[..., 0] * poses.placed[..., None]
+# curves in time
 
 
-def _noise(
-    after: tuple[np.ndarray, np.ndarray], poses: BodyPoses, effective: float, noise: tuple[float, float]
-) -> tuple[float, float]:
-    """Return the standard deviations of a coordinate and of an angle, from the residuals."""
-    counts = 3.0 * np.array([poses.placed.sum(), poses.turned.sum()])
-    kept = max(0.2, 1.0 - effective / counts.sum())
-    sums = np.array([np.sum(after[1] ** 2), np.sum(after[0] ** 2)])
-    found = np.sqrt(sums / np.maximum(counts * kept, 1.0))
-    found = np.where(counts > 0, np.maximum(found, LEAST_NOISE), noise)
-    return float(found[0]), float(found[1])
+@dataclasses.dataclass(frozen=True, eq=False)
+class Splines:
+    """B-splines on evenly spaced knots.
+
+    Attributes:
+        knots: times of the knots (s).
+        count: number of splines.
+        roots: factor of the prior's matrix at τ = 1, which is `rootsᵀ roots`: first the rows of the jerk,
+            then those of the value, each in order of time.
+    """
+
+    knots: Float[np.ndarray, " n"]
+    count: int
+    roots: Any
+
+    @classmethod
+    def of(cls, start: float, end: float, spacing: float) -> Splines:
+        """Return splines from `start` to `end` with a spacing of knots up to `spacing` (s)."""
+        pieces = max(1, int(np.ceil((end - start) / spacing - 1e-9)))
+        step = (end - start) / pieces
+        knots = start + step * np.arange(-DEGREE, pieces + DEGREE + 1)
+        splines = cls(knots, pieces + DEGREE, None)
+        nodes, weights = np.polynomial.legendre.leggauss(DEGREE - ORDER + 1)
+        at = (start + step * (np.arange(pieces)[:, None] + (nodes + 1) / 2)).ravel()
+        scale = np.sqrt(np.tile(weights * step / 2, pieces))[:, None]
+        corner = (2 * np.pi * CORNER) ** ORDER
+        parts = [splines.design(at, ORDER).multiply(scale), splines.design(at).multiply(corner * scale)]
+        return dataclasses.replace(splines, roots=scipy.sparse.vstack(parts).tocsr())
+
+    def roots_of(self, profile: Float[np.ndarray, " points"]) -> Any:
+        """Return the prior's roots with the jerk's precision scaled by a profile (1 on average)."""
+        scale = np.concatenate([np.sqrt(profile), np.ones(len(profile))])
+        return self.roots.multiply(scale[:, None]).tocsr()
+
+    @property
+    def points(self) -> int:
+        """Number of points in time at which the prior evaluates the jerk."""
+        return self.roots.shape[0] // 2
+
+    def design(self, time: Float[np.ndarray, " F"], derivative: int = 0) -> Any:
+        """Return the sparse values (F, count) of a derivative of the splines at given times (s)."""
+        knots, degree = self.knots, DEGREE - derivative
+        inside = np.clip(time, knots[DEGREE], np.nextafter(knots[-DEGREE - 1], -np.inf))
+        values: Any = BSpline.design_matrix(inside, knots[derivative : len(knots) - derivative], degree)
+        step = knots[1] - knots[0]
+        for order in range(derivative, 0, -1):
+            # a derivative is a difference of coefficients
+            rows = self.count - order
+            difference = scipy.sparse.eye_array(rows, rows + 1, k=1) - scipy.sparse.eye_array(rows, rows + 1)
+            values = values @ (difference / step)
+        return values.tocsr()
+
+
+class Banded:
+    """Banded linear system of a curve: data of the frames plus the prior."""
+
+    def __init__(
+        self,
+        splines: Splines,
+        design: Any,
+        H: Float[np.ndarray, "F K K"],
+        g: Float[np.ndarray, "F K"],
+        roots: Any,
+    ) -> None:
+        self.splines, self.modes, self.roots = splines, g.shape[1], roots
+        n, K = splines.count, self.modes
+        self.right = np.asarray(design.T @ g).ravel()
+        self.data = np.zeros(((DEGREE + 1) * K, n * K))
+        columns = design.tocsc()
+        flat = H.reshape(len(H), K * K)
+        for lag in range(DEGREE + 1):
+            both = columns[:, lag:].multiply(columns[:, : n - lag]) if lag else columns.multiply(columns)
+            blocks = np.asarray(both.T.tocsr() @ flat).reshape(n - lag, K, K)
+            # row of the later spline, column of the earlier one
+            band = self.data.reshape(len(self.data), -1, K)
+            for j in range(K):
+                for i in range(j if lag == 0 else 0, K):
+                    band[lag * K + i - j, : n - lag, j] += blocks[:, i, j]
+        gram = (roots.T @ roots).tocsc()
+        self.gram = [gram.diagonal(-lag) for lag in range(DEGREE + 1)]
+        self.factor: np.ndarray | None = None
+
+    def factorise(self, precision: Float[np.ndarray, " K"], ridge: Float[np.ndarray, " K"]) -> None:
+        """Factorise with the precisions τ of the prior and a ridge on every coefficient."""
+        K, n = self.modes, self.splines.count
+        band = self.data.copy()
+        for lag, diagonal in enumerate(self.gram):
+            row = band[lag * K].reshape(n, K)
+            row[: n - lag] += diagonal[:, None] * precision
+        band[0] += np.tile(ridge, n)
+        self.factor = cholesky_banded(band, lower=True, overwrite_ab=True, check_finite=False)
+
+    def solve(self, right: Float[np.ndarray, "nK ..."]) -> Float[np.ndarray, "nK ..."]:
+        """Return the solution for one right-hand side or several."""
+        assert self.factor is not None
+        return np.asarray(cho_solve_banded((self.factor, True), right, check_finite=False))
+
+    def curve(self) -> Float[np.ndarray, "n K"]:
+        """Return the most likely coefficients."""
+        return self.solve(self.right).reshape(self.splines.count, self.modes)

@@ -8,15 +8,16 @@ from typing import Literal, get_args
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.interpolate import CubicSpline
 
-from knode_cosserat.recordings.estimation import balance, curvature, kinematics, paper
+from knode_cosserat.recordings.estimation import balance, curvature, kinematics
 from knode_cosserat.recordings.estimation.balance import KnownRows, packed_fields
-from knode_cosserat.recordings.estimation.observations import RecordingPart, parts_of
+from knode_cosserat.recordings.estimation.curvature import BodyPoses
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.recordings.recording import Body, Recording
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import MEASURED
+from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import Euler
 from knode_cosserat.trajectory import Trajectory
 
@@ -25,6 +26,12 @@ Method = Literal["best", "paper"]
 NOISE = (3e-4, 3e-3)
 #: largest ratio between the lengths of robot and recording, or its inverse
 UNLIKE = 2.0
+#: margin of poses used before the first row and after the last (s)
+AROUND = 0.5
+#: tolerance of stamps of one frame (s)
+_SAME = 1e-4
+#: smallest number of bodies away from the clamped end, and of rows
+FEWEST_BODIES, FEWEST_ROWS = 2, 4
 
 
 def estimate_states(
@@ -41,7 +48,10 @@ def estimate_states(
     (`curvature`), at motion capture's own rate. Positions, orientations, velocities and accelerations are
     integrals of it. n and m follow from the robot's balance, integrated from the tip, and v from its
     constitutive law. u is the measured curvature, not the law's result for m, so that errors of the robot's
-    model remain visible. `method="paper"` is the paper's method (`paper`).
+    model remain visible. `method="paper"` is the paper's
+    method: cubic splines of positions and spherical interpolation of orientations over arclength at every
+    row, central differences in time in the material frame (the paper's own scripts leave q in the global
+    one), and the discrete equations of a simulation for n and m.
 
     Positions, orientations, velocities and u come from the recording alone. n, m and v depend on the
     robot's masses and loads and are as accurate as these.
@@ -63,14 +73,14 @@ def estimate_states(
         RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, or has
             too few bodies or no orientations; or the method or a time is not allowed.
     """
-    found = _parts(recording, robot, method, dt, start, end)
-    if len(found) > 1:
-        times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in found)
+    parts = _parts(recording, robot, method, dt, start, end)
+    if len(parts) > 1:
+        times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in parts)
         raise RecordingError(
-            f"{found[0].rows.source}: the recording is in {len(found)} parts ({times}); choose one by start "
+            f"{parts[0].rows.source}: the recording is in {len(parts)} parts ({times}); choose one by start "
             "and end, or take all of them by estimate_parts"
         )
-    return _estimated(found[0], robot, method)
+    return _estimated(parts[0], robot, method)
 
 
 def estimate_parts(
@@ -102,7 +112,7 @@ def _parts(
     if not isinstance(robot, System):
         raise RecordingError(f"robot is a {type(robot).__name__}; allowed is a robot or a model")
     balance.require_rod(robot)
-    parts = parts_of(recording, robot, dt, start, end)
+    parts = _parts_of(recording, robot, dt, start, end)
     for part in parts:
         ratio = _stretch(part, robot)
         if not 1.0 / UNLIKE < ratio < UNLIKE:
@@ -120,17 +130,13 @@ def _stretch(part: RecordingPart, robot: System) -> float:
     return float(np.nanmax(reach @ places / (places @ places)))
 
 
-def applied_controls(part: RecordingPart) -> Float[np.ndarray, "T c"]:
-    """Return for each row the tension held from the row before; for the first, its own."""
-    tension = part.rows.tension
-    return np.concatenate([tension[:1], tension[:-1]])
-
-
 def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
-    control, settings = applied_controls(part), None
+    tension, settings = part.rows.tension, None
+    # the tension held from the row before; for the first row, its own
+    control = np.concatenate([tension[:1], tension[:-1]])
     if method == "paper":
         settings = dataclasses.replace(MEASURED, space=Euler())
-        y, z = paper.paper_states(part, robot, control, settings)
+        y, z = _paper_states(part, robot, control, settings)
     else:
         y, z = _best(part, robot, control)
     rows = len(part.rows.time)
@@ -149,53 +155,190 @@ def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
     )
 
 
-def rod_of(part: RecordingPart, robot: System) -> kinematics.RodGeometry:
-    """Return the grid for a robot and the bodies of a recording."""
-    y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
-    h = y0[robot.y_layout.slice("h")]
-    return kinematics.RodGeometry.of(
-        float(robot.length),
-        robot.nodes,
-        part.fractions,
-        h / np.linalg.norm(h),
-        y0[robot.y_layout.slice("p")],
-    )
-
-
 def _best(
     part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"]
 ) -> tuple[np.ndarray, np.ndarray]:
-    rod, time = rod_of(part, robot), part.rows.time
-    fit = curvature.fitted(rod, part.poses, _stretch(part, robot), NOISE)
-    it = kinematics.motion(rod, fit.at(time), fit.stretch)
-    return completed(robot, rod, it, time, control)
-
-
-def completed(
-    robot: System,
-    rod: kinematics.RodGeometry,
-    it: kinematics.RodMotion,
-    time: Float[np.ndarray, " T"],
-    control: Float[np.ndarray, "T c"],
-) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z at the nodes: the motion, n and m from the robot's balance, and v from its law."""
-    spin = np.concatenate([np.zeros_like(it.w[..., :1]), it.w], axis=-1)
-    h_t = 0.5 * kinematics.hamilton(it.shape.h, spin)
-    p_t = (it.shape.R @ it.q[..., None])[..., 0]
-    _, z_rest = robot.rest(jnp.zeros(()))
-    z = np.broadcast_to(np.asarray(z_rest), (*it.q.shape[:2], robot.z_layout.size)).copy()
-    z[..., robot.z_layout.slice("u")] = it.shape.u
+    y0, z0 = (np.asarray(values, dtype=float) for values in robot.rest(jnp.zeros(())))
+    h, p = y0[robot.y_layout.slice("h")], y0[robot.y_layout.slice("p")]
+    rod = kinematics.RodGeometry.of(
+        float(robot.length), robot.nodes, part.fractions, h / np.linalg.norm(h), p
+    )
+    time = part.rows.time
+    fit = curvature.fitted(rod, part.poses, _stretch(part, robot), NOISE)
+    motion = kinematics.motion(rod, fit.at(time), fit.stretch)
+    shape = motion.shape
+    spin = np.concatenate([np.zeros_like(motion.w[..., :1]), motion.w], axis=-1)
+    h_t = 0.5 * kinematics.hamilton(shape.h, spin)
+    p_t = kinematics.rotated(shape.R, motion.q)
+    z = np.broadcast_to(z0, (*motion.q.shape[:2], robot.z_layout.size)).copy()
+    z[..., robot.z_layout.slice("u")] = shape.u
     rows = KnownRows(
         t=time,
         control=control,
-        y=packed_fields(robot, "y", p=it.shape.p, h=it.shape.h, q=it.q, w=it.w),
-        y_t=packed_fields(robot, "y", p=p_t, h=h_t, q=it.q_t, w=it.w_t),
+        y=packed_fields(robot, "y", p=shape.p, h=shape.h, q=motion.q, w=motion.w),
+        y_t=packed_fields(robot, "y", p=p_t, h=h_t, q=motion.q_t, w=motion.w_t),
         z=z,
-        z_t=packed_fields(robot, "z", u=it.u_t),
+        z_t=packed_fields(robot, "z", u=motion.u_t),
     )
     y = balance.loads_of(robot, rod.s, rows)[:, rod.nodes]
     at_nodes = rows._replace(y=y, y_t=rows.y_t[:, rod.nodes], z=z[:, rod.nodes], z_t=rows.z_t[:, rod.nodes])
     dt = float(np.mean(np.diff(time)))
     by_law = balance.strains_of(robot, at_nodes, MEASURED, round(dt, 9)).copy()
-    by_law[..., robot.z_layout.slice("u")] = it.shape.u[:, rod.nodes]
+    by_law[..., robot.z_layout.slice("u")] = shape.u[:, rod.nodes]
     return y, by_law
+
+
+def _paper_states(
+    part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
+) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
+    """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
+    rows = part.rows
+    used = rows.fractions > 0.0
+    if not np.isfinite(rows.quaternion[:, used]).all():
+        raise RecordingError(
+            f"{rows.source}: a body has no orientation; the paper's method needs that of every body"
+        )
+    y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
+    p0, h0 = y0[robot.y_layout.slice("p")], y0[robot.y_layout.slice("h")]
+    count = len(rows.time)
+    places = np.concatenate([[0.0], rows.fractions[used]])
+    position = np.concatenate([np.broadcast_to(p0, (count, 1, 3)), rows.position[:, used]], axis=1)
+    quaternion = np.concatenate([np.broadcast_to(h0, (count, 1, 4)), rows.quaternion[:, used]], axis=1)
+    nodes = np.linspace(0.0, 1.0, robot.nodes)
+    p, h = _along(places, position, quaternion, nodes)
+    dt = rows.dt
+    R = kinematics.matrices(h)
+    p_t = np.gradient(p, dt, axis=0, edge_order=2)
+    h_t = np.gradient(h, dt, axis=0, edge_order=2)
+    q = (np.swapaxes(R, -1, -2) @ p_t[..., None])[..., 0]
+    w = 2.0 * kinematics.hamilton(h * np.array([1.0, -1.0, -1.0, -1.0]), h_t)[..., 1:]
+    known = packed_fields(robot, "y", p=p, h=h, q=q, w=w)
+    return balance.semi_discretised(robot, rows.time, control, known, settings, round(dt, 9))
+
+
+def _along(
+    places: Float[np.ndarray, " B"],
+    position: Float[np.ndarray, "T B 3"],
+    quaternion: Float[np.ndarray, "T B 4"],
+    nodes: Float[np.ndarray, " N"],
+) -> tuple[Float[np.ndarray, "T N 3"], Float[np.ndarray, "T N 4"]]:
+    """Return positions and orientations at the nodes for every row."""
+    p = np.asarray(CubicSpline(places, position, axis=1)(nodes))
+    after = np.clip(np.searchsorted(places, nodes, side="left"), 1, len(places) - 1)
+    part = (nodes - places[after - 1]) / (places[after] - places[after - 1])
+    start, to = quaternion[:, after - 1], quaternion[:, after]
+    turn = kinematics.turn_between(to, start) * part[:, None]
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    step = np.concatenate([np.cos(angle / 2), np.sinc(angle / (2 * np.pi)) / 2 * turn], axis=-1)
+    h = kinematics.hamilton(step, start)
+    # q and -q are the same rotation: choose the continuous sign, because rows are differentiated in time
+    flips = np.cumprod(np.where(np.sum(h[1:] * h[:-1], axis=-1) < 0.0, -1.0, 1.0), axis=0)
+    h[1:] *= flips[..., None]
+    return p, np.where(h[:1, :, :1] < 0.0, -h, h)
+
+
+# parts of a recording
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class RecordingPart:
+    """An unbroken part of a recording.
+
+    Attributes:
+        rows: measurements at the times to estimate.
+        poses: poses of the bodies away from the clamped end, at the full rate.
+        fractions: places of these bodies, as fractions of the rod's length.
+    """
+
+    rows: Measurements
+    poses: BodyPoses
+    fractions: Float[np.ndarray, " M"]
+
+
+def _parts_of(
+    recording: Recording | Measurements, robot: System, dt: float, start: float | None, end: float | None
+) -> list[RecordingPart]:
+    """Return the parts with enough rows for an estimation.
+
+    Raises:
+        RecordingError: the recording does not fit the robot, or has too few data.
+    """
+    if isinstance(recording, Recording):
+        rows = recording.sampled(dt, start, end)
+    elif isinstance(recording, Measurements):
+        rows = recording
+        if start is not None or end is not None:
+            rows = rows.between(-np.inf if start is None else start, np.inf if end is None else end + 1e-9)
+        if abs(rows.dt - dt) > 1e-6 * dt:
+            raise RecordingError(
+                f"{rows.source}: its rows are {rows.dt:g} s apart and dt is {dt:g} s; allowed is the same"
+            )
+    else:
+        raise RecordingError(
+            f"recording is a {type(recording).__name__}; allowed is a Recording or Measurements"
+        )
+    _check(rows, robot)
+    pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
+    if not pieces:
+        raise RecordingError(
+            f"{rows.source}: no {FEWEST_ROWS} rows of {dt:g} s one after the other "
+            "with all positions and tensions"
+        )
+    used = rows.fractions > 0.0
+    parts = []
+    for piece in pieces:
+        poses = (
+            _frames([body for body, use in zip(recording.bodies, used, strict=True) if use], piece.time)
+            if isinstance(recording, Recording)
+            else _of_rows(piece, used)
+        )
+        parts.append(RecordingPart(piece, poses, rows.fractions[used]))
+    return parts
+
+
+def _check(rows: Measurements, robot: System) -> None:
+    tendons = rows.tension.shape[1]
+    if tendons != robot.control_size:
+        raise RecordingError(
+            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_size} "
+            "controls; allowed is the same number"
+        )
+    away = rows.fractions > 0.0
+    if away.sum() < FEWEST_BODIES:
+        raise RecordingError(
+            f"{rows.source}: {int(away.sum())} bodies on the rod away from its clamped end; "
+            f"required is {FEWEST_BODIES} or more"
+        )
+    if not np.isfinite(rows.quaternion[:, away]).all(axis=2).any():
+        raise RecordingError(
+            f"{rows.source}: no body has orientations; required for states is one or more (see the "
+            "recording's findings, the markers' `rotation` and `rest` in its configuration)"
+        )
+
+
+def _of_rows(rows: Measurements, used: np.ndarray) -> BodyPoses:
+    position, quaternion = rows.position[:, used], rows.quaternion[:, used]
+    turned = np.isfinite(quaternion).all(axis=2)
+    filled = np.where(turned[..., None], quaternion, [1.0, 0.0, 0.0, 0.0])
+    # bridged poses are not observations
+    seen = rows.measured[:, used]
+    return BodyPoses(rows.time, position, filled, seen, turned & seen)
+
+
+def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> BodyPoses:
+    """Return the poses of all bodies, grouped by frame."""
+    first, last = time[0] - AROUND, time[-1] + AROUND
+    inside = [body.time[(body.time >= first) & (body.time <= last)] for body in bodies]
+    stamps = np.unique(np.concatenate(inside))
+    frames = stamps[np.concatenate([[True], np.diff(stamps) > _SAME])]
+    count = (len(frames), len(bodies))
+    position, quaternion = np.zeros((*count, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (*count, 1))
+    placed, turned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    for k, body in enumerate(bodies):
+        inside_rows = np.flatnonzero((body.time >= first) & (body.time <= last))
+        row = np.searchsorted(frames, body.time[inside_rows] + _SAME / 2, side="right") - 1
+        position[row, k], placed[row, k] = body.position[inside_rows], True
+        if body.quaternion is not None:
+            quaternion[row, k], turned[row, k] = body.quaternion[inside_rows], True
+    return BodyPoses(frames, position, quaternion, placed, turned)

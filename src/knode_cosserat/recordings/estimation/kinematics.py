@@ -21,6 +21,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.spatial.transform import Rotation
 
 #: numbers of cosines for the curvature about x, about y, and for the twist
 MODES = (9, 9, 3)
@@ -138,34 +139,25 @@ def rod_shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> 
     return RodShape(np.einsum("pck,fk->fpc", rod.basis, a, optimize=True), h, R, p)
 
 
-class Sensitivity(NamedTuple):
-    """Derivatives of the bodies' poses by the coefficients: rotations (global frame, rad) and shifts (m)."""
-
-    turn: Float[np.ndarray, "F M 3 K"]
-    shift: Float[np.ndarray, "F M 3 K"]
-
-
-def sensitivity(rod: RodGeometry, it: RodShape) -> Sensitivity:
-    """Return the derivatives of the bodies' poses by the coefficients, as integrals without recursion."""
+def sensitivity(
+    rod: RodGeometry, shape: RodShape
+) -> tuple[Float[np.ndarray, "F M 3 K"], Float[np.ndarray, "F M 3 K"]]:
+    """Return derivatives of the bodies' poses by the coefficients: rotations (global, rad), shifts (m)."""
     weights = _weights(rod)  # (M, P)
-    F, P = it.p.shape[:2]
-    moment = np.cross(it.R, it.p[..., None], axisa=-2, axisb=-2, axisc=-2)  # columns of R, times p
+    F, P = shape.p.shape[:2]
+    moment = np.cross(shape.R, shape.p[..., None], axisa=-2, axisb=-2, axisc=-2)  # columns of R, times p
     M, K = len(rod.bodies), rod.modes
     turn, shift = np.zeros((F, M, 3, K)), np.zeros((F, M, 3, K))
     for axis in range(3):
-        mine = np.flatnonzero(np.any(rod.basis[:, axis] != 0.0, axis=0))
-        factors = np.einsum("mp,pk->pmk", weights, rod.basis[:, axis, mine]).reshape(P, -1)
-
-        def integrals(
-            columns: np.ndarray, factors: np.ndarray = factors, count: int = len(mine)
-        ) -> np.ndarray:
-            flat = np.ascontiguousarray(np.moveaxis(columns, 1, -1)).reshape(F * 3, P)
-            return np.moveaxis((flat @ factors).reshape(F, 3, M, count), 1, 2)
-
-        turn[..., mine] = integrals(it.R[..., axis])
-        shift[..., mine] = -integrals(moment[..., axis])
-    shift += np.cross(turn, it.p[:, rod.bodies, :, None], axisa=-2, axisb=-2, axisc=-2)
-    return Sensitivity(turn, shift)
+        modes = np.flatnonzero(np.any(rod.basis[:, axis] != 0.0, axis=0))
+        factors = np.einsum("mp,pk->pmk", weights, rod.basis[:, axis, modes]).reshape(P, -1)
+        # one product of matrices for all frames and bodies
+        for sign, columns, integrals in ((1.0, shape.R, turn), (-1.0, moment, shift)):
+            flat = np.ascontiguousarray(np.moveaxis(columns[..., axis], 1, -1)).reshape(F * 3, P)
+            product = (flat @ factors).reshape(F, 3, M, len(modes))
+            integrals[..., modes] = sign * np.moveaxis(product, 1, 2)
+    shift += np.cross(turn, shape.p[:, rod.bodies, :, None], axisa=-2, axisb=-2, axisc=-2)
+    return turn, shift
 
 
 class RodMotion(NamedTuple):
@@ -181,19 +173,19 @@ class RodMotion(NamedTuple):
 
 def motion(rod: RodGeometry, a: Float[np.ndarray, "3 F K"], stretch: float) -> RodMotion:
     """Return shape, velocities and accelerations from the coefficients and their first two rates."""
-    it = rod_shape(rod, a[0], stretch)
-    u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, each, optimize=True) for each in a[1:])
-    p_s = stretch * it.R[..., 2]
-    turned = _turned(it.R, u_t)
+    shape = rod_shape(rod, a[0], stretch)
+    u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, rate, optimize=True) for rate in a[1:])
+    p_s = stretch * shape.R[..., 2]
+    turned = rotated(shape.R, u_t)
     w = cumulative(rod, turned)
     p_t = cumulative(rod, np.cross(w, p_s))
-    w_t = cumulative(rod, _turned(it.R, u_tt) + np.cross(w, turned))
+    w_t = cumulative(rod, rotated(shape.R, u_tt) + np.cross(w, turned))
     p_tt = cumulative(rod, np.cross(w_t, p_s) + np.cross(w, np.cross(w, p_s)))
-    back = np.swapaxes(it.R, -1, -2)
-    q_local, w_local = _turned(back, p_t), _turned(back, w)
+    back = np.swapaxes(shape.R, -1, -2)
+    q_local, w_local = rotated(back, p_t), rotated(back, w)
     # rates in a rotating frame; for ω the extra term vanishes
-    q_t = _turned(back, p_tt) - np.cross(w_local, q_local)
-    return RodMotion(it, q_local, w_local, q_t, _turned(back, w_t), u_t)
+    q_t = rotated(back, p_tt) - np.cross(w_local, q_local)
+    return RodMotion(shape, q_local, w_local, q_t, rotated(back, w_t), u_t)
 
 
 # integrals
@@ -224,47 +216,29 @@ def _weights(rod: RodGeometry) -> Float[np.ndarray, "M P"]:
 # rotations
 
 
-def hamilton(
-    left: Float[np.ndarray, "... 4"], right: Float[np.ndarray, "... 4"]
-) -> Float[np.ndarray, "... 4"]:
+def hamilton(a: Float[np.ndarray, "... 4"], b: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 4"]:
     """Return the product of quaternions, scalar first."""
-    a, b, c, d = np.moveaxis(left, -1, 0)
-    w, x, y, z = np.moveaxis(right, -1, 0)
-    return np.stack(
-        [
-            a * w - b * x - c * y - d * z,
-            a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x,
-            a * z + b * y - c * x + d * w,
-        ],
-        axis=-1,
-    )
+    scalar = a[..., :1] * b[..., :1] - np.sum(a[..., 1:] * b[..., 1:], axis=-1, keepdims=True)
+    vector = a[..., :1] * b[..., 1:] + b[..., :1] * a[..., 1:] + np.cross(a[..., 1:], b[..., 1:])
+    return np.concatenate([scalar, vector], axis=-1)
 
 
 def matrices(h: Float[np.ndarray, "... 4"]) -> Float[np.ndarray, "... 3 3"]:
     """Return the rotation matrices of unit quaternions, scalar first."""
-    w, x, y, z = np.moveaxis(h, -1, 0)
-    rows = (
-        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-    )
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    rotation = Rotation.from_quat(h.reshape(-1, 4), scalar_first=True)
+    return rotation.as_matrix().reshape(*h.shape[:-1], 3, 3)
 
 
 def turn_between(
     to: Float[np.ndarray, "... 4"], start: Float[np.ndarray, "... 4"]
 ) -> Float[np.ndarray, "... 3"]:
     """Return the rotation vectors (rad, global frame) from orientations `start` to `to`."""
-    inverse = start * np.array([1.0, -1.0, -1.0, -1.0])
-    turn = hamilton(to, inverse)
-    turn = np.where(turn[..., :1] < 0.0, -turn, turn)
-    size = np.linalg.norm(turn[..., 1:], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, turn[..., :1])
-    return turn[..., 1:] * np.where(size > 1e-12, angle / np.maximum(size, 1e-12), 2.0)
+    before, after = (Rotation.from_quat(h.reshape(-1, 4), scalar_first=True) for h in (start, to))
+    return (after * before.inv()).as_rotvec().reshape(*to.shape[:-1], 3)
 
 
-def _turned(
-    R: Float[np.ndarray, "F P 3 3"], vectors: Float[np.ndarray, "F P 3"]
-) -> Float[np.ndarray, "F P 3"]:
+def rotated(
+    R: Float[np.ndarray, "... 3 3"], vectors: Float[np.ndarray, "... 3"]
+) -> Float[np.ndarray, "... 3"]:
+    """Return vectors turned by rotation matrices."""
     return (R @ vectors[..., None])[..., 0]

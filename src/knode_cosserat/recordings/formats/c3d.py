@@ -114,15 +114,15 @@ class _C3D:
         names, units = self._texts("ANALOG:LABELS", count, "channel"), self._texts("ANALOG:UNITS", count)
         at = (time[:, None] + np.arange(per_frame) / (rate * per_frame)).ravel()
         titles = [f"{name} [{unit}]" if unit else name for name, unit in zip(names, units, strict=True)]
-        return [Channels(at, dict(zip(titles, values.T, strict=True)))]
+        return [(at, dict(zip(titles, values.T, strict=True)))]
 
     def _frames(self, first: int, last: int) -> tuple[int, int]:
         """Return the first frame's number and the stated number of frames."""
         count = last - first + 1
         actual = [self.parameters.get(f"TRIAL:ACTUAL_{end}_FIELD") for end in ("START", "END")]
-        if all(isinstance(each, np.ndarray) and each.size == 2 for each in actual):
+        if all(isinstance(word, np.ndarray) and word.size == 2 for word in actual):
             # two words of 16 bits, the lower first
-            first, last = (int(each[0]) % 65536 + 65536 * (int(each[1]) % 65536) for each in actual)  # type: ignore[index]
+            first, last = (int(word[0]) % 65536 + 65536 * (int(word[1]) % 65536) for word in actual)  # type: ignore[index]
             return first, last - first + 1
         frames = self._number("POINT:FRAMES", 0) % 65536
         if last == _FULL or count <= 0:
@@ -148,7 +148,7 @@ class _C3D:
     def _parameters(self, section: bytes) -> dict[str, Any]:
         """Return the parameters by GROUP:NAME: arrays of numbers or lists of texts."""
         groups: dict[int, str] = {}
-        found: list[tuple[int, str, Any]] = []
+        parameters: list[tuple[int, str, Any]] = []
         position = 0
         while position + 4 <= len(section):
             length, group = struct.unpack_from("bb", section, position)
@@ -161,11 +161,11 @@ class _C3D:
             if group < 0:
                 groups[-group] = name
             else:
-                found.append((group, name, self._value(section, position + 2)))
+                parameters.append((group, name, self._value(section, position + 2)))
             if offset <= 0:
                 break
             position += offset
-        return {f"{groups.get(group, group)}:{name}": value for group, name, value in found}
+        return {f"{groups.get(group, group)}:{name}": value for group, name, value in parameters}
 
     def _value(self, section: bytes, position: int) -> Any:
         kind, dimensions = struct.unpack_from("bB", section, position)

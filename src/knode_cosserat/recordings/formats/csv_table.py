@@ -11,15 +11,20 @@ import csv
 import io
 import itertools
 from collections.abc import Sequence
-
-import pandas as pd  # type: ignore[import-untyped]
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from knode_cosserat._files import csv_rows
 from knode_cosserat._files.limits import excess
+from knode_cosserat._files.writing import replacing
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
-from knode_cosserat.recordings.table import ALLOWED, Table, numbered, numbers_of
+from knode_cosserat.recordings.streams import Outgoing
+from knode_cosserat.recordings.table import ALLOWED, Table, columns_and_metadata, numbered, numbers_of
+
+if TYPE_CHECKING:
+    import pandas as pd  # type: ignore[import-untyped]
 
 #: delimiters of cells, and lines that they are recognised by
 DELIMITERS, _SAMPLE = (",", ";", "\t"), 20
@@ -39,13 +44,13 @@ def read_csv(data: bytes, path: str) -> Table:
     except UnicodeDecodeError:
         raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
-    said, first = _comments(lines)
+    metadata, first = _comments(lines)
     delimiter = delimiter_of(lines[first : first + 10 * _SAMPLE])
     # a quoted cell can have line breaks, so that the header may not be one of the lines
     columns = 1 + max((line.count(delimiter) for line in itertools.islice(lines, first, None)), default=0)
     _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"), path)
     table, about_units = _titled(cells_of(text, delimiter, path), path)
-    return Table(said, numbers_of(table), (*_about_comments(lines, first), *about_units))
+    return Table(metadata, numbers_of(table), (*_about_comments(lines, first), *about_units))
 
 
 def delimiter_of(lines: Sequence[str]) -> str:
@@ -71,14 +76,14 @@ def _require(reason: str, path: str) -> None:
 
 def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:
     """Return the metadata from the lines `# key: value` before the header, and the header's index."""
-    said: dict[str, str] = {}
+    metadata: dict[str, str] = {}
     for index, line in enumerate(lines):
         if line.strip() and not line.startswith("#"):
-            return said, index
+            return metadata, index
         key, colon, value = line.removeprefix("#").partition(":")
         if colon:
-            said[key.strip()] = value.strip()
-    return said, len(lines)
+            metadata[key.strip()] = value.strip()
+    return metadata, len(lines)
 
 
 def _about_comments(lines: Sequence[str], header: int) -> tuple[Finding, ...]:
@@ -99,6 +104,8 @@ def _about_comments(lines: Sequence[str], header: int) -> tuple[Finding, ...]:
 
 def cells_of(text: str, delimiter: str, path: str) -> pd.DataFrame:
     """Return all cells as text, with decimal points."""
+    import pandas as pd
+
     try:
         cells = pd.read_csv(
             io.StringIO(text), sep=delimiter, comment="#", header=None, dtype=str, skipinitialspace=True
@@ -131,6 +138,8 @@ def _are(cells: pd.Series, pattern: str) -> bool:
 
 def _titled(cells: pd.DataFrame, path: str) -> tuple[pd.DataFrame, tuple[Finding, ...]]:
     """Return the rows under titles, without a line of units, and findings."""
+    import pandas as pd
+
     is_number = [pd.to_numeric(cells.iloc[:2, k], errors="coerce").notna() for k in range(cells.shape[1])]
     findings: tuple[Finding, ...] = ()
     if all(column.iloc[0] for column in is_number):
@@ -150,11 +159,22 @@ def _titled(cells: pd.DataFrame, path: str) -> tuple[pd.DataFrame, tuple[Finding
     return table, findings
 
 
+def write_csv(path: Path, outgoing: Outgoing) -> None:
+    """Write a recording as a CSV table, with its metadata as comments."""
+    table, metadata = columns_and_metadata(outgoing)
+    comments = "".join(f"# {key}: {value}\n" for key, value in metadata.items())
+    with replacing(path) as temporary:
+        temporary.write_text(comments + table.to_csv(index=False, lineterminator="\n"), encoding="utf-8")
+
+
 register(
     RecordingFormat(
         "CSV table",
         recognise=lambda head: False,
         read=lambda path, wanted: read_csv(content.file_bytes(path, csv_rows.LARGEST_FILE), str(path)),
+        suffixes=(".csv", ".csv.gz"),
+        write=write_csv,
+        written=(".csv",),
         is_fallback=True,
     )
 )

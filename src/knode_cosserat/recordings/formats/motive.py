@@ -21,7 +21,6 @@ from collections.abc import Collection
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings.exports import Cells, Track, export_table, length_unit, text_lines
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -98,6 +97,8 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
 
 def _of_angles(cells: Cells, places: dict[str, int], order: str, path: Path) -> np.ndarray:
     """Return quaternions of Euler angles (degrees) about the moving axes in an order such as XYZ."""
+    from scipy.spatial.transform import Rotation
+
     if sorted(order.upper()) != list("XYZ"):
         raise RecordingError(
             f"{path}: the rotation type is {order!r}; allowed is Quaternion, or an order as XYZ"

@@ -25,9 +25,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.exports import LENGTHS, Cells, Channels, Track, export_table, text_lines
+from knode_cosserat.recordings.exports import LENGTHS, Cells, Track, export_table, text_lines
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.formats.csv_table import delimiter_of
@@ -61,14 +60,14 @@ def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
     time, tracks, channels, findings = None, [], [], list[Finding]()
     for section in sections:
         at = section.frame / rate + section.sample / section.rate
-        found, others = _tracks(section, findings, path)
-        if found and (time is None or np.array_equal(at, time)):
+        bodies, others = _tracks(section, findings, path)
+        if bodies and (time is None or np.array_equal(at, time)):
             time = at
-            tracks += found
-        elif found:
-            names = ", ".join(track.name for track in found)
+            tracks += bodies
+        elif bodies:
+            names = ", ".join(track.name for track in bodies)
             findings.append(Finding("warning", "", f"{names:.200}: of another rate than the first; left out"))
-        channels.append(Channels(at, others))
+        channels.append((at, others))
     return export_table(
         path, np.zeros(0) if time is None else time, tracks, up="z", channels=channels, findings=findings
     )
@@ -144,6 +143,8 @@ def _tracks(
 
 
 def _of_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
+    from scipy.spatial.transform import Rotation
+
     known = np.isfinite(vectors).all(axis=1)
     quaternion = np.full((len(vectors), 4), np.nan)
     quaternion[known] = Rotation.from_rotvec(vectors[known]).as_quat(scalar_first=True)

@@ -1,19 +1,18 @@
-"""Recordings in Parquet files: columns of numbers."""
+"""Recordings in Parquet files: columns of numbers, and metadata in the schema."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import pandas as pd  # type: ignore[import-untyped]
-
 from knode_cosserat._files import parquet_file
 from knode_cosserat._files.reading import ReadError
+from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
-from knode_cosserat.recordings.table import Table, numbers_of
+from knode_cosserat.recordings.streams import Outgoing
+from knode_cosserat.recordings.table import Table, columns_and_metadata, numbers_of
 
 MAGIC = b"PAR1"
 _NUMBERS = ("BOOLEAN", "INT32", "INT64", "FLOAT", "DOUBLE")
@@ -27,28 +26,37 @@ def read_parquet(path: Path) -> Table:
         RecordingError: the file cannot be read, a column has no numbers, or a limit is exceeded.
         ImportError: pyarrow is not installed.
     """
-    pyarrow = _pyarrow()
+    types = _pyarrow().types
+    import pandas as pd  # type: ignore[import-untyped]
+
     try:
         with parquet_file.open_parquet(path) as file:
             for k in range(file.metadata.num_columns):
                 _check_column(file.metadata.schema.column(k), path)
             parquet_file.require_limited_expansion(file.metadata, path)
             table = file.read()
-            said = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
+            metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     except ReadError as error:
         raise RecordingError(f"{path}: {error}") from None
+    numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_null)
     for field in table.schema:
-        _check_type(pyarrow, field, path)
-    frame = pd.DataFrame({name: table.column(i).to_numpy() for i, name in enumerate(table.column_names)})
-    _require(len(frame) > 0, path, "no rows")
-    return Table(said, numbers_of(frame))
+        if not any(is_kind(field.type) for is_kind in numbers):
+            raise RecordingError(
+                f"{path}: the column {shown(field.name)} has {field.type}; allowed are numbers"
+            )
+    frame = pd.DataFrame({name: table.column(k).to_numpy() for k, name in enumerate(table.column_names)})
+    if frame.empty:
+        raise RecordingError(f"{path}: no rows")
+    return Table(metadata, numbers_of(frame))
 
 
-def write_parquet(path: Path, table: pd.DataFrame, said: Mapping[str, str]) -> None:
-    """Write columns and metadata as Parquet. Raises `ImportError` if pyarrow is not installed."""
+def write_parquet(path: Path, outgoing: Outgoing) -> None:
+    """Write a recording as a Parquet file. Raises `ImportError` if pyarrow is not installed."""
     pyarrow = _pyarrow()
-    written = pyarrow.Table.from_pandas(table, preserve_index=False)
-    pyarrow.parquet.write_table(written.replace_schema_metadata(dict(said)), path)
+    table, metadata = columns_and_metadata(outgoing)
+    columns = pyarrow.Table.from_pandas(table, preserve_index=False).replace_schema_metadata(metadata)
+    with replacing(path) as temporary:
+        pyarrow.parquet.write_table(columns, temporary)
 
 
 def _pyarrow() -> Any:
@@ -60,25 +68,15 @@ def _pyarrow() -> Any:
     return pyarrow
 
 
-def _require(fair: bool, path: Path, what: str) -> None:
-    if not fair:
-        raise RecordingError(f"{path}: {what}")
-
-
 def _check_column(column: Any, path: Path) -> None:
     """Raise `RecordingError` if a column has no plain numbers."""
     flat = column.max_repetition_level == 0 and column.path == column.name
-    numbers = column.physical_type in _NUMBERS and column.logical_type.type in _PLAIN
-    kind = column.logical_type.type if column.logical_type.type not in _PLAIN else column.physical_type
-    what = f"the column {shown(column.path)} has {kind.lower() if flat else 'lists'}; allowed are numbers"
-    _require(flat and numbers, path, what)
-
-
-def _check_type(pyarrow: Any, field: Any, path: Path) -> None:
-    kind, types = field.type, pyarrow.types
-    numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_null)
-    what = f"the column {shown(field.name)} has {kind}; allowed are numbers"
-    _require(any(is_kind(kind) for is_kind in numbers), path, what)
+    if not flat or column.physical_type not in _NUMBERS or column.logical_type.type not in _PLAIN:
+        kind = column.physical_type if column.logical_type.type in _PLAIN else column.logical_type.type
+        raise RecordingError(
+            f"{path}: the column {shown(column.path)} has {kind.lower() if flat else 'lists'}; allowed are "
+            "numbers"
+        )
 
 
 register(
@@ -86,5 +84,8 @@ register(
         "Parquet table",
         recognise=lambda head: head.startswith(MAGIC),
         read=lambda path, wanted: read_parquet(path),
+        suffixes=(".parquet",),
+        write=write_parquet,
+        written=(".parquet",),
     )
 )

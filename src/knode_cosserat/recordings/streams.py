@@ -1,22 +1,86 @@
-"""Conversion of time stamps to one clock: order, duplicates, jumps, and clocks that disagree."""
+"""Raw numbers of a recording by topic, read or to be written, and their times on one clock."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from knode_cosserat.recordings.findings import Finding
-from knode_cosserat.recordings.messages import Stream
+from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.findings import Finding, counted
 
 #: largest disagreement of equal clocks, and smallest jump of a clock (s)
 DISAGREEMENT = 0.5
 JUMP = 0.1
+#: smallest implausible time between poses (s): motion capture at 1 to 1,000 Hz whose times are in ms
+SLOW = 1.0
 #: messages separated from the largest group by a longer pause do not belong to the recording (s)
 FAR = 600.0
 #: smallest drift of a clock against another (s), and smallest number of stamps that show one
 DRIFT, FEWEST_STAMPS = 0.01, 20
+
+
+def period(time: Float[np.ndarray, " n"]) -> float:
+    """Return the median time from row to row (s); zero for fewer than two rows."""
+    return float(np.median(np.diff(time))) if len(time) > 1 else 0.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Stream:
+    """Numbers of one topic, in the units and the order of its messages or columns.
+
+    Attributes:
+        topic: name of the topic.
+        stamped: measurement times (ns); -1 without a stamp.
+        received: recording times (ns).
+        values: poses (position and, if known, quaternion, scalar first) or tensions.
+        broken: number of messages that could not be decoded.
+        remarks: findings on the order of its numbers.
+    """
+
+    topic: str
+    stamped: Int[np.ndarray, " n"]
+    received: Int[np.ndarray, " n"]
+    values: Float[np.ndarray, "n size"]
+    broken: int = 0
+    remarks: tuple[Finding, ...] = ()
+
+
+class OutgoingStream(NamedTuple):
+    """Numbers of a topic to be written.
+
+    Attributes:
+        topic: name of the topic.
+        role: role of the numbers.
+        time: times (s).
+        values: poses (position, and quaternion if known), tensions or commands.
+        source: the topic's entry in the configuration; None for poses.
+    """
+
+    topic: str
+    role: Literal["pose", "tension", "command"]
+    time: Any
+    values: Any
+    source: Any = None
+
+
+class Outgoing(NamedTuple):
+    """Recording to be written.
+
+    Attributes:
+        config: configuration of its topics.
+        streams: numbers of the topics.
+        start: time zero on a bag's clock (s since 1970); tables begin at zero.
+        delays: delay from stamp to recording (s) by topic; zero by default.
+    """
+
+    config: RecordingConfig
+    streams: list[OutgoingStream]
+    start: int
+    delays: Mapping[str, float]
 
 
 def offsets(streams: Sequence[Stream]) -> dict[str, float]:
@@ -55,8 +119,8 @@ def measurement_times(
             )
             findings.append(Finding("warning", stream.topic, what))
         else:
-            times[stream.topic], found = _without_jumps(stream)
-            findings += found
+            times[stream.topic], about_jumps = _without_jumps(stream)
+            findings += about_jumps
     return times, [*findings, *_about_drift(streams, times)]
 
 
@@ -112,40 +176,23 @@ def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " 
     """Return the indices of the rows to keep, in order of increasing time, and the findings."""
     findings: list[Finding] = []
     order = np.argsort(time, kind="stable")
-    backwards = int(np.sum(np.diff(time) < 0))
-    if backwards:
-        where = tuple(float(t) for t in time[1:][np.diff(time) < 0][:100])
-        what = f"{_times(backwards)} a stamp is before the one in front of it; the messages were sorted"
-        findings.append(Finding("warning", topic, what, where))
+    backwards = np.diff(time) < 0
+    if backwards.any():
+        count = "once" if backwards.sum() == 1 else f"{backwards.sum()} times"
+        what = f"{count} a stamp is before the one in front of it; the messages were sorted"
+        findings.append(Finding("warning", topic, what, tuple(map(float, time[1:][backwards][:100]))))
     rising = time[order]
     fresh = np.concatenate([np.ones(len(order[:1]), dtype=bool), np.diff(rising) > 0])
     if not fresh.all():
-        what = (
-            f"{_count(int((~fresh).sum()), 'stamp is', 'stamps are')} there twice; the first of each was kept"
-        )
-        findings.append(Finding("warning", topic, what, tuple(float(t) for t in rising[~fresh][:100])))
+        stamps = counted(int((~fresh).sum()), "stamp is", "stamps are")
+        what = f"{stamps} there twice; the first of each was kept"
+        findings.append(Finding("warning", topic, what, tuple(map(float, rising[~fresh][:100]))))
     order = order[fresh]
-    near = _together(time[order])
+    # the largest group without a long pause
+    group = np.concatenate([np.zeros(len(order[:1]), dtype=int), np.cumsum(np.diff(time[order]) > FAR * 1e9)])
+    near = np.asarray(group == np.argmax(np.bincount(group, minlength=1)))
     if not near.all():
-        lost = int((~near).sum())
-        what = (
-            f"{_count(lost, 'message is', 'messages are')} more than {FAR:g} s from the others, and left out"
-        )
+        messages = counted(int((~near).sum()), "message is", "messages are")
+        what = f"{messages} more than {FAR:g} s from the others, and left out"
         findings.append(Finding("warning", topic, what))
     return order[near], findings
-
-
-def _together(time: Int[np.ndarray, " n"]) -> Bool[np.ndarray, " n"]:
-    """Return a mask of the (increasing) times in the largest group without a long pause."""
-    if len(time) == 0:
-        return np.ones(0, dtype=bool)
-    group = np.concatenate([[0], np.cumsum(np.diff(time) > FAR * 1e9)])
-    return np.asarray(group == np.argmax(np.bincount(group)))
-
-
-def _times(count: int) -> str:
-    return "once" if count == 1 else f"{count} times"
-
-
-def _count(count: int, one: str, several: str) -> str:
-    return f"{count} {one if count == 1 else several}"

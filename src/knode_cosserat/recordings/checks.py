@@ -1,0 +1,415 @@
+"""Checks of raw streams: errors that are removed or undone, and implausible values, each with a finding."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.ndimage
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
+
+from knode_cosserat.recordings.config import (
+    MOTOR_UNITS,
+    POSITION_UNITS,
+    TENSION_UNITS,
+    MotorSource,
+    RecordingConfig,
+    TensionSource,
+)
+from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
+from knode_cosserat.recordings.recording import Body, Tensions, bridge
+from knode_cosserat.recordings.streams import SLOW, period
+
+#: smallest jumps that are removed (m, rad, N)
+SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
+#: longest spike of a load cell (s): spikes last one or two messages, a longer change can be a command
+LONGEST_SPIKE = 0.04
+#: smallest number of frames of a body
+FEWEST_FRAMES = 2
+#: plausible range of a tendon robot's tensions (N)
+SLACK, STRONG = 0.12, 120.0
+#: plausible range of a rod's length (m)
+SHORT, LONG = 0.02, 20.0
+#: largest plausible ratio of measured to commanded tensions, or the inverse
+FACTOR = 20.0
+#: largest share of rows with implausible tensions; more of them are no accidents
+RARE = 0.05
+
+_UNITS = {**TENSION_UNITS, **MOTOR_UNITS}
+
+
+@dataclasses.dataclass
+class _Rows:
+    """Rows of a topic from which errors are removed.
+
+    Attributes:
+        topic: name of the topic.
+        time: times (s).
+        values: numbers of each row.
+        findings: findings on what was removed.
+    """
+
+    topic: str
+    time: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, "n size"]
+    findings: list[Finding] = dataclasses.field(default_factory=list)
+
+    def drop(self, wrong: Bool[np.ndarray, " n"], words: Sequence[str], severity: Severity) -> None:
+        """Remove rows, with a finding in words: for one row, for several, and the reason."""
+        one, several, reason = words
+        if wrong.any():
+            self.add(f"{counted(int(wrong.sum()), one, several)} {reason}; left out", severity, wrong)
+            self.time, self.values = self.time[~wrong], self.values[~wrong]
+
+    def drop_unusable(self, wrong: Bool[np.ndarray, " n"], words: Sequence[str]) -> None:
+        """Remove rows with numbers that are not finite or implausibly large, and others that are wrong."""
+        large = ~np.all(np.abs(np.nan_to_num(self.values, nan=np.inf)) < 1e9, axis=1)
+        self.drop(wrong | large, words, "warning")
+
+    def add(self, message: str, severity: Severity, rows: Bool[np.ndarray, " n"]) -> None:
+        """Add a finding on rows."""
+        self.findings.append(Finding(severity, self.topic, message, tuple(self.time[rows][:1000].tolist())))
+
+    def add_pauses(self, longest: float) -> None:
+        """Add a finding on pauses that are too long to be bridged."""
+        steps = np.diff(self.time)
+        long = steps > bridge(self.time, longest)
+        if long.any():
+            begins = self.time[:-1][long]
+            pairs = zip(begins[:3], steps[long][:3], strict=True)
+            listed = ", ".join(f"{begin:.2f} to {begin + step:.2f} s" for begin, step in pairs)
+            more = f" and {len(begins) - 3} more" if len(begins) > 3 else ""
+            pauses = counted(len(begins), "pause", "pauses")
+            what = f"{pauses} too long to be bridged ({listed}{more}): the recording is in parts"
+            self.findings.append(Finding("warning", self.topic, what, tuple(begins.tolist())))
+
+
+# poses
+
+
+def cleaned_body(
+    config: RecordingConfig, source: tuple[str, str, float], time: np.ndarray, pose: np.ndarray, path: str
+) -> tuple[Body, list[Finding]]:
+    """Return a body without errors, in the recording's own frame and units, and the findings.
+
+    Args:
+        config: configuration of the recording.
+        source: name, topic and fraction of the body.
+        time: times (s).
+        pose: positions and, if known, quaternions.
+        path: the file's name in error messages.
+
+    Raises:
+        RecordingError: the body has fewer than two usable frames.
+    """
+    name, topic, fraction = source
+    rows, is_oriented = _Rows(topic, time, pose), pose.shape[1] == 7
+    no_rotation = np.zeros(len(time), dtype=bool)
+    if is_oriented:
+        # some drivers send a zero quaternion while the body is not seen
+        with np.errstate(all="ignore"):
+            no_rotation = ~(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) < 0.05)
+    rows.drop_unusable(no_rotation, ("pose is", "poses are", "not finite, or no rotation"))
+    if config.repeats == "drop":
+        again = np.concatenate([[False], np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)])
+        rows.drop(again[: len(rows.time)], ("pose repeats", "poses repeat", "the one before"), "note")
+    if len(rows.time) < FEWEST_FRAMES:
+        raise RecordingError(
+            f"{path}: topic {topic}: {len(rows.time)} usable poses of {name}; required is {FEWEST_FRAMES} or "
+            "more"
+        )
+    unclear: list[int] = []
+    if is_oriented:
+        quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
+        quaternion, swaps, unclear = swaps_undone(rows.time, quaternion)
+        rows.values = np.concatenate([rows.values[:, :3], quaternion], axis=1)
+        for swap in swaps:
+            when = float(rows.time[swap.row])
+            turned = f"by {swap.angle:.0f} degrees about {swap.axis}"
+            what = f"its axes were swapped at {when:.3f} s, {turned}; undone"
+            rows.findings.append(Finding("warning", topic, what, (when,)))
+    wrong = np.zeros(len(rows.time), dtype=bool)
+    if not config.static:
+        # as many rows as can be bridged, but not most of the filter's window
+        usual = float(np.median(np.diff(rows.time))) or 1.0
+        longest = int(np.clip(config.longest_gap / usual, 1, 4))
+        floor = SMALLEST_SHIFT / POSITION_UNITS[config.position_unit]
+        wrong = outliers(np.diff(rows.values[:, :3], axis=0), rows.time, floor=floor, longest=longest)
+        if is_oriented:
+            turns = rotation_steps(rows.values[:, 3:])
+            wrong |= outliers(turns, rows.time, floor=SMALLEST_TURN, longest=longest)
+    large = [row for row in unclear if not wrong[row - 1 : row + 1].any()]
+    if large:
+        what = f"{counted(len(large), 'turn', 'turns')} too large for a motion, and no swap of axes"
+        mask = np.isin(np.arange(len(wrong)), large)
+        rows.add(f"{what}; left as seen", "warning", mask)
+    rows.drop(wrong, ("pose jumps", "poses jump", "out of the motion and back"), "note")
+    rows.add_pauses(config.longest_gap)
+    orientation = rows.values[:, 3:] if is_oriented else None
+    return Body(name, topic, fraction, rows.time, rows.values[:, :3], orientation), rows.findings
+
+
+# tensions
+
+
+def cleaned_tensions(
+    config: RecordingConfig, seconds: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], path: str
+) -> tuple[Tensions | None, Tensions | None, list[Finding]]:
+    """Return measured and commanded tensions (N, tendon 1 first; None if absent), and the findings.
+
+    Args:
+        config: configuration of the recording.
+        seconds: times (s) by topic.
+        values: numbers by topic.
+        path: the file's name in error messages.
+
+    Raises:
+        RecordingError: messages have another number of tendons, or required tensions have no usable row.
+    """
+    findings: list[Finding] = []
+    both: list[Tensions | None] = []
+    for kind, source in (("measured", config.measured), ("commanded", config.command)):
+        tensions = None
+        if source is not None and source.topic in seconds:
+            topic = source.topic
+            rows = _cleaned_rows(source, seconds[topic], values[topic], kind, path)
+            if len(rows.time):
+                tensions = Tensions(topic, rows.time, rows.values)
+                if kind == "measured":
+                    rows.add_pauses(config.longest_gap)
+            elif config.tensions == kind:
+                raise RecordingError(f"{path}: topic {topic}: no usable {kind} tension")
+            findings += rows.findings
+        both.append(tensions)
+    return both[0], both[1], findings
+
+
+def _cleaned_rows(
+    source: TensionSource | MotorSource, time: np.ndarray, sent: np.ndarray, kind: str, path: str
+) -> _Rows:
+    if len(sent) == 0:
+        return _Rows(
+            source.topic, time, sent, [Finding("warning", source.topic, f"there are no {kind} tensions")]
+        )
+    if sent.shape[1] != len(source.order):
+        raise RecordingError(
+            f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; "
+            f"the configuration's order has {len(source.order)} tendons"
+        )
+    rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * _UNITS[source.unit])
+    rows.drop_unusable(np.zeros(len(time), dtype=bool), ("tension is", "tensions are", "not finite"))
+    if not isinstance(source, TensionSource):
+        return rows
+    is_sample = kind == "measured" and not source.held
+    wrong = implausible_tensions(rows.values)
+    if wrong.any():
+        worst = rows.values[wrong].ravel()
+        what = (
+            f"{counted(int(wrong.sum()), 'row has', 'rows have')} a tension that is not plausible, "
+            f"{worst[np.argmax(np.abs(worst))]:.4g} N among tensions of "
+            f"{np.median(np.abs(rows.values)):.3g} N"
+        )
+        # held tensions are kept, because they last until the next row
+        fate: tuple[str, Severity] = ("left out", "warning") if is_sample else ("kept", "problem")
+        rows.add(f"{what}; {fate[0]}", fate[1], wrong)
+        if is_sample:
+            rows.time, rows.values = rows.time[~wrong], rows.values[~wrong]
+    if is_sample and 0.0 < period(rows.time) <= LONGEST_SPIKE:
+        longest = min(2, int(LONGEST_SPIKE / period(rows.time)))
+        spikes = [
+            outliers(np.diff(tendon)[:, None], rows.time, floor=SMALLEST_PULL, longest=longest)
+            for tendon in rows.values.T
+        ]
+        rows.drop(np.any(spikes, axis=0), ("tension jumps", "tensions jump", "up or down and back"), "note")
+    return rows
+
+
+# outliers
+
+#: threshold of a jump, in standard deviations of the steps around it
+_SIGMAS = 12.0
+#: numbers of steps on each side that measure the variation of the motion: locally, and over a wider window
+_AROUND = (10, 50)
+#: ratio of a normal distribution's standard deviation to its median absolute value
+NORMAL = 1.4826
+
+
+def outliers(
+    steps: Float[np.ndarray, "m size"], time: Float[np.ndarray, " n"], *, floor: float, longest: int
+) -> Bool[np.ndarray, " n"]:
+    """Return a mask of rows that jump out of a signal and back again within `longest` rows.
+
+    A jump is a step that differs from the steps around it. The rows between two jumps that cancel are
+    outliers. Even fast motion does not return to its expected position in one step.
+
+    Args:
+        steps: change from each row to the next (m = n - 1).
+        time: times of the rows (s), increasing.
+        floor: smallest size of a jump.
+        longest: largest number of consecutive outliers.
+    """
+    mask = np.zeros(len(time), dtype=bool)
+    # no jump is larger than two steps
+    if len(steps) < 5 or 2.0 * np.max(np.linalg.norm(steps, axis=1)) < floor:
+        return mask
+    dt = np.diff(time)[:, None]
+    # filter the rate, because some frames are missing
+    expected = scipy.ndimage.median_filter(steps / dt, size=(9, 1), mode="nearest") * dt
+    jump = steps - expected
+    size = np.linalg.norm(jump, axis=1)
+    windows = [min(2 * around + 1, len(size)) for around in _AROUND]
+    medians = [scipy.ndimage.median_filter(size, size=window, mode="nearest") for window in windows]
+    jumps = np.flatnonzero(size > np.maximum(floor, _SIGMAS * NORMAL * np.max(medians, axis=0)))
+    for out, back in itertools.pairwise(jumps):
+        returns = np.linalg.norm(jump[out] + jump[back]) < 0.5 * min(size[out], size[back])
+        if back - out <= longest and returns and not mask[out]:
+            mask[out + 1 : back + 1] = True
+    return mask
+
+
+def rotation_steps(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
+    """Return the rotation vectors from row to row (rad)."""
+    rotation = Rotation.from_quat(quaternion, scalar_first=True)
+    return (rotation[:-1].inv() * rotation[1:]).as_rotvec()
+
+
+# swapped axes
+
+
+class Swap(NamedTuple):
+    """Swap of a body's axes at a row; it also applies to all later rows.
+
+    Attributes:
+        row: index of the row.
+        angle: angle of the swap (degrees).
+        axis: its rotation axis in the body's axes.
+    """
+
+    row: int
+    angle: float
+    axis: tuple[int, ...]
+
+
+#: largest rotation by motion between two frames (rad): a larger one cannot be distinguished from a swap
+_LARGEST_TURN = np.radians(45.0)
+#: smallest tolerance of a swap about a multiple of 90 degrees, for motion between the two frames (rad)
+_MOVED = np.radians(15.0)
+#: rotation group of the cube, the identity first
+_CUBE = Rotation.create_group("O")
+
+
+def swaps_undone(
+    time: Float[np.ndarray, " n"], quaternion: Float[np.ndarray, "n 4"]
+) -> tuple[Float[np.ndarray, "n 4"], list[Swap], list[int]]:
+    """Return orientations without swapped axes, the swaps, and the rows of other large rotations.
+
+    Between two frames a swap rotates a body by one of the 23 rotations of a cube, plus its motion. The
+    neighbouring rotations bound that motion. A large rotation is left unchanged if it is not a multiple of
+    90 degrees, or if the motion is too fast to decide.
+
+    Args:
+        time: times of the rows (s), increasing.
+        quaternion: orientation of the body, scalar first.
+    """
+    rotation = Rotation.from_quat(quaternion, scalar_first=True)
+    turn = rotation[:-1].inv() * rotation[1:] if len(time) > 1 else rotation[:0]
+    angle = np.asarray(turn.magnitude())
+    rate = np.where(angle > _LARGEST_TURN, 0.0, angle / np.diff(time))
+    undo = Rotation.identity()
+    pieces: list[Rotation] = []
+    swaps: list[Swap] = []
+    unclear: list[int] = []
+    begin = 0
+    for step in np.flatnonzero(angle > _LARGEST_TURN):
+        # bound on the body's own rotation: the fastest rate nearby, over the time between the two frames
+        moved = np.max(rate[max(0, step - 10) : step + 11], initial=0.0) * (time[step + 1] - time[step])
+        error = np.asarray((_CUBE.inv() * turn[step]).magnitude())
+        nearest = int(np.argmin(error))
+        is_identity = _CUBE[nearest].magnitude() < 1e-6
+        if is_identity or error[nearest] > max(_MOVED, 1.5 * moved) or moved > _LARGEST_TURN:
+            unclear.append(int(step) + 1)
+            continue
+        pieces.append(rotation[begin : step + 1] * undo)
+        begin = int(step) + 1
+        # rotations are measured in the swapped axes: undo the swaps in reverse order
+        undo = _CUBE[nearest].inv() * undo
+        axis = np.sign(np.round(_CUBE[nearest].as_rotvec(), 6)).astype(int).tolist()
+        swaps.append(Swap(begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))
+    if not swaps:
+        return quaternion, [], unclear
+    pieces.append(rotation[begin:] * undo)
+    return Rotation.concatenate(pieces).as_quat(scalar_first=True), swaps, unclear
+
+
+# plausibility
+
+
+def implausible_sizes(
+    bodies: Sequence[Body],
+    tensions: tuple[Tensions | None, Tensions | None],
+    at_rest: Float[np.ndarray, "M 3"] | None,
+    *,
+    is_static: bool,
+) -> list[Finding]:
+    """Return findings on implausible times and units, with the likely error.
+
+    Args:
+        bodies: bodies in the robot's frame.
+        tensions: measured and commanded tensions.
+        at_rest: positions of the bodies at rest (m), if known.
+        is_static: True if rows are equilibria, whose times are arbitrary.
+    """
+    findings, sizes = [], []
+    for stream, is_measured in zip(tensions, (True, False), strict=True):
+        if stream is None:
+            continue
+        size = float(np.median(np.abs(stream.tension)))
+        sizes.append(size)
+        if 0.0 < size < SLACK or size > STRONG:
+            hint = "newtons read as grams-force" if size < SLACK else "grams-force read as newtons"
+            what = f"tensions of {size:.3g} N are not plausible: are {hint}?"
+            findings.append(Finding("problem", stream.topic, what))
+        elif is_measured and np.median(stream.tension.min(axis=1)) < -SLACK:
+            findings.append(Finding("warning", stream.topic, "tensions are below zero: is the sign right?"))
+    if len(sizes) == 2 and min(sizes) > 0.0 and max(sizes) > FACTOR * min(sizes):
+        what = (
+            f"measured tensions are {sizes[0]:.3g} N and commanded ones {sizes[1]:.3g} N: not the same unit?"
+        )
+        findings.append(Finding("problem", "", what))
+    places = [np.median(body.position, axis=0) for body in bodies] if at_rest is None else at_rest
+    far = float(np.linalg.norm(places, axis=1).max())
+    if not SHORT < far < LONG:
+        what = (
+            f"the bodies are up to {far:.3g} m from the clamped end: are positions in the unit that is said?"
+        )
+        findings.append(Finding("problem", "", what))
+    time = min((body.time for body in bodies), key=period)
+    if not is_static and SLOW <= period(time) < np.inf:
+        what = (
+            f"poses are {period(time):.3g} s apart, and the recording takes "
+            f"{(time[-1] - time[0]) / 3600.0:.2g} h: are the times in ms? "
+            "(Rows of shapes at rest need static: true.)"
+        )
+        findings.append(Finding("problem", "", what))
+    return findings
+
+
+def implausible_tensions(newtons: Float[np.ndarray, "n tendons"]) -> Bool[np.ndarray, " n"]:
+    """Return a mask of rows with a tension that no tendon has, among tensions that are plausible.
+
+    It is below zero by more than the usual tension, because a tendon cannot push, or above `STRONG` and more
+    than `FACTOR` times the usual one. The usual tension is the median of those that are not zero.
+    """
+    none = np.zeros(len(newtons), dtype=bool)
+    size = np.abs(newtons)
+    if not np.any(size > 0.0):
+        return none
+    usual = float(np.median(size[size > 0.0]))
+    if not SLACK <= usual <= STRONG or np.median(newtons[size > 0.0]) < 0.0:
+        return none
+    rows = np.any((newtons < -usual) | (newtons > max(STRONG, FACTOR * usual)), axis=1)
+    return rows if np.mean(rows) <= max(RARE, 1.0 / len(rows)) else none
