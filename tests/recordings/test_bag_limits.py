@@ -10,11 +10,10 @@ import time
 import numpy as np
 import pytest
 from backports import zstd
-from knode_cosserat.learning.files.container import ContainerError
-from knode_cosserat.learning.files.unpacking import MOST_NESTED, _depth
 
 from knode_cosserat._files.limits import MORE, VARIABLE
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.io.container import MOST_NESTED, ContainerError, nesting
 from knode_cosserat.recordings import RecordingError, content, load_recording
 from knode_cosserat.recordings.content import ALLOWANCE, EXPANDED, RATIO, Decompression
 from knode_cosserat.recordings.formats import bag
@@ -192,6 +191,6 @@ def test_messages_with_more_bytes_than_the_file(tmp_path, monkeypatch):
 
 
 def test_depth_of_a_header_is_known_before_it_is_read():
-    assert _depth(b'{"a": [[1], {"b": []}]}') == 4
-    assert _depth(b"[" * 3500) > MOST_NESTED
+    assert nesting('{"a": [[1], {"b": []}]}') == 4
+    assert nesting("[" * 3500) > MOST_NESTED
     assert issubclass(ContainerError, ValueError)

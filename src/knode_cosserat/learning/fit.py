@@ -187,7 +187,7 @@ def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitCon
         c0 = None
         if options.history and trajectories:
             first = trajectories[0]
-            c0 = coefficient_table(settings_of(first), first.dt)[1].flat[0]
+            c0 = coefficient_table(settings_of(first), first.dt)[-1].flat[0]
         keys = map(jax.random.key, config.seeds)
         networks = [network(knowledge.strand, options, key, c0) for key in keys]
         if options.standardised and dataset is not None:

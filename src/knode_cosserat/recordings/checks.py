@@ -21,6 +21,7 @@ from knode_cosserat.recordings.config import (
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
+from knode_cosserat.recordings.frame import NORMAL, rotation_steps
 from knode_cosserat.recordings.recording import Body, Tensions, bridge
 from knode_cosserat.recordings.streams import SLOW, period
 
@@ -234,8 +235,6 @@ def _cleaned_rows(
 _SIGMAS = 12.0
 #: numbers of steps on each side that measure the variation of the motion: locally, and over a wider window
 _AROUND = (10, 50)
-#: ratio of a normal distribution's standard deviation to its median absolute value
-NORMAL = 1.4826
 
 
 def outliers(
@@ -269,12 +268,6 @@ def outliers(
         if back - out <= longest and returns and not mask[out]:
             mask[out + 1 : back + 1] = True
     return mask
-
-
-def rotation_steps(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
-    """Return the rotation vectors from row to row (rad)."""
-    rotation = Rotation.from_quat(quaternion, scalar_first=True)
-    return (rotation[:-1].inv() * rotation[1:]).as_rotvec()
 
 
 # swapped axes

@@ -16,6 +16,8 @@ from knode_cosserat.recordings.findings import Finding
 if TYPE_CHECKING:
     from knode_cosserat.recordings.recording import Body
 
+#: ratio of a normal distribution's standard deviation to its median absolute value
+NORMAL = 1.4826
 #: shortest rest for the calibration of a body's axes (s), and smallest number of frames
 SHORTEST_REST, FEWEST_FRAMES = 0.2, 5
 #: largest displacement of a resting body (m), beyond its noise
@@ -285,3 +287,9 @@ def _rms_angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> floa
     """Return the root mean square of the angles (rad) between unit vectors."""
     angle = np.arctan2(np.linalg.norm(np.cross(a, b), axis=1), np.sum(a * b, axis=1))
     return float(np.sqrt(np.mean(angle**2)))
+
+
+def rotation_steps(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m 3"]:
+    """Return the rotation vectors from row to row (rad)."""
+    rotation = Rotation.from_quat(quaternion, scalar_first=True)
+    return (rotation[:-1].inv() * rotation[1:]).as_rotvec()

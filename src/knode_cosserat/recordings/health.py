@@ -10,9 +10,8 @@ import scipy.optimize
 import scipy.signal
 from jaxtyping import Float
 
-from knode_cosserat.recordings.checks import NORMAL, rotation_steps
 from knode_cosserat.recordings.findings import Finding
-from knode_cosserat.recordings.frame import rest_mask, rest_positions, rod_lengths
+from knode_cosserat.recordings.frame import NORMAL, rest_mask, rest_positions, rod_lengths, rotation_steps
 from knode_cosserat.recordings.streams import period
 
 if TYPE_CHECKING:

@@ -110,7 +110,7 @@ def strains_of(robot: System, rows: KnownRows, settings: Settings, dt: float) ->
 
     `rows.y` must be complete; `rows.z` is ignored. The first row is assumed to be at rest.
     """
-    coefficients = coefficient_table(settings, dt)[1]
+    coefficients = coefficient_table(settings, dt)[-1]
     return np.asarray(_strains(robot, _padded(rows), coefficients))[: len(rows.t)]
 
 
@@ -151,7 +151,7 @@ def semi_discretised(
     Rates come from the time scheme and earlier rows. The history of the first row is constant (paper,
     section 3).
     """
-    coefficients = coefficient_table(settings, dt)[1]
+    coefficients = coefficient_table(settings, dt)[-1]
     records = np.asarray(_semi_discretised(robot, *_padded((t, control, known)), coefficients))[: len(t)]
     ny = robot.y_layout.size
     return records[..., :ny], records[..., ny:]
