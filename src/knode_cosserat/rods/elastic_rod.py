@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.parameters import parameter, part
+from knode_cosserat.rods.parameters import parameter, slot
 from knode_cosserat.rods.section import (
     ALONG,
     CircularSection,
@@ -68,13 +68,17 @@ class ElasticRod(System):
     bending_stiffness: Any = parameter(
         "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
     )
-    sections: tuple[SectionChange, ...] = part(
+    sections: tuple[SectionChange, ...] = slot(
         "where the section differs", SectionChange, many=True, default=()
     )
 
     @abc.abstractmethod
     def section_controls(self, control: Any) -> list[Any]:
         """Return the control of each section."""
+
+    @abc.abstractmethod
+    def with_internal(self, strains: Float[Any, "6"]) -> Float[Any, " z"]:
+        """Return z with these strains without stress."""
 
     # derived quantities
 
@@ -140,8 +144,10 @@ class ElasticRod(System):
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
         """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
-        _, z = self.rest(s)
-        return z.at[3:6].set(self.material(s, control).u_star) if self.sections else z
+        strains = self.rest(s)[1][:6]
+        return self.with_internal(
+            strains.at[3:6].set(self.material(s, control).u_star) if self.sections else strains
+        )
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return the sections' factors on stiffness and damping; None without sections."""
@@ -150,7 +156,8 @@ class ElasticRod(System):
         found = self._differences(s, control)
         area = found.radius * found.radius
         damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        return damping * found.stiffness, damping
+        others = jnp.ones(self.z_layout.size - 6)
+        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
 
     # the law of the strains
 

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import choice, parameter, place
-from knode_cosserat.rods.parts import Part, require_stretch
+from knode_cosserat.rods.parts import Part, RodPoint, Wrench, require_stretch
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 
@@ -39,16 +39,6 @@ class Motion(NamedTuple):
         """Return the motion from a packed y and its rate."""
         p, h, q, w = (layout.get(y, name) for name in ("p", "h", "q", "w"))
         return cls(p, rotation_matrix(h), q, w, layout.get(y_t, "q"), layout.get(y_t, "w"))
-
-
-class Wrench(NamedTuple):
-    """A force (N, or N/m) and a moment (N·m, or N) about the axis, global frame."""
-
-    force: Float[Any, "3"]
-    moment: Float[Any, "3"]
-
-    def __add__(self, other: Any) -> Wrench:
-        return Wrench(self.force + other.force, self.moment + other.moment)
 
 
 class Body(NamedTuple):
@@ -100,6 +90,16 @@ class PointLoad(Load):
     at: float = place("where it acts", default=1.0)
 
     @property
+    def applied_at(self) -> float:  # type: ignore[override]
+        """Place where it acts."""
+        return self.at
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Place where it acts."""
+        return (self.at,)
+
+    @property
     def body(self) -> Body | None:
         """The load as a rigid body about the rod's axis, or None. Bodies at one place are summed."""
         return None
@@ -119,9 +119,23 @@ class SpreadLoad(Load):
         super().__check_init__()
         require_stretch(self.begin, self.end, type(self).__name__)
 
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Places where it begins and ends."""
+        return tuple(end for end in (self.begin, self.end) if end > 0.0)
+
+    def load(self, point: RodPoint) -> Wrench:
+        """Return the load on the rod per length, zero outside of its stretch."""
+        wrench = self.wrench(point.motion, point.input)
+        if (self.begin, self.end) == (0.0, 1.0):
+            return wrench
+        length = point.rod.length
+        acts = (point.s >= self.begin * length) & (point.s <= self.end * length)
+        return Wrench(*(jnp.where(acts, term, 0.0) for term in wrench))
+
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """Return the load on the rod per length (N/m, N)."""
+        """Return the load on the rod per length (N/m, N) within its stretch."""
 
 
 _FOLLOWS = "whether it turns with the rod"

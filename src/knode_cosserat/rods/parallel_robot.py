@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.rod import Rod
@@ -34,6 +35,8 @@ FIELDS = (3, 7, 10, 13, 16)
 class Leg(Rod):
     """The rod between base and platform. Its control is the control of the whole robot."""
 
+    y_layout: ClassVar[Layout] = ElasticRod.y_layout
+    z_layout: ClassVar[Layout] = ElasticRod.z_layout
     base_unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
 
     legs: int = eqx.field(static=True, default=6)

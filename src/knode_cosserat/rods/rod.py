@@ -6,7 +6,8 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Self
+import functools
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,19 +15,12 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
+from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.loads import (
-    Load,
-    Motion,
-    PointLoad,
-    SpreadLoad,
-    Wrench,
-    point_wrench,
-    square_law_drag,
-)
-from knode_cosserat.rods.parameters import ParameterError, parameter, part
-from knode_cosserat.rods.parts import prefixed_fields, shares
-from knode_cosserat.rods.section import INWARD, shape_at_rest
+from knode_cosserat.rods.loads import Load, Motion, point_wrench, square_law_drag
+from knode_cosserat.rods.parameters import ParameterError, parameter, slot, slots_of
+from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
+from knode_cosserat.rods.section import INWARD, SectionChange, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
@@ -36,24 +30,17 @@ FIRST_ROOT = 1.875104068711961
 #: drag × length over mass per length, below which drag is weak: the damping ratio at an amplitude of a
 #: tenth of the length is then below 0.2 %
 WEAK_DRAG = 0.05
+#: control of a part that has none
+NO_CONTROL = np.zeros(0)
 #: default pose of the base
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class PartControls(NamedTuple):
-    """Controls of a rod's parts; sections and loads in their order."""
-
-    base: Any
-    tip: Any
-    sections: list[Any]
-    loads: list[Any]
-
-
 class Rod(ElasticRod):
-    """A round rod with gravity, drag, loads, ends and surroundings.
+    """A round rod with gravity, drag, loads, ends, surroundings and further effects.
 
-    A subclass defines its actuators by its own `constitutive` law, or by their load on the rod,
-    `actuator_force`.
+    All other terms of its equations are contributions of its `parts`. A subclass adds parts of its own, such
+    as actuators.
     """
 
     mixed: ClassVar[bool] = False
@@ -71,51 +58,81 @@ class Rod(ElasticRod):
         high=100.0,
         default=(0.0, 0.0, -9.81),
     )
-    loads: tuple[Load, ...] = part("what loads it beside gravity and drag", Load, many=True, default=())
-    surroundings: tuple[Obstacle, ...] = part("what it may touch", Obstacle, many=True, default=())
-    base_end: End = part("what holds it at s = 0", End, default=Clamped())
-    tip_end: End = part("what holds it at s = length", End, default=Free())
+    loads: tuple[Load, ...] = slot("what loads it beside gravity and drag", Load, many=True, default=())
+    surroundings: tuple[Obstacle, ...] = slot("what it may touch", Obstacle, many=True, default=())
+    effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
+    base_end: End = slot("what holds it at s = 0", End, default=Clamped())
+    tip_end: End = slot("what holds it at s = length", End, default=Free())
 
     def __check_init__(self) -> None:
         if not self.base_end.anywhere:
             raise ParameterError(f"base_end is {self.base_end.kind}; that is allowed as tip_end only")
 
-    # derived quantities
+    # parts
 
-    @property
+    @functools.cached_property
+    def parts(self) -> dict[str, Contribution]:
+        """Parts of the robot (`list_parts`)."""
+        return self.list_parts()
+
+    def list_parts(self) -> dict[str, Contribution]:
+        """Return the parts by the prefix of their controls, in the order of their fields in y, z and control.
+
+        A subclass adds its own to these.
+        """
+        several: Any = {
+            "section": self.sections, "obstacle": self.surroundings, "load": self.loads,
+            "effect": self.effects,
+        }  # fmt: skip
+        ends = {"base": self.base_end, "tip": self.tip_end}
+        return ends | {f"{name}{k}": each for name, those in several.items() for k, each in enumerate(those)}
+
+    @functools.cached_property
+    def y_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of y: that of the rod, then the parts' fields."""
+        return ElasticRod.y_layout + Layout(*(f for part in self.parts.values() for f in part.y_fields(self)))
+
+    @functools.cached_property
+    def z_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of z: that of the rod, then the parts' fields."""
+        return ElasticRod.z_layout + Layout(*(f for part in self.parts.values() for f in part.z_fields(self)))
+
+    @functools.cached_property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Unknown fields of y at the base."""
-        return self.base_end.unknowns
+        """Unknown fields of y at the base: those of its end, then of the parts."""
+        others = (name for part in self.parts.values() for name in part.base_fields(self))
+        return (*self.base_end.unknowns, *others)
 
-    @property
-    def actuator_layout(self) -> Layout:
-        """Layout of the actuators' controls; empty by default."""
-        return Layout()
-
-    @property
+    @functools.cached_property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the actuators' controls, then the controls of ends, sections and loads."""
-        driven = [
-            field for prefix, each in self._driven for field in prefixed_fields(each.control_fields, prefix)
-        ]
-        return Layout(*self.actuator_layout.fields, *driven)
+        """Layout of the parts' controls."""
+        return Layout(
+            *(
+                field if part.actuates else field._replace(name=f"{name}_{field.name}")
+                for name, part in self.parts.items()
+                for field in part.control_fields
+            )
+        )
 
-    @property
-    def _driven(self) -> list[tuple[str, Any]]:
-        """Parts that may have controls, each with the prefix of its controls' names."""
-        ends = [("base", self.base_end), ("tip", self.tip_end)]
-        sections = [(f"section{k}", each) for k, each in enumerate(self.sections)]
-        return [*ends, *sections, *((f"load{k}", each) for k, each in enumerate(self.loads))]
-
-    def _controls(self, control: Any) -> PartControls:
-        """Return the control of each part."""
-        spots = shares(tuple(each for _, each in self._driven), self.actuator_layout.size)
-        base, tip, *others = (control[spot] for spot in spots)
-        return PartControls(base, tip, others[: len(self.sections)], others[len(self.sections) :])
+    def inputs(self, control: Any) -> list[tuple[Contribution, Any]]:
+        """Return the parts, each with its control."""
+        found, first = [], 0
+        for part in self.parts.values():
+            last = first + sum(field.size for field in part.control_fields)
+            # an empty slice would only be traced
+            found.append((part, control[first:last] if last > first else NO_CONTROL))
+            first = last
+        return found
 
     def section_controls(self, control: Any) -> list[Any]:
         """Return the control of each section."""
-        return self._controls(control).sections
+        return [own for part, own in self.inputs(control) if isinstance(part, SectionChange)]
+
+    def _end_controls(self, control: Any) -> list[Any]:
+        """Return the controls of the ends."""
+        return [own for part, own in self.inputs(control) if isinstance(part, End)]
+
+    # derived quantities
 
     @property
     def rest_is_guess(self) -> bool:  # type: ignore[override]
@@ -125,18 +142,15 @@ class Rod(ElasticRod):
     @property
     def held(self) -> bool:  # type: ignore[override]
         """True if an end is constrained, or there is an obstacle on which the rod may lie."""
-        return self.base_end.held or self.tip_end.held or bool(self.surroundings)
+        return any(part.held for part in self.parts.values())
 
     @property
     def is_undamped(self) -> bool:
         """True if no parameter, part or internal variable damps a motion; weak drag does not count."""
         values = (self.bending_damping, self.shear_damping, self.linear_drag)
-        internal = not set(self.z_layout.names) <= {"v", "u"}  # friction, relaxation
-        if (
-            internal
-            or self.surroundings
-            or any(value is not None and np.any(np.asarray(value)) for value in values)
-        ):
+        damped = any(value is not None and np.any(np.asarray(value)) for value in values)
+        parts = self.parts.values()
+        if damped or any(part.damps or part.z_fields(self) for part in parts):
             return False
         drag = np.max(np.asarray(self.drag)) * np.max(self.length)
         return bool(drag < WEAK_DRAG * np.min(self.mass_per_length))
@@ -147,13 +161,28 @@ class Rod(ElasticRod):
         EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
         return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
-    def eased(self, part: float) -> Self:
-        """Return the rod with smoothed contact and friction on its obstacles."""
-        if not self.surroundings:
-            return self
-        return self.replace(surroundings=tuple(each.eased(part) for each in self.surroundings))
-
     # observables for learning
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the controls of the parts in the form in which they enter the equations."""
+        return jnp.concatenate([part.actuation(self, own) for part, own in self.inputs(control)])
+
+    @property
+    def has_actuation(self) -> bool:
+        """True if that differs from the control."""
+        plain = Contribution.actuation
+        return any(type(part).actuation is not plain for part in self.parts.values())
+
+    def eased(self, part: float) -> Self:
+        """Return the rod with eased parts: smoothed contact, and friction that builds up slowly."""
+        changes = {}
+        for name in slots_of(type(self)):
+            held = getattr(self, name)
+            several = held if isinstance(held, tuple) else (held,)
+            easier = tuple(each and each.eased(part) for each in several)
+            if any(new is not old for new, old in zip(easier, several, strict=True)):
+                changes[name] = easier if isinstance(held, tuple) else easier[0]
+        return self.replace(**changes) if changes else self
 
     @property
     def observable_layout(self) -> Layout:
@@ -177,20 +206,30 @@ class Rod(ElasticRod):
         bent = u - self.material(s, control).u_star
         return jnp.concatenate([acceleration, spin, q, w, bent, u_t])
 
-    # the paper's equations
+    # the equations
 
-    def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"] | None:
-        """Return the actuators' load per length (N/m), global frame; None by default."""
-        return None
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """Return the law of v and u, linear but for the parts, and of internal variables."""
+        point = RodPoint(self, s, t, y, y_t, control, material=self.material(s, control))
+        parts = [(part, point._replace(input=own)) for part, own in self.inputs(control)]
+        evolutions = {name: law for part, own in parts for name, law in part.evolutions(own).items()}
+
+        def law(internal: Fields) -> MaterialLaw:
+            found = self.linear_law(s, y, control)
+            for part, own in parts:
+                found = part.law(own, found, internal)
+            return found
+
+        return InternalState(evolutions, law) if evolutions else law({})
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s (paper eq. 10, spatial derivatives of the rod)."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
-        motion = Motion.of(self.y_layout, y, y_t)
+        motion, material = Motion.of(self.y_layout, y, y_t), self.material(s, control)
         _, R, q, w, q_t, w_t = motion
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         v_t, u_t = self.z_layout.get(z_t, "v"), self.z_layout.get(z_t, "u")
-        *_, rhoA, rhoJ, radius = self.material(s, control)
+        rhoA, rhoJ = material.rhoA, material.rhoJ
         dragged = square_law_drag(self.drag, q)
         if self.linear_drag is not None:
             dragged = dragged + dot(self.linear_drag, q)
@@ -201,63 +240,44 @@ class Rod(ElasticRod):
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
         q_s = v_t - cross(u, q) + cross(w, v)
         w_s = u_t - cross(u, w)
-        pushed = self.actuator_force(control)
-        if pushed is not None:
-            n_s = n_s - pushed
-        for load in self._distributed(s, motion, radius, control):
-            n_s, m_s = n_s - load.force, m_s - load.moment
-        return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s])
-
-    def _distributed(self, s: Any, motion: Motion, radius: Any, control: Any) -> list[Wrench]:
-        """Return the wrenches of loads and surroundings, per length."""
-        found = [obstacle.wrench(motion, radius) for obstacle in self.surroundings]
-        for load, own in zip(self.loads, self._controls(control).loads, strict=True):
-            if not isinstance(load, SpreadLoad):
-                continue
-            wrench = load.wrench(motion, own)
-            if (load.begin, load.end) != (0.0, 1.0):
-                acts = (s >= load.begin * self.length) & (s <= load.end * self.length)
-                wrench = Wrench(*(jnp.where(acts, each, 0.0) for each in wrench))
-            found.append(wrench)
-        return found
+        point = RodPoint(self, s, t, y, y_t, control, None, z, z_t, material, motion)
+        rates: Fields = {}
+        for part, own in self.inputs(control):
+            at = point._replace(input=own)
+            load = part.load(at)
+            if load is not None:
+                n_s, m_s = n_s - load.force, m_s - load.moment
+            rates |= part.rates(at)
+        return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
 
     # discontinuities: places where something begins, ends or pulls
 
-    @property
+    @functools.cached_property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Places where loads and sections begin or end, and where point loads act."""
-        stretches: list[Any] = [
-            *self.sections,
-            *(load for load in self.loads if isinstance(load, SpreadLoad)),
-        ]
-        found = {end for each in stretches for end in (each.begin, each.end)}
-        found -= {0.0}
-        found |= {load.at for load in self.loads if isinstance(load, PointLoad)}
-        return tuple(sorted(cut for cut in found if cut < 1.0))
+        """Places before the tip where parts begin or end, or loads act."""
+        return tuple(sorted({cut for part in self.parts.values() for cut in part.cuts if cut < 1.0}))
 
     @property
     def jumps(self) -> bool:  # type: ignore[override]
         """True if a point load acts before the tip."""
-        return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
+        return any(part.applied_at in self.cuts for part in self.parts.values())
 
     def jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
-        places = {cut: k for k, cut in enumerate(self.cuts)}
-        weights = {k: acting[places[load.at]] for k, load in self._points() if load.at in places}
-        wrench = self._point_wrench(weights, y, y_t, control)
+        wrench = self._point_wrench(dict(zip(self.cuts, acting, strict=True)), y, y_t, control)
         change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
         return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
 
-    def _points(self) -> list[tuple[int, PointLoad]]:
-        return [(k, load) for k, load in enumerate(self.loads) if isinstance(load, PointLoad)]
-
     def _point_wrench(self, weights: Any, y: Any, y_t: Any, control: Any) -> Wrench:
-        """Return the sum of the point loads, each times its weight."""
-        controls = self._controls(control).loads
+        """Return the sum of the point loads, each times the weight of its place."""
         motion = Motion.of(self.y_layout, y, y_t)
-        acting = [(self.loads[k], weight, controls[k]) for k, weight in weights.items()]
+        acting = [
+            (part, weights[part.applied_at], own)
+            for part, own in self.inputs(control)
+            if part.applied_at in weights
+        ]
         return point_wrench(acting, motion, self.gravity)
 
     # the two ends, and rest
@@ -265,13 +285,20 @@ class Rod(ElasticRod):
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y and z of the unloaded rod at rest: straight, or with the sections' curvature."""
         s = jnp.asarray(s, dtype=float)
-        p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, self._no_control(0)), s)
-        y = jnp.concatenate([p, h, np.zeros(self.y_layout.size - 7)])
-        return y, jnp.concatenate([self.v_star, u])
+        still, _ = self._end_controls(np.zeros(self.control_layout.size))
+        p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, still), s)
+        more: Fields = {}
+        for part in self.parts.values():
+            more |= part.rest_y(self, s)
+        y = jnp.concatenate([p, h, np.zeros(12), *_ordered(more, self.y_layout)])
+        return y, self.with_internal(jnp.concatenate([self.v_star, u]))
 
-    def _no_control(self, k: int) -> np.ndarray:
-        """Return the zero control of the k-th driven part."""
-        return np.zeros(sum(field.size for field in self._driven[k][1].control_fields))
+    def with_internal(self, strains: Float[Any, "6"]) -> Float[Any, " z"]:
+        """Return z with these strains without stress, and the internal variables of the parts at rest."""
+        z: Fields = {}
+        for part in self.parts.values():
+            z |= part.rest_z(self, strains)
+        return jnp.concatenate([strains, *_ordered(z, self.z_layout, 2)])
 
     def _rest_shape(self, base: Pose, s: Any) -> tuple[Any, Any, Any]:
         if not self.sections:
@@ -292,7 +319,7 @@ class Rod(ElasticRod):
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
-        held = self.base_end.pose(AT_ORIGIN, self._controls(control).base)
+        held = self.base_end.pose(AT_ORIGIN, self._end_controls(control)[0])
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
         return self.y_layout.replaced(y, self.base_unknowns, unknowns)
 
@@ -305,8 +332,8 @@ class Rod(ElasticRod):
 
     def end_poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
         """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
-        controls, rest = self._controls(control), self._pose(self.rest(self.length)[0])
-        ends = (self.base_end, AT_ORIGIN, controls.base), (self.tip_end, rest, controls.tip)
+        controls, rest = self._end_controls(control), self._pose(self.rest(self.length)[0])
+        ends = zip((self.base_end, self.tip_end), (AT_ORIGIN, rest), controls, strict=True)
         base, tip = (end.pose(at, own) if isinstance(end, Clamped) else None for end, at, own in ends)
         return base, tip
 
@@ -316,43 +343,46 @@ class Rod(ElasticRod):
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
-        at_tip = {k: 1.0 for k, load in self._points() if load.at == 1.0}
-        if at_tip:
-            loaded = self._point_wrench(at_tip, y, y_t, control)
+        if any(part.applied_at == 1.0 for part in self.parts.values()):
+            loaded = self._point_wrench({1.0: 1.0}, y, y_t, control)
             n, m = n - loaded.force, m - loaded.moment
         if type(self.tip_end) is Free:
-            left = jnp.concatenate([-n, -m])
+            rows = [-n, -m]
         else:
             rest = self._pose(self.rest(self.length)[0])
-            held = self.tip_end.pose(rest, self._controls(control).tip)
-            left = self.tip_end.left(held, self._pose(y), n, m)
-        if "h" not in self.base_unknowns:
-            return left
-        h = self.y_layout.get(y, "h")
-        return jnp.concatenate([left, jnp.sum(h * h)[None] - 1.0])
+            held = self.tip_end.pose(rest, self._end_controls(control)[1])
+            rows = [self.tip_end.left(held, self._pose(y), n, m)]
+        if "h" in self.base_unknowns:
+            h = self.y_layout.get(y, "h")
+            rows.append(jnp.sum(h * h)[None] - 1.0)
+        point = RodPoint(self, self.length, t, y, y_t, control)
+        others = (part.tip_rows(point._replace(input=own)) for part, own in self.inputs(control))
+        return jnp.concatenate([*rows, *(row for row in others if row is not None)])
 
     @property
     def tip_layout(self) -> Layout:
-        """Layout of the tip's conditions: force and moment, or the constrained pose."""
-        fields = self.tip_end.conditions
+        """Layout of the tip's conditions: force and moment, or the constrained pose; then the parts'."""
+        fields: list[Any] = [*self.tip_end.conditions]
         if "h" in self.base_unknowns:
-            fields = (*fields, ("norm", 1, "1", "square of the length of the quaternion, less one"))
-        return Layout(*fields)
+            fields.append(("norm", 1, "1", "square of the length of the quaternion, less one"))
+        return Layout(*fields, *(field for part in self.parts.values() for field in part.tip_fields(self)))
 
     def scales(self) -> Scales:
         """Return the scales of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
         L, EI = self.length, self.Kbt[0, 0]
         T = L * L * jnp.sqrt(self.mass_per_length / EI)
-        sizes = {
-            "p": L, "h": 1.0, "n": EI / (L * L), "m": EI / L, "q": L / T, "w": 1.0 / T,
-            "turn": 1.0, "norm": 1.0,
-        }  # fmt: skip
+        sizes: Fields = {"p": L, "n": EI / (L * L), "m": EI / L, "q": L / T, "w": 1.0 / T}
+        for part in self.parts.values():
+            sizes |= part.scales(self, sizes)
 
         def of(layout: Layout) -> Any:
-            return jnp.concatenate([jnp.full(f.size, self.scale_of(f.name, sizes)) for f in layout.fields])
+            return jnp.concatenate([jnp.full(f.size, sizes.get(f.name, 1.0)) for f in layout.fields])
 
         return Scales(of(self.y_layout), of(self.tip_layout))
 
-    def scale_of(self, name: str, sizes: dict[str, Any]) -> Any:
-        """Return the natural size of a field of y or of the tip's conditions; `sizes` are those of a beam."""
-        return sizes[name]
+
+def _ordered(values: Fields, layout: Layout, first: int = 6) -> list[Any]:
+    """Return the values of a layout's fields from the `first` on, zero without one; `KeyError` for others."""
+    for name in values:
+        layout.slice(name)
+    return [values.get(field.name, np.zeros(field.size)) for field in layout.fields[first:]]
