@@ -13,7 +13,6 @@ from __future__ import annotations
 import abc
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -76,10 +75,6 @@ class ElasticRod(System):
     def section_controls(self, control: Any) -> list[Any]:
         """Return the control of each section."""
 
-    @abc.abstractmethod
-    def with_internal(self, strains: Float[Any, "6"]) -> Float[Any, " z"]:
-        """Return z with these strains without stress."""
-
     # derived quantities
 
     @property
@@ -129,7 +124,7 @@ class ElasticRod(System):
         )  # fmt: skip
         if not self.sections:
             return plain
-        found = self._differences(s, control)
+        found = self.differences(s, control)
         area = found.radius * found.radius
         return Material(
             plain.Kse * (area * found.stiffness), plain.Bse * area,
@@ -137,27 +132,9 @@ class ElasticRod(System):
             plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
         )  # fmt: skip
 
-    def _differences(self, s: Any, control: Any) -> Differences:
+    def differences(self, s: Any, control: Any) -> Differences:
+        """Return the sections' changes at s (m)."""
         return differences_at(self.sections, s / self.length, self.section_controls(control))
-
-    # observables for learning
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
-        strains = self.rest(s)[1][:6]
-        return self.with_internal(
-            strains.at[3:6].set(self.material(s, control).u_star) if self.sections else strains
-        )
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return the sections' factors on stiffness and damping; None without sections."""
-        if not self.sections:
-            return None
-        found = self._differences(s, control)
-        area = found.radius * found.radius
-        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        others = jnp.ones(self.z_layout.size - 6)
-        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
 
     # the law of the strains
 

@@ -24,6 +24,15 @@ def square_law_drag(C: Float[Any, "3 3"], q: Float[Any, "3"]) -> Float[Any, "3"]
     return dot(C, q * jnp.abs(q))
 
 
+def transverse_force(tension: Float[Any, " tendons"], angles: Float[Any, " tendons"]) -> Float[Any, "3"]:
+    """Return the load of the paper's crude model: f = Σ τᵢ dᵢ per metre of rod (N/m), in the global frame.
+
+    dᵢ is the unit vector at the tendon's angle (rad) in the global x-y plane. The force does not rotate with
+    the rod and there is no moment: the paper's τ·φ. Tension in N.
+    """
+    return jnp.stack([jnp.sum(tension * jnp.cos(angles)), jnp.sum(tension * jnp.sin(angles)), jnp.zeros(())])
+
+
 class Motion(NamedTuple):
     """Pose and motion of a point of the rod: p, R in the global frame, the rest in the material frame."""
 

@@ -9,6 +9,7 @@ class: an `Effect` for any rod, or a load, a section, an obstacle.
 
 from __future__ import annotations
 
+import functools
 import inspect
 from typing import Any, ClassVar, NamedTuple, Self
 
@@ -16,7 +17,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields
+from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields, slots_of
 
 
 class Wrench(NamedTuple):
@@ -39,16 +40,17 @@ class RodPoint(NamedTuple):
     t: Any
     y: Float[Any, " y"]
     y_t: Float[Any, " y"]
-    #: control of the robot, and of the part that is asked
+    #: control of the robot
     control: Any
-    input: Any = None
+    #: pose and velocities (`loads.Motion`)
+    motion: Any = None
+    #: section and material (`section.Material`); None at the tip
+    material: Any = None
     #: strains and internal variables, and their rates; None in the law and at the tip
     z: Any = None
     z_t: Any = None
-    #: section and material (`section.Material`); None at the tip
-    material: Any = None
-    #: pose and velocities (`loads.Motion`); only in the balance
-    motion: Any = None
+    #: control of the part that is asked
+    input: Any = None
 
     def get(self, name: str) -> Any:
         """Return a field of y or z by its name."""
@@ -158,6 +160,23 @@ class Part(Contribution, Parametrised):
 
 class Effect(Part):
     """Further physics of a rod (`Rod.effects`), such as an added mass or a layer with internal variables."""
+
+
+@functools.singledispatch
+def eased(system: Any, part: float) -> Any:
+    """Return a system whose parts have near-discontinuities spread over 1/part of their width.
+
+    Solvers use it as an intermediate problem when the direct solution fails. It is the system itself if no
+    part has any. A system that is not a list of parts registers its own function.
+    """
+    changes: dict[str, Any] = {}
+    for name in slots_of(type(system)):
+        held = getattr(system, name)
+        several = held if isinstance(held, tuple) else (held,)
+        easier = tuple(each and each.eased(part) for each in several)
+        if any(new is not old for new, old in zip(easier, several, strict=True)):
+            changes[name] = easier if isinstance(held, tuple) else easier[0]
+    return system.replace(**changes) if changes else system
 
 
 def require_stretch(begin: Any, end: Any, who: str) -> None:

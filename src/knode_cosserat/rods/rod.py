@@ -7,18 +7,19 @@
 from __future__ import annotations
 
 import functools
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import Load, Motion, point_wrench, square_law_drag
-from knode_cosserat.rods.parameters import ParameterError, parameter, slot, slots_of
+from knode_cosserat.rods.parameters import ParameterError, parameter, slot
 from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
 from knode_cosserat.rods.section import INWARD, SectionChange, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
@@ -36,6 +37,104 @@ NO_CONTROL = np.zeros(0)
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
+class RodEnds(Ends):
+    """Ends of a rod, and the conditions of its parts."""
+
+    system: Rod
+
+    @property
+    def held(self) -> bool:
+        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
+        return any(part.held for part in self.system.parts.values())
+
+    @property
+    def rest_is_guess(self) -> bool:
+        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
+        return self.system.tip_end.held
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the tip's conditions: force and moment, or the constrained pose; then the parts'."""
+        rod = self.system
+        norm = ("norm", 1, "1", "square of the length of the quaternion, less one")
+        fields = [*rod.tip_end.conditions, *((norm,) if "h" in rod.base_unknowns else ())]
+        return Layout(*fields, *(field for part in rod.parts.values() for field in part.tip_fields(rod)))
+
+    def poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
+        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
+        rod = self.system
+        ends = (rod.base_end, AT_ORIGIN), (rod.tip_end, rod.pose(rod.rest(rod.length)[0]))
+        base, tip = (
+            end.pose(rest, own) if isinstance(end, Clamped) else None
+            for (end, rest), own in zip(ends, rod.end_controls(control), strict=True)
+        )
+        return base, tip
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
+        rod = self.system
+        if type(rod.base_end) is Clamped:
+            return y
+        q, w = velocities(rod.pose(y), rod.pose(y_t))
+        return jnp.concatenate([y[:13], q, w, y[19:]])
+
+
+class RodObserved(Observed):
+    """Motion and bending of a rod, in the material frame, and the controls of its parts."""
+
+    system: Rod
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of `observables`."""
+        return Layout(
+            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
+            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
+            ("q", 3, "m/s", "velocity"),
+            ("w", 3, "rad/s", "angular velocity"),
+            ("u", 3, "1/m", "curvature"),
+            ("u_t", 3, "1/(m s)", "rate of the curvature"),
+        )
+
+    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+        """Return acceleration, spin, q, w, curvature and its rate; see `layout`."""
+        layout, strains = self.system.y_layout, self.system.z_layout
+        (q, w), (q_t, w_t) = ([layout.get(given, name) for name in ("q", "w")] for given in (y, y_t))
+        J = np.diag([1.0, 1.0, 2.0])
+        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
+        bent = strains.get(z, "u") - self.system.material(s, control).u_star
+        return jnp.concatenate([acceleration, spin, q, w, bent, strains.get(z_t, "u")])
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the controls of the parts in the form in which they enter the equations."""
+        rod = self.system
+        return jnp.concatenate([part.actuation(rod, own) for part, own in rod.inputs(control)])
+
+    @property
+    def has_actuation(self) -> bool:
+        """True if a part has another form of its control."""
+        plain = Contribution.actuation
+        return any(type(part).actuation is not plain for part in self.system.parts.values())
+
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
+        rod = self.system
+        u_star = rod.material(s, control).u_star if rod.sections else rod.u_star
+        return rod.with_internal(jnp.concatenate([rod.v_star, u_star]))
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Return the sections' factors on stiffness and damping; None without sections."""
+        rod = self.system
+        if not rod.sections:
+            return None
+        found = rod.differences(s, control)
+        area = found.radius * found.radius
+        others = jnp.ones(rod.z_layout.size - 6)
+        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
+        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
+
+
 class Rod(ElasticRod):
     """A round rod with gravity, drag, loads, ends, surroundings and further effects.
 
@@ -44,7 +143,6 @@ class Rod(ElasticRod):
     """
 
     mixed: ClassVar[bool] = False
-    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
 
     drag: Any = parameter("kg/m2", "C, square-law drag", shape="matrix", low=0.0, high=1e3, default=0.0)
     linear_drag: Any = parameter(
@@ -128,21 +226,11 @@ class Rod(ElasticRod):
         """Return the control of each section."""
         return [own for part, own in self.inputs(control) if isinstance(part, SectionChange)]
 
-    def _end_controls(self, control: Any) -> list[Any]:
+    def end_controls(self, control: Any) -> list[Any]:
         """Return the controls of the ends."""
         return [own for part, own in self.inputs(control) if isinstance(part, End)]
 
     # derived quantities
-
-    @property
-    def rest_is_guess(self) -> bool:  # type: ignore[override]
-        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
-        return self.tip_end.held
-
-    @property
-    def held(self) -> bool:  # type: ignore[override]
-        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
-        return any(part.held for part in self.parts.values())
 
     @property
     def is_undamped(self) -> bool:
@@ -161,56 +249,24 @@ class Rod(ElasticRod):
         EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
         return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
-    # observables for learning
-
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the controls of the parts in the form in which they enter the equations."""
-        return jnp.concatenate([part.actuation(self, own) for part, own in self.inputs(control)])
+    # aspects
 
     @property
-    def has_actuation(self) -> bool:
-        """True if that differs from the control."""
-        plain = Contribution.actuation
-        return any(type(part).actuation is not plain for part in self.parts.values())
-
-    def eased(self, part: float) -> Self:
-        """Return the rod with eased parts: smoothed contact, and friction that builds up slowly."""
-        changes = {}
-        for name in slots_of(type(self)):
-            held = getattr(self, name)
-            several = held if isinstance(held, tuple) else (held,)
-            easier = tuple(each and each.eased(part) for each in several)
-            if any(new is not old for new, old in zip(easier, several, strict=True)):
-                changes[name] = easier if isinstance(held, tuple) else easier[0]
-        return self.replace(**changes) if changes else self
+    def ends(self) -> RodEnds:
+        """Facts of the two ends."""
+        return RodEnds(self)
 
     @property
-    def observable_layout(self) -> Layout:
+    def observed(self) -> RodObserved:
         """Motion and bending, in the material frame."""
-        return Layout(
-            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
-            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
-            ("q", 3, "m/s", "velocity"),
-            ("w", 3, "rad/s", "angular velocity"),
-            ("u", 3, "1/m", "curvature"),
-            ("u_t", 3, "1/(m s)", "rate of the curvature"),
-        )
-
-    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """Return acceleration, spin, q, w, curvature and its rate; see `observable_layout`."""
-        q, w = self.y_layout.get(y, "q"), self.y_layout.get(y, "w")
-        q_t, w_t = self.y_layout.get(y_t, "q"), self.y_layout.get(y_t, "w")
-        u, u_t = self.z_layout.get(z, "u"), self.z_layout.get(z_t, "u")
-        J = np.diag([1.0, 1.0, 2.0])
-        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
-        bent = u - self.material(s, control).u_star
-        return jnp.concatenate([acceleration, spin, q, w, bent, u_t])
+        return RodObserved(self)
 
     # the equations
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u, linear but for the parts, and of internal variables."""
-        point = RodPoint(self, s, t, y, y_t, control, material=self.material(s, control))
+        motion = Motion.of(self.y_layout, y, y_t)
+        point = RodPoint(self, s, t, y, y_t, control, motion, self.material(s, control))
         parts = [(part, point._replace(input=own)) for part, own in self.inputs(control)]
         evolutions = {name: law for part, own in parts for name, law in part.evolutions(own).items()}
 
@@ -240,7 +296,7 @@ class Rod(ElasticRod):
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
         q_s = v_t - cross(u, q) + cross(w, v)
         w_s = u_t - cross(u, w)
-        point = RodPoint(self, s, t, y, y_t, control, None, z, z_t, material, motion)
+        point = RodPoint(self, s, t, y, y_t, control, motion, material, z, z_t)
         rates: Fields = {}
         for part, own in self.inputs(control):
             at = point._replace(input=own)
@@ -258,11 +314,11 @@ class Rod(ElasticRod):
         return tuple(sorted({cut for part in self.parts.values() for cut in part.cuts if cut < 1.0}))
 
     @property
-    def jumps(self) -> bool:  # type: ignore[override]
-        """True if a point load acts before the tip."""
-        return any(part.applied_at in self.cuts for part in self.parts.values())
+    def jump(self) -> Any:
+        """Jump of n and m by the point loads before the tip; None without any."""
+        return self._jump if any(part.applied_at in self.cuts for part in self.parts.values()) else None
 
-    def jump(
+    def _jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
@@ -285,7 +341,7 @@ class Rod(ElasticRod):
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y and z of the unloaded rod at rest: straight, or with the sections' curvature."""
         s = jnp.asarray(s, dtype=float)
-        still, _ = self._end_controls(np.zeros(self.control_layout.size))
+        still, _ = self.end_controls(np.zeros(self.control_layout.size))
         p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, still), s)
         more: Fields = {}
         for part in self.parts.values():
@@ -319,25 +375,12 @@ class Rod(ElasticRod):
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
-        held = self.base_end.pose(AT_ORIGIN, self._end_controls(control)[0])
+        held = self.base_end.pose(AT_ORIGIN, self.end_controls(control)[0])
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
         return self.y_layout.replaced(y, self.base_unknowns, unknowns)
 
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
-        if type(self.base_end) is Clamped:
-            return y
-        q, w = velocities(self._pose(y), self._pose(y_t))
-        return jnp.concatenate([y[:13], q, w, y[19:]])
-
-    def end_poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
-        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
-        controls, rest = self._end_controls(control), self._pose(self.rest(self.length)[0])
-        ends = zip((self.base_end, self.tip_end), (AT_ORIGIN, rest), controls, strict=True)
-        base, tip = (end.pose(at, own) if isinstance(end, Clamped) else None for end, at, own in ends)
-        return base, tip
-
-    def _pose(self, y: Any) -> Pose:
+    def pose(self, y: Any) -> Pose:
+        """Return the pose in a packed y."""
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
@@ -349,23 +392,15 @@ class Rod(ElasticRod):
         if type(self.tip_end) is Free:
             rows = [-n, -m]
         else:
-            rest = self._pose(self.rest(self.length)[0])
-            held = self.tip_end.pose(rest, self._end_controls(control)[1])
-            rows = [self.tip_end.left(held, self._pose(y), n, m)]
+            rest = self.pose(self.rest(self.length)[0])
+            held = self.tip_end.pose(rest, self.end_controls(control)[1])
+            rows = [self.tip_end.left(held, self.pose(y), n, m)]
         if "h" in self.base_unknowns:
             h = self.y_layout.get(y, "h")
             rows.append(jnp.sum(h * h)[None] - 1.0)
-        point = RodPoint(self, self.length, t, y, y_t, control)
+        point = RodPoint(self, self.length, t, y, y_t, control, Motion.of(self.y_layout, y, y_t))
         others = (part.tip_rows(point._replace(input=own)) for part, own in self.inputs(control))
         return jnp.concatenate([*rows, *(row for row in others if row is not None)])
-
-    @property
-    def tip_layout(self) -> Layout:
-        """Layout of the tip's conditions: force and moment, or the constrained pose; then the parts'."""
-        fields: list[Any] = [*self.tip_end.conditions]
-        if "h" in self.base_unknowns:
-            fields.append(("norm", 1, "1", "square of the length of the quaternion, less one"))
-        return Layout(*fields, *(field for part in self.parts.values() for field in part.tip_fields(self)))
 
     def scales(self) -> Scales:
         """Return the scales of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
@@ -378,7 +413,7 @@ class Rod(ElasticRod):
         def of(layout: Layout) -> Any:
             return jnp.concatenate([jnp.full(f.size, sizes.get(f.name, 1.0)) for f in layout.fields])
 
-        return Scales(of(self.y_layout), of(self.tip_layout))
+        return Scales(of(self.y_layout), of(self.ends.layout))
 
 
 def _ordered(values: Fields, layout: Layout, first: int = 6) -> list[Any]:

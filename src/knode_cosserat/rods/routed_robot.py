@@ -107,17 +107,6 @@ class RoutedTendonRobot(TendonRod):
         same = {field.name: getattr(robot, field.name) for field in dataclasses.fields(TendonRod)}
         return cls(**same).replace(**changes)
 
-    def undelayed(
-        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
-    ) -> Float[np.ndarray, "T c"]:
-        """Return the acting tensions, from the load cells' readings."""
-        cells = self.load_cells
-        return measured if cells is None else cells.undelayed(measured, dt, before)
-
-    def trained_range(self) -> TrainedRange | None:
-        """Return the range of the recordings used to identify it; None if it has none."""
-        return self.trained
-
     # parts
 
     @property

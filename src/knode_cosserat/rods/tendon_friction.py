@@ -68,19 +68,35 @@ class TendonFriction(TendonContribution, Part):
         """Return the law with that of fᵢ; in an equilibrium the bending determines it."""
 
         def evolutions(strains: Fields, rates: Fields) -> dict[str, Evolution]:
-            along = point.rod.bending_directions(point.s) / self.reach
-            bent = strains["u"] - point.material.u_star
-            return {"f": Evolution(dot(along, rates["u"]), self.at_rest * dot(along, bent), -1.0, 1.0)}
+            directions = point.rod.bending_directions(point.s)
+            return {"f": self.evolution(directions, rates["u"], strains["u"] - point.material.u_star)}
 
         return law.with_internal(evolutions)
 
+    def evolution(
+        self, directions: Float[Any, "c 3"], u_t: Float[Any, "3"], bent: Float[Any, "3"]
+    ) -> Evolution:
+        """Return the law of fᵢ of tendons that bend the rod in these directions.
+
+        Args:
+            directions: eᵢ.
+            u_t: rate of the curvature (1/(m s)).
+            bent: curvature relative to the unloaded rod (1/m), for an equilibrium.
+        """
+        along = directions / self.reach
+        return Evolution(dot(along, u_t), self.at_rest * dot(along, bent), -1.0, 1.0)
+
     def rates(self, point: RodPoint) -> Fields:
         """Return λᵢ_s (1/m)."""
-        u, f = point.get("u"), point.get("f")
+        f = point.get("f")
         for part in point.rod.parts.values():
             f = part.mobilised(point, f) if isinstance(part, TendonContribution) else f
+        return {"loss": self.loss_rates(point.get("u"), f)}
+
+    def loss_rates(self, u: Float[Any, "3"], f: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return λᵢ_s (1/m) at the curvature u (1/m), with the mobilised fraction f of the friction."""
         turn = jnp.sqrt(u[0] * u[0] + u[1] * u[1] + STRAIGHT**2) - STRAIGHT
-        return {"loss": (self.wobble + self.curvature * turn) * f}
+        return (self.wobble + self.curvature * turn) * f
 
     def transmitted(self, point: RodPoint, tension: Float[Any, " c"]) -> Float[Any, " c"]:
         """Return the tensions less the loss."""
@@ -109,10 +125,13 @@ class Vibration(TendonContribution, Part):
         return (("x", 1, "1", "part of the friction that vibration has taken away"),)
 
     def evolutions(self, point: RodPoint) -> dict[str, Evolution]:
-        """Return the law of x; at rest it is 0 or 1."""
-        total = jnp.sum(base_tension(point))
+        """Return the law of x."""
+        return {"x": self.evolution(jnp.sum(base_tension(point)))}
+
+    def evolution(self, total: Any) -> Evolution:
+        """Return the law of x under a total tension (N) of all tendons: at rest it is 0 or 1."""
         growth = jnp.reshape(self.rate * (total - self.tension), (1,))
-        return {"x": Evolution(growth, jnp.sign(growth), 0.0, 1.0)}
+        return Evolution(growth, jnp.sign(growth), 0.0, 1.0)
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
         """Return the law with the loss of bending stiffness."""

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import PoseHistory, pose_mse, tip_dtw
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import Scales, System
 from knode_cosserat.trajectory import Trajectory
@@ -75,34 +76,28 @@ class NoKnowledge(System):
         """Return the model's y at the base."""
         return self.model.base(t, control, unknowns)
 
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return the model's y at the base with its velocities."""
-        return self.model.moving_base(y, y_t)
-
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the model's boundary conditions at the tip."""
         return self.model.tip(t, control, y, y_t)
 
     @property
-    def tip_layout(self) -> Layout:
-        """Layout of the residual at the model's tip."""
-        return self.model.tip_layout
+    def ends(self) -> Ends:
+        """Facts of the model's ends."""
+        return self.model.ends
 
     def scales(self) -> Scales:
         """Return the model's scales."""
         return self.model.scales()
 
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the model's actuation, so that the network has the same input as with a nominal model."""
-        return self.model.actuation(control)
+    @property
+    def observed(self) -> Observed:
+        """Observables of the model, so that the network has the same input as with a nominal model."""
+        return self.model.observed
 
-    def positions(self, y: Any) -> Any:
-        """Return the model's positions."""
-        return self.model.positions(y)
-
-    def quaternions(self, y: Any) -> Any:
-        """Return the model's quaternions."""
-        return self.model.quaternions(y)
+    @property
+    def drawing(self) -> Drawing:
+        """Drawing of the model."""
+        return self.model.drawing
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with changed parameters (or nodes) of the model."""
@@ -158,7 +153,8 @@ class LinearPredictor(NamedTuple):
                 x = self.A @ x + self.B @ force
                 rows.append(x)
             y = (self.rest + self.scale * np.array(rows)).reshape(len(rows), self.system.nodes, -1)
-        return NodePoses(np.asarray(self.system.positions(y)), np.asarray(self.system.quaternions(y)))
+        drawing = self.system.drawing
+        return NodePoses(np.asarray(drawing.positions(y)), np.asarray(drawing.quaternions(y)))
 
 
 #: candidate ranks
@@ -215,7 +211,7 @@ def _fitted(system: System, trajectories: Sequence[Trajectory], rank: int) -> Li
 
 
 def _forces(system: System, tensions: Any) -> np.ndarray:
-    return np.asarray(jax.vmap(system.actuation)(np.asarray(tensions)))
+    return np.asarray(jax.vmap(system.observed.actuation)(np.asarray(tensions)))
 
 
 def _misses(predictor: LinearPredictor, trajectory: Trajectory) -> float:
