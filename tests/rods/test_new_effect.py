@@ -24,8 +24,6 @@ from knode_cosserat.rotation import cross, dot
 class AddedMass(loads.SpreadLoad):
     """Inertia of the surrounding water across the rod."""
 
-    kind: ClassVar[str] = "added-mass"
-
     mass: Any = parameter("kg/m", "added mass per length", low=0.0, high=1e3, default=0.0)
 
     def wrench(self, motion, control):
@@ -89,11 +87,10 @@ def test_it_runs_in_batches_and_is_differentiable():
 
 
 def test_a_robot_file_holds_it(tmp_path):
-    robot = layered().replace(loads=(AddedMass(mass=0.1),))
-    kc.save_robot(robot, tmp_path / "layered.yaml")
+    kc.save_robot(layered(), tmp_path / "layered.yaml")
     assert "kind: friction-layer" in (tmp_path / "layered.yaml").read_text()
     loaded = kc.load_robot(tmp_path / "layered.yaml")
-    assert loaded.effects[0].reach == 0.01 and loaded.loads[0].mass == 0.1
+    assert loaded.effects[0].reach == 0.01
     assert "friction-layer" in str(kc.robots.robot_schema())
 
 
@@ -124,3 +121,19 @@ def test_a_rate_of_an_unknown_field_is_refused():
 
     with pytest.raises(KeyError, match="no field 'bristel'"):
         motion(layered().replace(effects=(Wrong(1.0),)))
+
+
+def test_two_effects_with_the_same_field_are_refused():
+    twice = layered().replace(effects=(FrictionLayer(1.0), FrictionLayer(2.0)))
+    with pytest.raises(kc.robots.ParameterError, match="two parts have a field 'bristle'"):
+        motion(twice)
+
+
+def test_a_relaxing_material_of_any_rod_is_that_of_a_routed_robot():
+    relaxation, tensions = kc.robots.Relaxation(0.5, 0.1), np.zeros((5, 4))
+    robots = (
+        RoutedTendonRobot(**ROD, gravity=(3.0, 0.0, 0.0), **{name: value})
+        for name, value in (("relaxation", relaxation), ("effects", (relaxation,)))
+    )
+    one, other = (kc.simulate(robot, tensions, DT) for robot in robots)
+    np.testing.assert_array_equal(one.z, other.z)

@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 import functools
+from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -188,12 +189,16 @@ class Rod(ElasticRod):
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]
         """Layout of y: that of the rod, then the parts' fields."""
-        return ElasticRod.y_layout + Layout(*(f for part in self.parts.values() for f in part.y_fields(self)))
+        return _joined(
+            ElasticRod.y_layout, (field for part in self.parts.values() for field in part.y_fields(self))
+        )
 
     @functools.cached_property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """Layout of z: that of the rod, then the parts' fields."""
-        return ElasticRod.z_layout + Layout(*(f for part in self.parts.values() for f in part.z_fields(self)))
+        return _joined(
+            ElasticRod.z_layout, (field for part in self.parts.values() for field in part.z_fields(self))
+        )
 
     @functools.cached_property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -414,6 +419,15 @@ class Rod(ElasticRod):
             return jnp.concatenate([jnp.full(f.size, sizes.get(f.name, 1.0)) for f in layout.fields])
 
         return Scales(of(self.y_layout), of(self.ends.layout))
+
+
+def _joined(layout: Layout, fields: Iterable[tuple[Any, ...]]) -> Layout:
+    """Return a layout with the fields of the parts. Raises `ParameterError` if two have the same name."""
+    joined = layout + Layout(*fields)
+    for name in joined.names:
+        if joined.names.count(name) > 1:
+            raise ParameterError(f"two parts have a field {name!r}; allowed is one part of its kind")
+    return joined
 
 
 def _ordered(values: Fields, layout: Layout, first: int = 6) -> list[Any]:
