@@ -15,7 +15,7 @@ def main(out: str = "follow_a_path.png", points: int = 60) -> kc.statics.Inverse
     turn = np.linspace(0.0, 2.0 * np.pi, points)
     wanted = np.stack([0.25 * np.sin(turn), 0.15 * np.sin(2.0 * turn)], axis=1)
     found = kc.inverse_kinematics(
-        robot, wanted, low=1.0, high=10.0, pose=lambda robot, y: (robot.positions(y)[:2], None)
+        robot, wanted, low=1.0, high=10.0, pose=lambda robot, y: (robot.drawing.positions(y)[:2], None)
     )
     kc.figures.path({"wanted": wanted, "reached": found.position}).savefig(out)
     reached, worst = np.sum(found.converged), np.max(found.position_error)

@@ -32,17 +32,15 @@ class NoKnowledge(System):
     y_layout = _of_model("y_layout")
     z_layout = _of_model("z_layout")
     control_layout = _of_model("control_layout")
-    tip_layout = _of_model("tip_layout")
     base_unknowns = _of_model("base_unknowns")
     length = _of_model("length")
     rest = _of_model("rest")
     base = _of_model("base")
-    moving_base = _of_model("moving_base")
     tip = _of_model("tip")
     scales = _of_model("scales")
-    actuation = _of_model("actuation")
-    positions = _of_model("positions")
-    quaternions = _of_model("quaternions")
+    ends = _of_model("ends")
+    observed = _of_model("observed")
+    drawing = _of_model("drawing")
 
     def __init__(self, model: System):
         self.model = model
@@ -115,7 +113,8 @@ class LinearPredictor(NamedTuple):
                 x = self.A @ x + self.B @ force
                 rows.append(x)
             y = (self.rest + self.scale * np.array(rows)).reshape(len(rows), self.system.nodes, -1)
-        return NodePoses(np.asarray(self.system.positions(y)), np.asarray(self.system.quaternions(y)))
+        drawing = self.system.drawing
+        return NodePoses(np.asarray(drawing.positions(y)), np.asarray(drawing.quaternions(y)))
 
 
 #: candidate ranks
@@ -172,7 +171,7 @@ def _fitted(system: System, trajectories: Sequence[Trajectory], rank: int) -> Li
 
 
 def _forces(system: System, tensions: Any) -> np.ndarray:
-    return np.asarray(jax.vmap(system.actuation)(np.asarray(tensions)))
+    return np.asarray(jax.vmap(system.observed.actuation)(np.asarray(tensions)))
 
 
 def _misses(predictor: LinearPredictor, trajectory: Trajectory) -> float:

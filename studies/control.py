@@ -301,7 +301,7 @@ def _observed(observer: KalmanObserver, start: Any, seed: int) -> tuple[list[flo
         observer.update(measured)
         times.append(clock.perf_counter() - began)
         found, truth = observer.estimate, plant.state
-        apart = np.asarray(robot.positions(found.y)) - np.asarray(truth.position[-1])
+        apart = np.asarray(robot.drawing.positions(found.y)) - np.asarray(truth.position[-1])
         errors.append(float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) / float(robot.length))
         inside.append(observer.covers(truth))
         plant.apply(control)

@@ -27,6 +27,7 @@ from knode_cosserat.recordings.estimation.estimate import estimate_states
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -403,7 +404,7 @@ def _paper_motion(
     """
     before = measured.initial_tension
     rest = None if before is None else equilibrium(resting, before, space=PAPER_SPACE)
-    acting = system.undelayed(measured.tension[:-1], measured.dt, before)
+    acting = undelayed(system, measured.tension[:-1], measured.dt, before)
     return simulate(
         system, acting, measured.dt, time="bdf2", space=PAPER_SPACE, start="paper", initial=rest,
         recovery_budget=recovery,

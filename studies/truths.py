@@ -188,7 +188,7 @@ class TurningTendons(TendonRobot):
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
         y_s = super().balance(s, t, y, y_t, z, z_t, control)
-        f = self.actuation(control)
+        f = self.observed.actuation(control)
         turned = dot(rotation_matrix(self.y_layout.get(y, "h")), f)
         return y_s.at[self.y_layout.slice("n")].add(self.turning * (f - turned))
 

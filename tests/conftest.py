@@ -15,7 +15,7 @@ from jaxtyping import install_import_hook
 
 from tests import progress
 
-EQUATIONS = ("rotation", "rods.loads", "rods.section", "rods.tendons")
+EQUATIONS = ("rotation", "rods.loads", "rods.section")
 SOLVER = tuple(f"solvers.{name}" for name in ("boundary", "problem", "space", "time", "steps"))
 
 install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "beartype.beartype")

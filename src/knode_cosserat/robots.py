@@ -2,11 +2,13 @@
 
 from knode_cosserat.rods import ends, loads, routing, surroundings
 from knode_cosserat.rods.anchors import EarlyAnchors
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.law import Evolution, InternalState, MaterialLaw, MaxwellBranch, Viscoelastic
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
+from knode_cosserat.rods.parts import Effect, RodPoint, Wrench
 from knode_cosserat.rods.reels import Reels
 from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rib_spacing import RibSpacing
@@ -22,7 +24,10 @@ from knode_cosserat.rods.tendon_robot import TendonRobot
 
 __all__ = [
     "Differences",
+    "Drawing",
     "EarlyAnchors",
+    "Effect",
+    "Ends",
     "Evolution",
     "Field",
     "FunctionSection",
@@ -31,6 +36,7 @@ __all__ = [
     "LoadCells",
     "MaterialLaw",
     "MaxwellBranch",
+    "Observed",
     "ParallelRobot",
     "ParameterError",
     "Reels",
@@ -38,6 +44,7 @@ __all__ = [
     "RibSpacing",
     "RobotFileError",
     "Rod",
+    "RodPoint",
     "RoutedTendonRobot",
     "Scales",
     "Sleeve",
@@ -48,6 +55,7 @@ __all__ = [
     "TendonRobot",
     "Vibration",
     "Viscoelastic",
+    "Wrench",
     "catalog",
     "ends",
     "load_robot",

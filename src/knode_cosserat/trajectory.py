@@ -86,12 +86,12 @@ class Trajectory(eqx.Module):
     @property
     def position(self) -> Any:
         """Positions (…, T, N, 3) in m, global frame."""
-        return self.system.positions(self.y)
+        return self.system.drawing.positions(self.y)
 
     @property
     def quaternion(self) -> Any:
         """Orientations (…, T, N, 4), scalar first."""
-        return self.system.quaternions(self.y)
+        return self.system.drawing.quaternions(self.y)
 
     @property
     def tip_position(self) -> Any:
@@ -250,7 +250,7 @@ class Trajectory(eqx.Module):
             return []
         # a user's own system may have no positions, or fail: a text must not
         with contextlib.suppress(Exception):
-            tip = np.asarray(self.system.positions(np.asarray(self.y)[solved[-1], -1]))
+            tip = np.asarray(self.system.drawing.positions(np.asarray(self.y)[solved[-1], -1]))
             return [f"tip at {float(self.time[solved[-1]]):g} s: {quantity(tip, 'm')}"]
         return []
 

@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.ends import AXES, Driven
-from knode_cosserat.rods.loads import Body, Motion, SpreadLoad, Wrench
+from knode_cosserat.rods.loads import Body, Motion, SpreadLoad
 from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parts import Wrench
 from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.trajectory import Trajectory

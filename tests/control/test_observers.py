@@ -117,7 +117,8 @@ def followed(observer, still, count=60):
     for k in range(count):
         measured = np.asarray(truth.state.tip_position[-1]) + 2e-4 * rng.normal(size=3)
         observer.update(measured)
-        apart = np.asarray(ROBOT.positions(observer.estimate.y)) - np.asarray(truth.state.position[-1])
+        position = np.asarray(ROBOT.drawing.positions(observer.estimate.y))
+        apart = position - np.asarray(truth.state.position[-1])
         errors.append(np.sqrt(np.mean(np.sum(apart**2, axis=-1))) / 0.635)
         inside.append(observer.covers(truth.state))
         control = TENSION + 0.8 * np.sin(4.0 * k * DT + np.arange(4))

@@ -88,7 +88,7 @@ def test_clearance_is_the_distance_of_the_surface(robot, survey):
     goal = goals(task, survey, 1)[0]._replace(centres=jnp.array([[0.1, 0.0, 0.3]]))
     system = task.placed(task.equipped(robot), goal)
     y, _ = jax.vmap(system.rest)(np.linspace(0.0, float(system.length), system.nodes))
-    nearest = np.linalg.norm(np.asarray(system.positions(y)) - [0.1, 0.0, 0.3], axis=1).min()
+    nearest = np.linalg.norm(np.asarray(system.drawing.positions(y)) - [0.1, 0.0, 0.3], axis=1).min()
     assert float(clearance_of(system, y)) == pytest.approx(nearest - 0.02 - float(system.radius))
     assert np.isinf(clearance_of(robot, y))
     np.testing.assert_allclose(tip_of(system, y).position, [0.0, 0.0, float(system.length)], atol=1e-12)

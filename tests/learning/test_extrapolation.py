@@ -11,7 +11,7 @@ from knode_cosserat.engine import pattern
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, without_range
+from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, trained_range, without_range
 from tests.learning.bar import BAR, WRONG, pulled
 
 PAPER = {"time": "bdf2", "start": "paper"}
@@ -46,7 +46,7 @@ def predicted(model, beyond):
 
 
 def test_the_range_is_that_of_the_trajectories(model, seen):
-    trained = model.trained_range()
+    trained = trained_range(model)
     for low, high, values in (
         (trained.strain_low, trained.strain_high, np.concatenate([each.z for each in seen]).reshape(-1, 1)),
         (trained.control_low, trained.control_high, np.concatenate([each.control[1:] for each in seen])),
@@ -69,7 +69,7 @@ def test_nothing_is_marked_in_what_it_learned_from(model, seen):
 
 
 def test_rows_beyond_are_marked_and_said(model, seen, predicted):
-    trained = model.trained_range()
+    trained = trained_range(model)
     slack = MARGIN * (trained.control_high - trained.control_low).max()
     driven = (predicted.control > trained.control_high + slack).any(axis=1)
     driven |= (predicted.control < trained.control_low - slack).any(axis=1)
@@ -92,7 +92,7 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     loaded = kc.load_trajectory(tmp_path / "predicted.nc", system=model)
     assert loaded.extrapolated.dtype == bool
     np.testing.assert_array_equal(loaded.extrapolated, marks)
-    assert loaded.system.trained_range() is not None
+    assert trained_range(loaded.system) is not None
     half = len(controls) // 2
     first = kc.simulate(model, controls[:half], beyond.dt, **PAPER)
     second = kc.simulate(model, controls[half:], beyond.dt, **PAPER, initial=first)
@@ -105,7 +105,7 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     np.testing.assert_array_equal(
         prediction.extrapolated, prediction.members[0].extrapolated | prediction.members[1].extrapolated
     )
-    top = 2.0 * np.asarray(model.trained_range().control_high)
+    top = 2.0 * np.asarray(trained_range(model).control_high)
     rest = kc.equilibrium(model, top)
     assert rest.extrapolated.shape == (1,) and rest.extrapolated[0]
     traced = jax.jit(lambda part: kc.simulate(model, part * controls, beyond.dt, **PAPER).extrapolated)(1.0)
@@ -134,7 +134,7 @@ def test_files_keep_the_range(model, tmp_path):
     found = kc.load_robot(tmp_path / "robot.yaml")
     assert jax.tree.all(jax.tree.map(np.array_equal, found.trained, trained))
     # a model of an identified robot has that robot's range until it is trained itself
-    assert KNODE(robot, model.residual).trained_range() is robot.trained
+    assert trained_range(KNODE(robot, model.residual)) is robot.trained
 
 
 def test_each_kind_of_number_is_judged_with_a_margin():

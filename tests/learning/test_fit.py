@@ -77,7 +77,7 @@ def test_a_model_is_what_its_knowledge_is():
     loose = kc.robots.SlenderRod(
         length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.robots.ends.Free()
     )
-    assert not loose.held and not KNODE(loose, None).held
+    assert not loose.ends.held and not KNODE(loose, None).ends.held
 
 
 def test_noise_in_the_data_is_in_every_number_and_the_same_each_time(bars):

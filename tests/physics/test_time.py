@@ -92,7 +92,7 @@ def test_first_step(name):
     first = {"paper": regular, "consistent": kc.solvers.BDF1().coefficients(0.05, 0.05)}
     for start in ("paper", "consistent"):
         table = coefficient_table(Settings(time=scheme, start=start), 0.05)
-        np.testing.assert_array_equal(table, [first[start], regular])
+        np.testing.assert_array_equal(table, [first[start], regular] if start == "consistent" else [regular])
 
 
 # observed orders: from rest, tendons that pull ever more, smoothly

@@ -441,7 +441,9 @@ def test_an_offset_that_the_papers_model_ignores_is_named(tmp_path):
     assert message.startswith(f"{file}: kind tendon-robot is the paper's model")
     # the offset is indeed ignored
     robot = load_robot(PAPER)
-    one, other = (robot.replace(tendon_offset=each).actuation(np.arange(4.0)) for each in (0.0, 0.05))
+    one, other = (
+        robot.replace(tendon_offset=each).observed.actuation(np.arange(4.0)) for each in (0.0, 0.05)
+    )
     np.testing.assert_array_equal(one, other)
     assert len(warned(lambda: modified(robot, ["tendon_offset=0.03"]))) == 1
 

@@ -11,10 +11,10 @@ from knode_cosserat.rods.routing import (
     FunctionRouting,
     Helical,
     Polynomial,
+    RoutedPaths,
     Routing,
     Straight,
     Tapered,
-    ends,
     routes,
 )
 
@@ -39,7 +39,7 @@ def test_routes_are_where_each_routing_says():
         [0.01 * np.sin(2.5), 0.005, 0.0],
     ]
     np.testing.assert_allclose(r, expected, rtol=0, atol=1e-16)
-    np.testing.assert_array_equal(ends(ROUTINGS), [1.0, 0.5, 0.8, 1.0, 1.0])
+    assert RoutedPaths(ROUTINGS, 1.0).ends == (1.0, 0.5, 0.8, 1.0, 1.0)
 
 
 def test_derivatives_are_those_along_the_rod():

@@ -8,7 +8,15 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
 import knode_cosserat as kc
-from knode_cosserat.rods.routing import FunctionRouting, Helical, Polynomial, Straight, Tapered, ends, routes
+from knode_cosserat.rods.routing import (
+    FunctionRouting,
+    Helical,
+    Polynomial,
+    RoutedPaths,
+    Straight,
+    Tapered,
+    routes,
+)
 from knode_cosserat.rods.tendon_law import tendon_strains
 from tests.rods import rucker_webster as oracle
 
@@ -33,7 +41,8 @@ SOFT = oracle.Rod(
 
 def shape(rod, routings, tensions, tolerance=1e-11):
     """[p, R, v, u] at the tip by the package's law: n and m carry rod and tendons, and have no jumps."""
-    anchored, stops = ends(routings), sorted({*(ends(routings) * rod.length), rod.length})
+    anchored = np.array(RoutedPaths(routings, rod.length).ends)
+    stops = sorted({*(anchored * rod.length), rod.length})
 
     @jax.jit
     def rates(s, x, tension):

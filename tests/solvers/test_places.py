@@ -79,7 +79,7 @@ def test_several_rods_have_a_line():
     rest = [platform.rest(s)[0] for s in np.linspace(0.0, 1.0, platform.nodes) * np.asarray(platform.length)]
     y = np.array(rest)[None]
     places = places_at(np.array([0.33]), platform.nodes)
-    p = np.asarray(platform.positions(y))
+    p = np.asarray(platform.drawing.positions(y))
     part = places.part[:, None]
     expected = (1.0 - part) * p[:, places.node] + part * p[:, places.node + 1]
     np.testing.assert_allclose(positions_at(platform, y, places), expected, atol=1e-15)

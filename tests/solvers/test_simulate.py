@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
@@ -112,7 +113,7 @@ def test_a_batch_keeps_nothing_of_another_robot(robot, sine):
 
 
 def test_a_smooth_system_is_as_gentle_as_it_gets(robot):
-    assert robot.eased(1e-3) is robot
+    assert eased(robot, 1e-3) is robot
 
 
 @pytest.mark.parametrize("part", [1.0, 0.1, 1e-3])
@@ -121,12 +122,12 @@ def test_easing_spreads_contact_and_friction_and_nothing_else(robot, part):
     slender = kc.robots.SlenderRod(
         length=0.4, radius=0.005, density=1e3, youngs_modulus=1e6, surroundings=(plane,)
     )
-    easier = slender.eased(part)
+    easier = eased(slender, part)
     assert float(easier.surroundings[0].smoothing) == pytest.approx(1e-4 / part)
     assert float(easier.surroundings[0].slip) == pytest.approx(2e-3 / part)
     assert float(easier.surroundings[0].friction) == 0.3 and float(easier.length) == 0.4
     rubbing = kc.robots.RoutedTendonRobot.like(robot, friction=TendonFriction(curvature=0.2, reach=0.05))
-    assert float(rubbing.eased(part).friction.reach) == pytest.approx(0.05 / part)
+    assert float(eased(rubbing, part).friction.reach) == pytest.approx(0.05 / part)
 
 
 # tension that makes boundary layers much shorter than a segment

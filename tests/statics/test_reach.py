@@ -163,7 +163,7 @@ def test_a_control_that_is_held_stays():
 
 def middle(system, y):
     """Half the tip's position: some function of the last node."""
-    return 0.5 * system.positions(y), system.quaternions(y)
+    return 0.5 * system.drawing.positions(y), system.drawing.quaternions(y)
 
 
 @pytest.mark.slow

@@ -35,7 +35,7 @@ def linear_motion(tensions, rank=3, seed=0):
     x, rows = np.zeros(rank), []
     for row in tensions:
         rows.append(rest + (basis @ x).reshape(rest.shape))
-        x = A @ x + B @ np.asarray(ROBOT.actuation(row))[:2]
+        x = A @ x + B @ np.asarray(ROBOT.observed.actuation(row))[:2]
     y = np.array(rows)
     zeros = np.zeros(len(y))
     controls = np.concatenate([np.zeros((1, 4)), tensions])[: len(y)]

@@ -13,6 +13,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.cli import main
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.viewer.document import document, export_scene
 from knode_cosserat.viewer.drawing import drawing, sliders
 from knode_cosserat.viewer.scene import LEAST_ROWS, MOST, MOST_NODES, encoded_array, kept, scene, track
@@ -171,6 +172,13 @@ def test_the_page_may_not_reach_any_network(truth, tmp_path):
     assert path.stat().st_size < 1_500_000
 
 
+class Plane(Drawing):
+    """Positions in two numbers."""
+
+    def positions(self, y):
+        return y[..., :2]
+
+
 class Flat(kc.System):
     """A system that says of its nodes where they are, in two numbers, and no more."""
 
@@ -181,8 +189,9 @@ class Flat(kc.System):
 
     length: float = 2.0
 
-    def positions(self, y):
-        return y[..., :2]
+    @property
+    def drawing(self):
+        return Plane(self)
 
     def rest(self, s):
         raise NotImplementedError
@@ -194,7 +203,7 @@ class Flat(kc.System):
 class Nowhere(Flat):
     """One that does not even say that."""
 
-    positions = kc.System.positions
+    drawing = kc.System.drawing
 
 
 def of(system, rows=4, nodes=5):

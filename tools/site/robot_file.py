@@ -25,6 +25,7 @@ HEAD = "| name | meaning | kind | unit | accepted | default |\n| --- | --- | ---
 FAMILIES = {
     "End": "Ends: `base_end`, `tip_end`",
     "Load": "Loads: `loads`",
+    "Effect": "Further physics: `effects`",
     "Obstacle": "Surroundings: `surroundings`",
     "SectionChange": "Sections: `sections`",
     "Routing": "Tendon routing: `routing`",

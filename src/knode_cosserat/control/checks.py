@@ -97,7 +97,7 @@ def _coordinates(known: tuple[int, ...]) -> Any:
     """Return the pose function of some of the tip's coordinates; the same one each time, for compilation."""
 
     def pose(system: System, y: Any) -> tuple[Any, None]:
-        return system.positions(y)[np.array(known)], None
+        return system.drawing.positions(y)[np.array(known)], None
 
     return pose
 
@@ -146,4 +146,4 @@ def _memory() -> float:
 def _base(robot: Any) -> Float[np.ndarray, "3"]:
     """Return the position of the base at rest (m)."""
     y, _ = robot.rest(0.0)
-    return np.asarray(robot.positions(np.asarray(y)[None]))[0]
+    return np.asarray(robot.drawing.positions(np.asarray(y)[None]))[0]

@@ -157,4 +157,4 @@ class SimulatedPlant(Plant):
     def tip(self) -> Float[np.ndarray, "3"]:
         """Return the true position of the tip (m)."""
         y = np.asarray(self._stepper.state.y[-1, -1:])
-        return np.asarray(self.robot.positions(y))[-1]
+        return np.asarray(self.robot.drawing.positions(y))[-1]

@@ -68,5 +68,5 @@ def _outputs(
         value, slope = errors_along(system, output, records, d_records, zero)
         values.append(value)
         moved.append(slope)
-    path = system.positions(split_record(system, records[:, -1])[0])
+    path = system.drawing.positions(split_record(system, records[:, -1])[0])
     return error, slopes, jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1), path

@@ -116,7 +116,7 @@ class Equations:
         [self.tip] = program.evaluate(traced, [*known, whole_y, whole_history])
         #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
         self.acting, self.far, self.jumping = program.inputs("acting", (len(system.cuts),), STATE), self.y, []
-        if system.jumps:
+        if system.jump is not None:
             shapes = np.zeros(len(system.cuts)), np.ones(self.ny), np.zeros(self.numbers)
             traced = jax.make_jaxpr(jump)(leaves, *step, *shapes)
             [self.far] = program.evaluate(traced, [*known, self.acting, self.y, self.history])
@@ -233,8 +233,8 @@ class TangentEquations(Equations):
         """
         super().__init__(system, moving, space)
         results = {
-            "rates": [*self.f, *self.z], "far": [*self.far] if system.jumps else [], "tip": [*self.tip],
-            "base": [*self.base],
+            "rates": [*self.f, *self.z], "far": [*self.far] if system.jump is not None else [],
+            "tip": [*self.tip], "base": [*self.base],
         }  # fmt: skip
         self.z_by_y = self._nonzeros(self.z, self.y)
         #: by the history of all strands in turn; that of a point is the first

@@ -85,7 +85,7 @@ class RodCode(Memory):
         self.slope, self.slope_end = a(len(e.pattern), self.used), a(len(e.pattern), self.pieces)
         self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
         #: y at the places of the ends; with jumps it differs from y at the points
-        self.far = a(ny, self.ends) if system.jumps else None
+        self.far = a(ny, self.ends) if system.jump is not None else None
         #: y at the stages between ends
         self.between = a(ny, self.count - self.ends)
         #: points of the nodes, as whole numbers

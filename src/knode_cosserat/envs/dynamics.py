@@ -95,10 +95,10 @@ def _assembled(spec: Spec, arrays: Arrays, drawn: Any, model: Any, goal: Any) ->
 
 def tip_of(system: System, y: Float[Any, "N y"]) -> Tip:
     """Return the pose of the tip; along z for a robot without orientations."""
-    position = system.positions(y[-1])
+    position = system.drawing.positions(y[-1])
     if "h" not in system.y_layout.names:
         return Tip(position, jnp.array([0.0, 0.0, 1.0]))
-    tangent = dot(rotation_matrix(system.quaternions(y[-1])), jnp.array([0.0, 0.0, 1.0]))
+    tangent = dot(rotation_matrix(system.drawing.quaternions(y[-1])), jnp.array([0.0, 0.0, 1.0]))
     return Tip(position, tangent)
 
 
@@ -106,7 +106,8 @@ def clearance_of(system: System, y: Float[Any, "N y"]) -> Float[Any, ""]:
     """Return the least distance (m) of the nodes' surface from obstacles; infinite without obstacles."""
     obstacles = getattr(system.nominal, "surroundings", ())
     radius = getattr(system.nominal, "radius", 0.0)
-    every = [jax.vmap(lambda p, each=each: each.distance(p)[0])(system.positions(y)) for each in obstacles]
+    p = system.drawing.positions(y)
+    every = [jax.vmap(lambda p, each=each: each.distance(p)[0])(p) for each in obstacles]
     return jnp.min(jnp.stack(every)) - radius if every else jnp.array(jnp.inf)
 
 

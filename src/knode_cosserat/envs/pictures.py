@@ -28,7 +28,7 @@ def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, 
     from matplotlib.image import imread
 
     system = environment.system(state)
-    points = np.asarray(system.positions(state.history.y[0]))
+    points = np.asarray(system.drawing.positions(state.history.y[0]))
     goal, t = state.goal, float(state.count) * environment.dt
     target = np.asarray(environment.task.target(goal, t))[:3]
     span = 1.1 * float(np.max(environment.robot.nominal.length))

@@ -180,7 +180,7 @@ def specified(
         float(randomisation.change), (randomisation.delay[0], randomisation.delay[1]), len(models),
     )  # fmt: skip
     rest = None
-    if equipped.rest_is_guess:
+    if equipped.ends.rest_is_guess:
         at_start = initial_state(equipped, settings)
         rest = (at_start.state.history, at_start.record)
     arrays = Arrays(

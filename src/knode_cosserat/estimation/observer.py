@@ -255,12 +255,9 @@ class KalmanObserver:
         nodes = grid_of(self.robot).nodes
         ny = len(self._scale)
         # the tip's position is linear in y
-        tips = np.array(
-            [self.robot.positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.belief.spread.records)]
-        )
-        apart = (
-            np.asarray(truth.tip_position[-1]) - np.asarray(self.robot.positions(self.record[-1:, :ny]))[0]
-        )
+        positions = self.robot.drawing.positions
+        tips = np.array([positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.belief.spread.records)])
+        apart = np.asarray(truth.tip_position[-1]) - np.asarray(positions(self.record[-1:, :ny]))[0]
         own = tips.T @ tips
         covariance = own + NUMERICAL**2 * np.eye(3)
         # the tip of an inextensible rod moves on a surface: only its uncertain directions count

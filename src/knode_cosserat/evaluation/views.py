@@ -79,7 +79,7 @@ def path_of(one: Tips | ArrayLike) -> NDArray[np.float64]:
 
 def curves_of(trajectory: Trajectory) -> list[NDArray[np.float64]]:
     """Return the lines (T, points, d) of a trajectory's robot."""
-    curves = trajectory.system.curves(one_of(trajectory).y)
+    curves = trajectory.system.drawing.curves(one_of(trajectory).y)
     return [np.asarray(curve, dtype=float) for curve in curves]
 
 

@@ -14,6 +14,7 @@ import math
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
@@ -86,7 +87,7 @@ def simulated_rows(
     """
     count = steps_per_row(dt, continuous)
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
-    acting = robot.undelayed(tension, dt / count, initial)
+    acting = undelayed(robot, tension, dt / count, initial)
     found = simulate(
         robot, acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
         initial=start, recovery_budget=recovery,

@@ -11,6 +11,7 @@ from jaxtyping import Float
 
 from knode_cosserat.identification.misfit import RecordingData
 from knode_cosserat.identification.steps import simulated_rows
+from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
@@ -101,7 +102,7 @@ def _moved(
         warnings.filterwarnings("ignore", message="the grid is too coarse")
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
         if like.static:
-            tension = np.concatenate([initial[None], robot.undelayed(tension, dt, initial)])
+            tension = np.concatenate([initial[None], undelayed(robot, tension, dt, initial)])
             found = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
             return still, dataclasses.replace(found, time=dt * found.time)
         moved = simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)

@@ -25,7 +25,7 @@ def far_side(
     control: Float[Any, "T c"], history: Float[Any, "T N x"],
 ) -> Float[Any, "T N y"]:  # fmt: skip
     """Return y at all nodes, on the far side of the nominal model's discontinuities."""
-    if not (knowledge.cuts and knowledge.jumps):
+    if not (knowledge.cuts and knowledge.jump):
         return y
     # the discontinuities at the exact start of each segment
     grid = grid_of(knowledge)

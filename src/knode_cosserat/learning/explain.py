@@ -61,7 +61,7 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     whole = model.knowledge
     parts: list[tuple[str, System, Layout, Any]] = [
         ("load", knowledge, loaded(knowledge), residual.load),
-        ("tip", whole, whole.tip_layout, residual.tip_load),
+        ("tip", whole, whole.ends.layout, residual.tip_load),
     ]
     for part, system, targets, load in parts:
         if load is not None:

@@ -108,10 +108,6 @@ class KNODE(Wrapped):
         """Return the residual of the tip's boundary conditions, with the learned residual."""
         return self.residual.tip(self.adapted, t, control, y, y_t)
 
-    def trained_range(self) -> TrainedRange | None:
-        """Return the model's own training range, else the nominal model's."""
-        return self.trained if self.trained is not None else self.knowledge.trained_range()
-
     def coefficients(self) -> dict[str, Any]:
         """Return the numbers in which the residual is linear; `replace` knows them as "residual.NAME"."""
         return self.residual.coefficients()

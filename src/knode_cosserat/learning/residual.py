@@ -175,7 +175,7 @@ class Network(Residual):
 
     def inputs(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " inputs"]:
         """Return the inputs: y, z and the actuation; with history, y, ʰy, z, ʰz and the actuation."""
-        force = knowledge.actuation(point.control)
+        force = knowledge.observed.actuation(point.control)
         if self.history:
             past = point.history
             more = 0.0 if self.history_c0 is None else past.c0 - self.history_c0
@@ -259,7 +259,7 @@ def input_layout(knowledge: System, history: bool) -> Layout:
     """Return the layout of a `Network`'s inputs, for this nominal model."""
     own = [[*layout.fields] for layout in (knowledge.y_layout, knowledge.z_layout)]
     past = [[Field(f"{f.name} past", f.size, f"{f.unit}/s", f"ʰ of {f.name}") for f in part] for part in own]
-    size = jax.eval_shape(knowledge.actuation, np.zeros(knowledge.control_size)).shape[0]
+    size = jax.eval_shape(knowledge.observed.actuation, np.zeros(knowledge.control_size)).shape[0]
     seen = [*own[0], *past[0], *own[1], *past[1]] if history else [*own[0], *own[1]]
     return Layout(*seen, Field("actuation", size, "", "what of the control enters the equations"))
 

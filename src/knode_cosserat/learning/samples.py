@@ -130,7 +130,7 @@ def predict_segment(
         k, own, records = piece
         low, high = (ds * (jnp.asarray(grid.segment)[own] + jnp.asarray(grid.bounds)[own, k]) for k in (0, 1))
         history = unpacked_history(system, sample.c0, records[0])
-        if system.jumps:
+        if system.jump is not None:
             acting = jnp.asarray(grid.acting)[own]
             beyond = semi_discrete.jump(system, acting, sample.t, y, sample.control, history)
             y = jnp.where(k > 0, beyond, y)

@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
+from jaxtyping import Float
+
 from knode_cosserat.rods.parameters import parameter, place
-from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.parts import Part, RodPoint
+from knode_cosserat.rods.tendon_parts import TendonContribution
 
 
-class EarlyAnchors(Part):
+class EarlyAnchors(TendonContribution, Part):
     """A place with early anchors: beyond it each tendon keeps a part of its tension, 0 if anchored there."""
 
     kind: ClassVar[str] = "early-anchors"
@@ -18,3 +22,12 @@ class EarlyAnchors(Part):
         "", "part of each tendon's tension beyond that place", shape="list", low=-1.0, high=2.0,
         default=(1.0, 1.0, 1.0, 1.0),
     )  # fmt: skip
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Place of the anchors."""
+        return (self.at,)
+
+    def running(self, point: RodPoint, values: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return each tendon's share of the values beyond that place."""
+        return values * jnp.where(point.s < self.at * point.rod.length, 1.0, self.share)

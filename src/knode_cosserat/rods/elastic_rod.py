@@ -13,13 +13,12 @@ from __future__ import annotations
 import abc
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.parameters import parameter, part
+from knode_cosserat.rods.parameters import parameter, slot
 from knode_cosserat.rods.section import (
     ALONG,
     CircularSection,
@@ -68,7 +67,7 @@ class ElasticRod(System):
     bending_stiffness: Any = parameter(
         "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
     )
-    sections: tuple[SectionChange, ...] = part(
+    sections: tuple[SectionChange, ...] = slot(
         "where the section differs", SectionChange, many=True, default=()
     )
 
@@ -125,7 +124,7 @@ class ElasticRod(System):
         )  # fmt: skip
         if not self.sections:
             return plain
-        found = self._differences(s, control)
+        found = self.differences(s, control)
         area = found.radius * found.radius
         return Material(
             plain.Kse * (area * found.stiffness), plain.Bse * area,
@@ -133,24 +132,9 @@ class ElasticRod(System):
             plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
         )  # fmt: skip
 
-    def _differences(self, s: Any, control: Any) -> Differences:
+    def differences(self, s: Any, control: Any) -> Differences:
+        """Return the sections' changes at s (m)."""
         return differences_at(self.sections, s / self.length, self.section_controls(control))
-
-    # observables for learning
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
-        _, z = self.rest(s)
-        return z.at[3:6].set(self.material(s, control).u_star) if self.sections else z
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return the sections' factors on stiffness and damping; None without sections."""
-        if not self.sections:
-            return None
-        found = self._differences(s, control)
-        area = found.radius * found.radius
-        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        return damping * found.stiffness, damping
 
     # the law of the strains
 

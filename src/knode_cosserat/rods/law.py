@@ -61,6 +61,15 @@ class Viscoelastic(NamedTuple):
     #: nonlinear part of ε and ε_t, a pytree (`jax.tree_util.Partial`); None: none
     moment: Any = None
 
+    @property
+    def softened(self) -> Float[Any, "3 3"]:
+        """Stiffness less the softening."""
+        return self.stiffness if self.softening is None else self.stiffness - self.softening
+
+    def soften(self, loss: Float[Any, "3 3"]) -> Viscoelastic:
+        """Return the law with another loss of stiffness."""
+        return self._replace(softening=loss if self.softening is None else self.softening + loss)
+
 
 class Elastic(NamedTuple):
     """Elastic law of one strain ε: (K - softening) ε = stress."""
@@ -100,6 +109,17 @@ class MaterialLaw(NamedTuple):
     coupling: Coupling | None = None
     #: evolutions by field of z, from the strains and their rates
     internal: Callable[[Fields, Fields], dict[str, Evolution]] | None = None
+
+    def with_strain(self, name: str, strain: Viscoelastic) -> MaterialLaw:
+        """Return the law with another law of one strain."""
+        return self._replace(strains={**self.strains, name: strain})
+
+    def with_internal(self, internal: Callable[[Fields, Fields], dict[str, Evolution]]) -> MaterialLaw:
+        """Return the law with further internal variables that depend on the strains and their rates."""
+        others = self.internal
+        if others is None:
+            return self._replace(internal=internal)
+        return self._replace(internal=lambda *strains: others(*strains) | internal(*strains))
 
 
 class InternalState(NamedTuple):

@@ -16,7 +16,7 @@ class LoadCells(Part):
     """Correction of measured tensions: true tension = gain * measured + offset, for each tendon.
 
     A tendon only pulls: a negative result is set to zero. `simulate` ignores the latency and applies the
-    controls without a delay; `System.undelayed` corrects a recording for it.
+    controls without a delay; `undelayed` corrects a recording for it.
     """
 
     kind: ClassVar[str] = "load-cells"
@@ -52,3 +52,14 @@ class LoadCells(Part):
     def tension(self, measured: Float[Any, " c"]) -> Float[Any, " c"]:
         """Return true tensions (N)."""
         return jnp.maximum(self.gain * measured + self.offset, 0.0)
+
+
+def undelayed(
+    system: Any, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
+) -> Float[np.ndarray, "T c"]:
+    """Return the controls that acted on a system, from measured ones that are held for `dt` (s) each.
+
+    They are equal unless the robot's load cells have a delay. `before` acted before the first row.
+    """
+    cells = getattr(system.nominal, "load_cells", None)
+    return measured if cells is None else cells.undelayed(measured, dt, before)

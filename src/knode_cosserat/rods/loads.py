@@ -15,13 +15,22 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import choice, parameter, place
-from knode_cosserat.rods.parts import Part, require_stretch
+from knode_cosserat.rods.parts import Part, RodPoint, Wrench, require_stretch
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 
 def square_law_drag(C: Float[Any, "3 3"], q: Float[Any, "3"]) -> Float[Any, "3"]:
     """Return the drag C q ⊙ |q| against the velocity q, both in the material frame (N/m); C in kg/m²."""
     return dot(C, q * jnp.abs(q))
+
+
+def transverse_force(tension: Float[Any, " tendons"], angles: Float[Any, " tendons"]) -> Float[Any, "3"]:
+    """Return the load of the paper's crude model: f = Σ τᵢ dᵢ per metre of rod (N/m), in the global frame.
+
+    dᵢ is the unit vector at the tendon's angle (rad) in the global x-y plane. The force does not rotate with
+    the rod and there is no moment: the paper's τ·φ. Tension in N.
+    """
+    return jnp.stack([jnp.sum(tension * jnp.cos(angles)), jnp.sum(tension * jnp.sin(angles)), jnp.zeros(())])
 
 
 class Motion(NamedTuple):
@@ -39,16 +48,6 @@ class Motion(NamedTuple):
         """Return the motion from a packed y and its rate."""
         p, h, q, w = (layout.get(y, name) for name in ("p", "h", "q", "w"))
         return cls(p, rotation_matrix(h), q, w, layout.get(y_t, "q"), layout.get(y_t, "w"))
-
-
-class Wrench(NamedTuple):
-    """A force (N, or N/m) and a moment (N·m, or N) about the axis, global frame."""
-
-    force: Float[Any, "3"]
-    moment: Float[Any, "3"]
-
-    def __add__(self, other: Any) -> Wrench:
-        return Wrench(self.force + other.force, self.moment + other.moment)
 
 
 class Body(NamedTuple):
@@ -100,6 +99,16 @@ class PointLoad(Load):
     at: float = place("where it acts", default=1.0)
 
     @property
+    def applied_at(self) -> float:  # type: ignore[override]
+        """Place where it acts."""
+        return self.at
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Place where it acts."""
+        return (self.at,)
+
+    @property
     def body(self) -> Body | None:
         """The load as a rigid body about the rod's axis, or None. Bodies at one place are summed."""
         return None
@@ -119,9 +128,23 @@ class SpreadLoad(Load):
         super().__check_init__()
         require_stretch(self.begin, self.end, type(self).__name__)
 
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Places where it begins and ends."""
+        return tuple(end for end in (self.begin, self.end) if end > 0.0)
+
+    def load(self, point: RodPoint) -> Wrench:
+        """Return the load on the rod per length, zero outside of its stretch."""
+        wrench = self.wrench(point.motion, point.input)
+        if (self.begin, self.end) == (0.0, 1.0):
+            return wrench
+        length = point.rod.length
+        acts = (point.s >= self.begin * length) & (point.s <= self.end * length)
+        return Wrench(*(jnp.where(acts, term, 0.0) for term in wrench))
+
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """Return the load on the rod per length (N/m, N)."""
+        """Return the load on the rod per length (N/m, N) within its stretch."""
 
 
 _FOLLOWS = "whether it turns with the rod"

@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.rod import Rod
@@ -34,6 +36,8 @@ FIELDS = (3, 7, 10, 13, 16)
 class Leg(Rod):
     """The rod between base and platform. Its control is the control of the whole robot."""
 
+    y_layout: ClassVar[Layout] = ElasticRod.y_layout
+    z_layout: ClassVar[Layout] = ElasticRod.z_layout
     base_unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
 
     legs: int = eqx.field(static=True, default=6)
@@ -72,10 +76,6 @@ class ParallelRobot(Bundle):
     """
 
     strand_class: ClassVar[type[System]] = Leg
-    rest_is_guess: ClassVar[bool] = True
-    #: observables of the platform; the legs' observables belong to the strand
-    velocities: ClassVar[tuple[str, ...]] = ("q", "w")
-
     length: Any = _of_rod("length")
     radius: Any = _of_rod("radius")
     density: Any = _of_rod("density")
@@ -147,6 +147,23 @@ class ParallelRobot(Bundle):
         """Positions of the legs' ends relative to the platform's centre, in its frame (m)."""
         return _on_circle(self.platform_radius, self.platform_angles)
 
+    # aspects
+
+    @property
+    def ends(self) -> PlatformEnds:
+        """Facts of actuators and platform."""
+        return PlatformEnds(self)
+
+    @property
+    def drawing(self) -> PlatformDrawing:
+        """Axis and legs."""
+        return PlatformDrawing(self)
+
+    @property
+    def observed(self) -> PlatformObserved:
+        """Motion of the platform; the legs' observables belong to the strand."""
+        return PlatformObserved(self)
+
     # the state of each leg
 
     def legs(self, y: Float[Any, "*n y"]) -> list[Any]:
@@ -157,47 +174,17 @@ class ParallelRobot(Bundle):
         """Return the positions (…, legs, 3) in m of the legs' points, from states y (…, y)."""
         return self.legs(y)[0]
 
-    def curves(self, y: Any) -> list[Any]:
-        """Return every leg's curve, and the polygon of the platform's joints."""
-        legs = np.moveaxis(np.asarray(self.leg_positions(y)), -2, 0)
-        order = np.argsort(np.asarray(self.platform_angles) % (2.0 * np.pi))
-        joints = np.moveaxis(legs[np.append(order, order[0]), ..., -1, :], 0, -2)
-        return [*legs, joints]
-
     def leg_quaternions(self, y: Any) -> Any:
         """Return the orientations (…, legs, 4) of the legs' points, scalar first, from states y (…, y)."""
         return self.legs(y)[1]
 
-    def positions(self, y: Any) -> Any:
-        """Return the robot's axis (…, 3) in m, from states y (…, y); at the tip, the platform's centre."""
-        numeric: Any = jnp if is_traced((self, y)) else np
-        p, h, *_ = self.legs(y)
-        w, x = h[..., :1], h[..., 1:]
-        joints = numeric.asarray(self.joints)
-        # each robot of a batch has its own joints
-        lead = joints.shape[:-2] + (1,) * (p.ndim - joints.ndim)
-        joints = numeric.broadcast_to(joints.reshape(*lead, *joints.shape[-2:]), p.shape)
-        across = numeric.cross(x, joints)
-        k = 2.0 / numeric.sum(h * h, axis=-1, keepdims=True)
-        arms = joints + k * (w * across + numeric.cross(x, across))
-        return numeric.mean(p - arms, axis=-2)
-
-    def quaternions(self, y: Any) -> Any:
-        """Return the legs' mean orientations (…, 4), scalar first; at the tip, the platform's."""
-        numeric: Any = jnp if is_traced((self, y)) else np
-        h = self.legs(y)[1]
-        h = h / numeric.sqrt(numeric.sum(h * h, axis=-1, keepdims=True))
-        same = numeric.sum(h * h[..., :1, :], axis=-1, keepdims=True) >= 0.0
-        total = numeric.sum(numeric.where(same, h, -h), axis=-2)
-        return total / numeric.sqrt(numeric.sum(total * total, axis=-1, keepdims=True))
-
     def platform_position(self, y: Any) -> Any:
         """Return the platform's centre (…, 3) in m, from the robot's states y (…, nodes, y)."""
-        return self.positions(y[..., -1, :])
+        return self.drawing.positions(y[..., -1, :])
 
     def platform_orientation(self, y: Any) -> Any:
         """Return the platform's orientation (…, 4), scalar first, from the robot's states y (…, nodes, y)."""
-        return self.quaternions(y[..., -1, :])
+        return self.drawing.quaternions(y[..., -1, :])
 
     # the two ends, and rest
 
@@ -237,12 +224,6 @@ class ParallelRobot(Bundle):
         loads = in_strands(self, unknowns)
         return jnp.concatenate([p, h, loads, jnp.zeros((count, 6))], axis=1).reshape(-1)
 
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return y at the base with the actuators' velocities along z."""
-        legs, speed = in_strands(self, y), self.legs(y_t)[0][:, 2:]
-        q = jnp.concatenate([jnp.zeros((self.strands, 2)), speed], axis=1)
-        return jnp.concatenate([legs[:, :13], q, legs[:, 16:]], axis=1).reshape(-1)
-
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residuals of the platform's motion and of the joints with the legs' tips."""
         p, h, n, m, _, _ = self.legs(y)
@@ -262,23 +243,37 @@ class ParallelRobot(Bundle):
 
         Computed from the mean of the legs' velocities, which differ a little on a coarse grid.
         """
-        q, w = self._velocity(y)
-        q_t, w_t = self._velocity(y_t)
+        q, w = self.platform_velocity(y)
+        q_t, w_t = self.platform_velocity(y_t)
         inertia = self.inertia
         return q_t + cross(w, q), dot(inertia, w_t) + cross(w, dot(inertia, w))
 
-    def _velocity(self, y: Any) -> tuple[Any, Any]:
-        """Velocity of the platform's centre and angular velocity, both in its frame; or their rates."""
+    def platform_velocity(self, y: Any) -> tuple[Any, Any]:
+        """Return velocity and angular velocity of the platform's centre, in its frame; or their rates."""
         *_, q, w = self.legs(y)
         w = jnp.mean(w, axis=0)
         return jnp.mean(q, axis=0) - cross(w, jnp.mean(jnp.asarray(self.joints), axis=0)), w
 
+    def scales(self) -> Scales:
+        """Return a leg's scales for every leg; a gap's scale is the leg's length, a turn's one radian."""
+        leg = self.strand.scales()
+        gaps = jnp.concatenate([jnp.full(3, self.length), jnp.ones(3)])
+        rest = jnp.tile(gaps, self.strands - 1)
+        return Scales(jnp.tile(leg.y, self.strands), jnp.concatenate([leg.tip, rest]))
+
+
+class PlatformEnds(Ends):
+    """Actuators at the base, and the platform at the tip."""
+
+    system: ParallelRobot
+    rest_is_guess = True
+
     @property
-    def tip_layout(self) -> Layout:
+    def layout(self) -> Layout:
         """Force and moment on the platform, and the other legs' tip errors relative to the first leg."""
         gaps = [
             field
-            for k in range(2, self.strands + 1)
+            for k in range(2, self.system.strands + 1)
             for field in (
                 (f"gap{k}", 3, "m", f"distance of leg {k}'s tip from its joint"),
                 (f"turn{k}", 3, "rad", f"turn of leg {k}'s tip from the platform"),
@@ -290,17 +285,57 @@ class ParallelRobot(Bundle):
             *gaps,
         )
 
-    def scales(self) -> Scales:
-        """Return a leg's scales for every leg; a gap's scale is the leg's length, a turn's one radian."""
-        leg = self.strand.scales()
-        gaps = jnp.concatenate([jnp.full(3, self.length), jnp.ones(3)])
-        rest = jnp.tile(gaps, self.strands - 1)
-        return Scales(jnp.tile(leg.y, self.strands), jnp.concatenate([leg.tip, rest]))
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at the base with the actuators' velocities along z."""
+        legs, speed = in_strands(self.system, y), self.system.legs(y_t)[0][:, 2:]
+        q = jnp.concatenate([jnp.zeros((self.system.strands, 2)), speed], axis=1)
+        return jnp.concatenate([legs[:, :13], q, legs[:, 16:]], axis=1).reshape(-1)
 
-    # observables for learning
+
+class PlatformDrawing(Drawing):
+    """Axis of the robot, and lines of its legs and platform."""
+
+    system: ParallelRobot
+
+    def curves(self, y: Any) -> list[Any]:
+        """Return every leg's curve, and the polygon of the platform's joints."""
+        legs = np.moveaxis(np.asarray(self.system.leg_positions(y)), -2, 0)
+        order = np.argsort(np.asarray(self.system.platform_angles) % (2.0 * np.pi))
+        joints = np.moveaxis(legs[np.append(order, order[0]), ..., -1, :], 0, -2)
+        return [*legs, joints]
+
+    def positions(self, y: Any) -> Any:
+        """Return the robot's axis (…, 3) in m, from states y (…, y); at the tip, the platform's centre."""
+        numeric: Any = jnp if is_traced((self.system, y)) else np
+        p, h, *_ = self.system.legs(y)
+        w, x = h[..., :1], h[..., 1:]
+        joints = numeric.asarray(self.system.joints)
+        # each robot of a batch has its own joints
+        lead = joints.shape[:-2] + (1,) * (p.ndim - joints.ndim)
+        joints = numeric.broadcast_to(joints.reshape(*lead, *joints.shape[-2:]), p.shape)
+        across = numeric.cross(x, joints)
+        k = 2.0 / numeric.sum(h * h, axis=-1, keepdims=True)
+        arms = joints + k * (w * across + numeric.cross(x, across))
+        return numeric.mean(p - arms, axis=-2)
+
+    def quaternions(self, y: Any) -> Any:
+        """Return the legs' mean orientations (…, 4), scalar first; at the tip, the platform's."""
+        numeric: Any = jnp if is_traced((self.system, y)) else np
+        h = self.system.legs(y)[1]
+        h = h / numeric.sqrt(numeric.sum(h * h, axis=-1, keepdims=True))
+        same = numeric.sum(h * h[..., :1, :], axis=-1, keepdims=True) >= 0.0
+        total = numeric.sum(numeric.where(same, h, -h), axis=-2)
+        return total / numeric.sqrt(numeric.sum(total * total, axis=-1, keepdims=True))
+
+
+class PlatformObserved(Observed):
+    """Motion of the platform, in its frame."""
+
+    system: ParallelRobot
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w")
 
     @property
-    def observable_layout(self) -> Layout:
+    def layout(self) -> Layout:
         """The platform's motion, in its frame; the legs' own observables belong to the strand."""
         return Layout(
             ("acceleration", 3, "m/s2", "acceleration of the platform"),
@@ -310,9 +345,9 @@ class ParallelRobot(Bundle):
         )
 
     def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """Return the platform's acceleration, spin, q and w; see `observable_layout`."""
-        q, w = self._velocity(y)
-        q_t, w_t = self._velocity(y_t)
+        """Return the platform's acceleration, spin, q and w; see `layout`."""
+        q, w = self.system.platform_velocity(y)
+        q_t, w_t = self.system.platform_velocity(y_t)
         return jnp.concatenate([q_t + cross(w, q), w_t, q, w])
 
 

@@ -216,7 +216,7 @@ class Slot:
     optional: bool
 
 
-def part(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
+def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
     """Return a dataclass field for a part, or parts (see `parts.Part`); default None makes it optional."""
     stated = Slot(meaning, family, many, optional=default is None)
 

@@ -1,34 +1,182 @@
-"""Parts of a robot: routings of tendons, loads, ends, obstacles, sections. Each is a small class of a family.
+"""Parts of a robot: sections, loads, ends, obstacles, tendons, friction, further effects.
 
-A family is an abstract class. Its subclasses with a `kind` can be named in a robot's file. A part has its own
-parameters, and may be driven by entries of the robot's control.
+A part is a small class of a family, with its own parameters. A family is an abstract class. Its subclasses
+with a `kind` can be named in a robot's file. A part contributes to the robot (`Contribution`): fields of y
+and z, terms of the material's law and of the balance, conditions at the tip, discontinuities, controls. A rod
+asks its parts in their order (`Rod.parts`), and knows nothing else about them. A new effect is therefore one
+class: an `Effect` for any rod, or a load, a section, an obstacle.
 """
 
 from __future__ import annotations
 
+import functools
 import inspect
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple, Self
 
+from jaxtyping import Float
+
+from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields
+from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields, slots_of
 
 
-class Part(Parametrised):
-    """Base class of parts."""
+class Wrench(NamedTuple):
+    """A force (N, or N/m) and a moment (N·m, or N) about the axis, global frame."""
 
-    #: name in robot files; empty if the part cannot be written to one
-    kind: ClassVar[str] = ""
+    force: Float[Any, "3"]
+    moment: Float[Any, "3"]
+
+    def __add__(self, other: Any) -> Wrench:
+        return Wrench(self.force + other.force, self.moment + other.moment)
+
+
+class RodPoint(NamedTuple):
+    """A point of a rod, where its parts are asked for their terms."""
+
+    #: the robot, with its parameters and layouts
+    rod: Any
+    #: arclength (m) and time (s)
+    s: Any
+    t: Any
+    y: Float[Any, " y"]
+    y_t: Float[Any, " y"]
+    #: control of the robot
+    control: Any
+    #: pose and velocities (`loads.Motion`)
+    motion: Any = None
+    #: section and material (`section.Material`); None at the tip
+    material: Any = None
+    #: strains and internal variables, and their rates; None in the law and at the tip
+    z: Any = None
+    z_t: Any = None
+    #: control of the part that is asked
+    input: Any = None
+
+    def get(self, name: str) -> Any:
+        """Return a field of y or z by its name."""
+        layout = self.rod.y_layout
+        return layout.get(self.y, name) if name in layout.names else self.rod.z_layout.get(self.z, name)
+
+
+class Contribution:
+    """Terms of a part in the equations of its robot; by default there are none.
+
+    A field is stated as (name, size, unit, meaning, …), see `layout.Field`. Each field of y requires its rate
+    along the rod (`rates`). Each field of z requires its law (`evolutions`, or a part of `law`). Each unknown
+    at the base (`base_fields`) requires a condition at the tip (`tip_fields`, `tip_rows`).
+    """
+
+    #: True for the robot's actuators: the names of their controls have no prefix
+    actuates: ClassVar[bool] = False
+    #: True if the part may hold the robot against loads
+    held: ClassVar[bool] = False
+    #: True if the part damps a motion; parts with internal variables need not state it
+    damps: ClassVar[bool] = False
+    #: place at which a point load acts (`PointLoad`); None for other parts
+    applied_at: ClassVar[float | None] = None
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """Fields of the robot's control that drive this part; the robot prefixes their names."""
         return ()
 
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Places of discontinuity, as fractions of the length."""
+        return ()
+
+    def y_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
+        """Return the part's fields of y."""
+        return ()
+
+    def z_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
+        """Return the part's fields of z."""
+        return ()
+
+    def base_fields(self, rod: Any) -> tuple[str, ...]:
+        """Return the names of the fields of y that are unknown at the base; the part's others are zero."""
+        return ()
+
+    def tip_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
+        """Return the fields of the part's conditions at the tip."""
+        return ()
+
+    def rest_y(self, rod: Any, s: Any) -> Fields:
+        """Return the part's fields of y at s (m) of the unloaded robot; zero without an entry."""
+        return {}
+
+    def rest_z(self, rod: Any, strains: Float[Any, "6"]) -> Fields:
+        """Return the part's fields of z where v and u are these strains without stress; zero without one."""
+        return {}
+
+    def scales(self, rod: Any, sizes: Fields) -> Fields:
+        """Return the natural sizes of the part's fields of y and of the tip; 1 without an entry.
+
+        `sizes` has those of the rod by name, such as a force's `n` and a length's `p`.
+        """
+        return {}
+
+    def evolutions(self, point: RodPoint) -> dict[str, Evolution]:
+        """Return the laws of the internal variables that depend on y and control only."""
+        return {}
+
+    def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
+        """Return the law of the strains with this part; `internal` has the values of all `evolutions`."""
+        return law
+
+    def load(self, point: RodPoint) -> Wrench | None:
+        """Return the load on the rod per length (N/m, N), global frame; None if there is none."""
+        return None
+
+    def rates(self, point: RodPoint) -> Fields:
+        """Return the rates along the rod of the part's fields of y."""
+        return {}
+
+    def tip_rows(self, point: RodPoint) -> Any:
+        """Return the residuals of the part's conditions at the tip, one number a row; None without any."""
+        return None
+
+    def actuation(self, rod: Any, control: Any) -> Any:
+        """Return the form in which the part's control enters the equations; by default the control."""
+        return control
+
+
+class Part(Contribution, Parametrised):
+    """Base class of parts with parameters."""
+
+    #: name in robot files; empty if the part cannot be written to one
+    kind: ClassVar[str] = ""
+
+    def eased(self, part: float) -> Self:
+        """Return the part with near-discontinuities spread over 1/part of their width; by default itself."""
+        return self
+
     def __check_init__(self) -> None:
         try:
             check_fields(self)
         except ParameterError as error:
             raise ParameterError(f"{type(self).__name__}: {error}") from None
+
+
+class Effect(Part):
+    """Further physics of a rod (`Rod.effects`), such as an added mass or a layer with internal variables."""
+
+
+@functools.singledispatch
+def eased(system: Any, part: float) -> Any:
+    """Return a system whose parts have near-discontinuities spread over 1/part of their width.
+
+    Solvers use it as an intermediate problem when the direct solution fails. It is the system itself if no
+    part has any. A system that is not a list of parts registers its own function.
+    """
+    changes: dict[str, Any] = {}
+    for name in slots_of(type(system)):
+        held = getattr(system, name)
+        several = held if isinstance(held, tuple) else (held,)
+        easier = tuple(each and each.eased(part) for each in several)
+        if any(new is not old for new, old in zip(easier, several, strict=True)):
+            changes[name] = easier if isinstance(held, tuple) else easier[0]
+    return system.replace(**changes) if changes else system
 
 
 def require_stretch(begin: Any, end: Any, who: str) -> None:
@@ -47,18 +195,3 @@ def kinds_of(family: type) -> dict[str, type[Part]]:
     for each in family.__subclasses__():
         found |= kinds_of(each)
     return dict(sorted(found.items()))
-
-
-def prefixed_fields(fields: tuple[Field, ...], prefix: str) -> tuple[Field, ...]:
-    """Return fields with their part's prefix before their names."""
-    return tuple(field._replace(name=f"{prefix}_{field.name}") for field in fields)
-
-
-def shares(parts: tuple[Any, ...], first: int) -> list[slice]:
-    """Return each part's slice of the robot's control; the first begins at `first`."""
-    found = []
-    for each in parts:
-        last = first + sum(field.size for field in each.control_fields)
-        found.append(slice(first, last))
-        first = last
-    return found

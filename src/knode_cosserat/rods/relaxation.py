@@ -14,21 +14,49 @@ from typing import Any, ClassVar
 
 from jaxtyping import Float
 
-from knode_cosserat.rods.law import MaxwellBranch
+from knode_cosserat.rods.law import Fields, MaterialLaw, MaxwellBranch
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.parts import Contribution, Effect, RodPoint
+
+MEANINGS = {"v": ("1", "v of the dashpot"), "u": ("1/m", "curvature of the dashpot")}
 
 
-class Relaxation(Part):
+class Branches(Contribution):
+    """Maxwell branches beside the laws of strains; z then has the strains of their dashpots."""
+
+    #: strains with a branch
+    strains: ClassVar[tuple[str, ...]]
+    #: r and T (s)
+    stiffness: Any
+    time: Any
+
+    def z_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
+        """Return the dashpots' strains."""
+        return tuple(
+            (f"{name}_branch", 3, MEANINGS[name][0], f"{MEANINGS[name][1]} of the Maxwell branch")
+            for name in self.strains
+        )
+
+    def rest_z(self, rod: Any, strains: Float[Any, "6"]) -> Fields:
+        """Return the strains of relaxed dashpots: those of the rod."""
+        return {f"{name}_branch": rod.z_layout.get(strains, name) for name in self.strains}
+
+    def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
+        """Return the law with the branches."""
+        for name in self.strains:
+            strain = law.strains[name]
+            branch = MaxwellBranch(f"{name}_branch", self.stiffness * strain.stiffness, self.time)
+            law = law.with_strain(name, strain._replace(branch=branch))
+        return law
+
+
+class Relaxation(Branches, Effect):
     """Relaxation of bending and twisting; z then has the curvature of the branch's dashpot."""
 
     kind: ClassVar[str] = "relaxation"
+    strains: ClassVar[tuple[str, ...]] = ("u",)
 
     stiffness: Any = parameter(
         "", "r, stiffness of the Maxwell branch over the stiffness at rest", low=0.0, high=1e3
     )
     time: Any = parameter("s", "T, relaxation time of the branch", low=1e-6, high=1e6, default=1.0)
-
-    def branch(self, Kbt: Float[Any, "3 3"]) -> MaxwellBranch:
-        """Return the branch beside the law of bending and twisting with this stiffness (N m²)."""
-        return MaxwellBranch("u_branch", self.stiffness * Kbt, self.time)

@@ -14,10 +14,11 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
+from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.parameters import ParameterError, parameter, places
-from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.parts import Part, RodPoint
+from knode_cosserat.rods.tendon_parts import tension
 
 #: below this the series of √w cot √w is exact to rounding
 SMALL_PRESSURE = 1e-3
@@ -61,12 +62,21 @@ class RibSpacing(Part):
         spans = np.append(np.diff(ribs) ** 2 / 12.0, 0.0)
         return self.share * jnp.asarray(spans)[jnp.sum(sigma >= ribs[1:])]
 
-    def lost(self, sigma: Any, length: Any, Kbt: Float[Any, "3 3"], total: Any) -> Float[Any, "3 3"]:
-        """Return the loss of Kbt (N m²) at σ of a rod of that length (m), under the sum (N) of tensions."""
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Places of the ribs."""
+        return self.at or ()
+
+    def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
+        """Return the law with the loss of bending stiffness.
+
+        Tendons press on the bent rod, including its curvature at rest.
+        """
+        Kbt, length = law.strains["u"].softened, point.rod.length
         stiffness = 0.5 * (Kbt[0, 0] + Kbt[1, 1])
-        softening = self.softening + self.softening_at(sigma) * length**2
-        lost = 1.0 - pressed(3.0 * softening * total / stiffness)
-        return lost * stiffness * np.diag([1.0, 1.0, 0.0])
+        softening = self.softening + self.softening_at(point.s / length) * length**2
+        lost = 1.0 - pressed(3.0 * softening * jnp.sum(tension(point)) / stiffness)
+        return law.with_strain("u", law.strains["u"].soften(lost * stiffness * np.diag([1.0, 1.0, 0.0])))
 
 
 def pressed(w: Any) -> Any:

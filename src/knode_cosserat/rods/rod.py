@@ -6,27 +6,23 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple, Self
+import functools
+from collections.abc import Iterable
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
+from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.loads import (
-    Load,
-    Motion,
-    PointLoad,
-    SpreadLoad,
-    Wrench,
-    point_wrench,
-    square_law_drag,
-)
-from knode_cosserat.rods.parameters import ParameterError, parameter, part
-from knode_cosserat.rods.parts import prefixed_fields, shares
-from knode_cosserat.rods.section import INWARD, shape_at_rest
+from knode_cosserat.rods.loads import Load, Motion, point_wrench, square_law_drag
+from knode_cosserat.rods.parameters import ParameterError, parameter, slot
+from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
+from knode_cosserat.rods.section import INWARD, SectionChange, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
@@ -36,28 +32,118 @@ FIRST_ROOT = 1.875104068711961
 #: drag × length over mass per length, below which drag is weak: the damping ratio at an amplitude of a
 #: tenth of the length is then below 0.2 %
 WEAK_DRAG = 0.05
+#: control of a part that has none
+NO_CONTROL = np.zeros(0)
 #: default pose of the base
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class PartControls(NamedTuple):
-    """Controls of a rod's parts; sections and loads in their order."""
+class RodEnds(Ends):
+    """Ends of a rod, and the conditions of its parts."""
 
-    base: Any
-    tip: Any
-    sections: list[Any]
-    loads: list[Any]
+    system: Rod
+
+    @property
+    def held(self) -> bool:
+        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
+        return any(part.held for part in self.system.parts.values())
+
+    @property
+    def rest_is_guess(self) -> bool:
+        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
+        return self.system.tip_end.held
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the tip's conditions: force and moment, or the constrained pose; then the parts'."""
+        rod = self.system
+        norm = ("norm", 1, "1", "square of the length of the quaternion, less one")
+        fields = [*rod.tip_end.conditions, *((norm,) if "h" in rod.base_unknowns else ())]
+        return Layout(*fields, *(field for part in rod.parts.values() for field in part.tip_fields(rod)))
+
+    def poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
+        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
+        rod = self.system
+        ends = (rod.base_end, AT_ORIGIN), (rod.tip_end, rod.pose(rod.rest(rod.length)[0]))
+        base, tip = (
+            end.pose(rest, own) if isinstance(end, Clamped) else None
+            for (end, rest), own in zip(ends, rod.end_controls(control), strict=True)
+        )
+        return base, tip
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
+        rod = self.system
+        if type(rod.base_end) is Clamped:
+            return y
+        q, w = velocities(rod.pose(y), rod.pose(y_t))
+        return jnp.concatenate([y[:13], q, w, y[19:]])
+
+
+class RodObserved(Observed):
+    """Motion and bending of a rod, in the material frame, and the controls of its parts."""
+
+    system: Rod
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of `observables`."""
+        return Layout(
+            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
+            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
+            ("q", 3, "m/s", "velocity"),
+            ("w", 3, "rad/s", "angular velocity"),
+            ("u", 3, "1/m", "curvature"),
+            ("u_t", 3, "1/(m s)", "rate of the curvature"),
+        )
+
+    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+        """Return acceleration, spin, q, w, curvature and its rate; see `layout`."""
+        layout, strains = self.system.y_layout, self.system.z_layout
+        (q, w), (q_t, w_t) = ([layout.get(given, name) for name in ("q", "w")] for given in (y, y_t))
+        J = np.diag([1.0, 1.0, 2.0])
+        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
+        bent = strains.get(z, "u") - self.system.material(s, control).u_star
+        return jnp.concatenate([acceleration, spin, q, w, bent, strains.get(z_t, "u")])
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the controls of the parts in the form in which they enter the equations."""
+        rod = self.system
+        return jnp.concatenate([part.actuation(rod, own) for part, own in rod.inputs(control)])
+
+    @property
+    def has_actuation(self) -> bool:
+        """True if a part has another form of its control."""
+        plain = Contribution.actuation
+        return any(type(part).actuation is not plain for part in self.system.parts.values())
+
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
+        rod = self.system
+        u_star = rod.material(s, control).u_star if rod.sections else rod.u_star
+        return rod.with_internal(jnp.concatenate([rod.v_star, u_star]))
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Return the sections' factors on stiffness and damping; None without sections."""
+        rod = self.system
+        if not rod.sections:
+            return None
+        found = rod.differences(s, control)
+        area = found.radius * found.radius
+        others = jnp.ones(rod.z_layout.size - 6)
+        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
+        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
 
 
 class Rod(ElasticRod):
-    """A round rod with gravity, drag, loads, ends and surroundings.
+    """A round rod with gravity, drag, loads, ends, surroundings and further effects.
 
-    A subclass defines its actuators by its own `constitutive` law, or by their load on the rod,
-    `actuator_force`.
+    All other terms of its equations are contributions of its `parts`. A subclass adds parts of its own, such
+    as actuators.
     """
 
     mixed: ClassVar[bool] = False
-    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
 
     drag: Any = parameter("kg/m2", "C, square-law drag", shape="matrix", low=0.0, high=1e3, default=0.0)
     linear_drag: Any = parameter(
@@ -71,72 +157,93 @@ class Rod(ElasticRod):
         high=100.0,
         default=(0.0, 0.0, -9.81),
     )
-    loads: tuple[Load, ...] = part("what loads it beside gravity and drag", Load, many=True, default=())
-    surroundings: tuple[Obstacle, ...] = part("what it may touch", Obstacle, many=True, default=())
-    base_end: End = part("what holds it at s = 0", End, default=Clamped())
-    tip_end: End = part("what holds it at s = length", End, default=Free())
+    loads: tuple[Load, ...] = slot("what loads it beside gravity and drag", Load, many=True, default=())
+    surroundings: tuple[Obstacle, ...] = slot("what it may touch", Obstacle, many=True, default=())
+    effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
+    base_end: End = slot("what holds it at s = 0", End, default=Clamped())
+    tip_end: End = slot("what holds it at s = length", End, default=Free())
 
     def __check_init__(self) -> None:
         if not self.base_end.anywhere:
             raise ParameterError(f"base_end is {self.base_end.kind}; that is allowed as tip_end only")
 
-    # derived quantities
+    # parts
 
-    @property
+    @functools.cached_property
+    def parts(self) -> dict[str, Contribution]:
+        """Parts of the robot (`list_parts`)."""
+        return self.list_parts()
+
+    def list_parts(self) -> dict[str, Contribution]:
+        """Return the parts by the prefix of their controls, in the order of their fields in y, z and control.
+
+        A subclass adds its own to these.
+        """
+        several: Any = {
+            "section": self.sections, "obstacle": self.surroundings, "load": self.loads,
+            "effect": self.effects,
+        }  # fmt: skip
+        ends = {"base": self.base_end, "tip": self.tip_end}
+        return ends | {f"{name}{k}": each for name, those in several.items() for k, each in enumerate(those)}
+
+    @functools.cached_property
+    def y_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of y: that of the rod, then the parts' fields."""
+        return _joined(
+            ElasticRod.y_layout, (field for part in self.parts.values() for field in part.y_fields(self))
+        )
+
+    @functools.cached_property
+    def z_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of z: that of the rod, then the parts' fields."""
+        return _joined(
+            ElasticRod.z_layout, (field for part in self.parts.values() for field in part.z_fields(self))
+        )
+
+    @functools.cached_property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
-        """Unknown fields of y at the base."""
-        return self.base_end.unknowns
+        """Unknown fields of y at the base: those of its end, then of the parts."""
+        others = (name for part in self.parts.values() for name in part.base_fields(self))
+        return (*self.base_end.unknowns, *others)
 
-    @property
-    def actuator_layout(self) -> Layout:
-        """Layout of the actuators' controls; empty by default."""
-        return Layout()
-
-    @property
+    @functools.cached_property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the actuators' controls, then the controls of ends, sections and loads."""
-        driven = [
-            field for prefix, each in self._driven for field in prefixed_fields(each.control_fields, prefix)
-        ]
-        return Layout(*self.actuator_layout.fields, *driven)
+        """Layout of the parts' controls."""
+        return Layout(
+            *(
+                field if part.actuates else field._replace(name=f"{name}_{field.name}")
+                for name, part in self.parts.items()
+                for field in part.control_fields
+            )
+        )
 
-    @property
-    def _driven(self) -> list[tuple[str, Any]]:
-        """Parts that may have controls, each with the prefix of its controls' names."""
-        ends = [("base", self.base_end), ("tip", self.tip_end)]
-        sections = [(f"section{k}", each) for k, each in enumerate(self.sections)]
-        return [*ends, *sections, *((f"load{k}", each) for k, each in enumerate(self.loads))]
-
-    def _controls(self, control: Any) -> PartControls:
-        """Return the control of each part."""
-        spots = shares(tuple(each for _, each in self._driven), self.actuator_layout.size)
-        base, tip, *others = (control[spot] for spot in spots)
-        return PartControls(base, tip, others[: len(self.sections)], others[len(self.sections) :])
+    def inputs(self, control: Any) -> list[tuple[Contribution, Any]]:
+        """Return the parts, each with its control."""
+        found, first = [], 0
+        for part in self.parts.values():
+            last = first + sum(field.size for field in part.control_fields)
+            # an empty slice would only be traced
+            found.append((part, control[first:last] if last > first else NO_CONTROL))
+            first = last
+        return found
 
     def section_controls(self, control: Any) -> list[Any]:
         """Return the control of each section."""
-        return self._controls(control).sections
+        return [own for part, own in self.inputs(control) if isinstance(part, SectionChange)]
 
-    @property
-    def rest_is_guess(self) -> bool:  # type: ignore[override]
-        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
-        return self.tip_end.held
+    def end_controls(self, control: Any) -> list[Any]:
+        """Return the controls of the ends."""
+        return [own for part, own in self.inputs(control) if isinstance(part, End)]
 
-    @property
-    def held(self) -> bool:  # type: ignore[override]
-        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
-        return self.base_end.held or self.tip_end.held or bool(self.surroundings)
+    # derived quantities
 
     @property
     def is_undamped(self) -> bool:
         """True if no parameter, part or internal variable damps a motion; weak drag does not count."""
         values = (self.bending_damping, self.shear_damping, self.linear_drag)
-        internal = not set(self.z_layout.names) <= {"v", "u"}  # friction, relaxation
-        if (
-            internal
-            or self.surroundings
-            or any(value is not None and np.any(np.asarray(value)) for value in values)
-        ):
+        damped = any(value is not None and np.any(np.asarray(value)) for value in values)
+        parts = self.parts.values()
+        if damped or any(part.damps or part.z_fields(self) for part in parts):
             return False
         drag = np.max(np.asarray(self.drag)) * np.max(self.length)
         return bool(drag < WEAK_DRAG * np.min(self.mass_per_length))
@@ -147,50 +254,43 @@ class Rod(ElasticRod):
         EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
         return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
-    def eased(self, part: float) -> Self:
-        """Return the rod with smoothed contact and friction on its obstacles."""
-        if not self.surroundings:
-            return self
-        return self.replace(surroundings=tuple(each.eased(part) for each in self.surroundings))
-
-    # observables for learning
+    # aspects
 
     @property
-    def observable_layout(self) -> Layout:
+    def ends(self) -> RodEnds:
+        """Facts of the two ends."""
+        return RodEnds(self)
+
+    @property
+    def observed(self) -> RodObserved:
         """Motion and bending, in the material frame."""
-        return Layout(
-            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
-            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
-            ("q", 3, "m/s", "velocity"),
-            ("w", 3, "rad/s", "angular velocity"),
-            ("u", 3, "1/m", "curvature"),
-            ("u_t", 3, "1/(m s)", "rate of the curvature"),
-        )
+        return RodObserved(self)
 
-    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """Return acceleration, spin, q, w, curvature and its rate; see `observable_layout`."""
-        q, w = self.y_layout.get(y, "q"), self.y_layout.get(y, "w")
-        q_t, w_t = self.y_layout.get(y_t, "q"), self.y_layout.get(y_t, "w")
-        u, u_t = self.z_layout.get(z, "u"), self.z_layout.get(z_t, "u")
-        J = np.diag([1.0, 1.0, 2.0])
-        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
-        bent = u - self.material(s, control).u_star
-        return jnp.concatenate([acceleration, spin, q, w, bent, u_t])
+    # the equations
 
-    # the paper's equations
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """Return the law of v and u, linear but for the parts, and of internal variables."""
+        motion = Motion.of(self.y_layout, y, y_t)
+        point = RodPoint(self, s, t, y, y_t, control, motion, self.material(s, control))
+        parts = [(part, point._replace(input=own)) for part, own in self.inputs(control)]
+        evolutions = {name: law for part, own in parts for name, law in part.evolutions(own).items()}
 
-    def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"] | None:
-        """Return the actuators' load per length (N/m), global frame; None by default."""
-        return None
+        def law(internal: Fields) -> MaterialLaw:
+            found = self.linear_law(s, y, control)
+            for part, own in parts:
+                found = part.law(own, found, internal)
+            return found
+
+        return InternalState(evolutions, law) if evolutions else law({})
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s (paper eq. 10, spatial derivatives of the rod)."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
-        motion = Motion.of(self.y_layout, y, y_t)
+        motion, material = Motion.of(self.y_layout, y, y_t), self.material(s, control)
         _, R, q, w, q_t, w_t = motion
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         v_t, u_t = self.z_layout.get(z_t, "v"), self.z_layout.get(z_t, "u")
-        *_, rhoA, rhoJ, radius = self.material(s, control)
+        rhoA, rhoJ = material.rhoA, material.rhoJ
         dragged = square_law_drag(self.drag, q)
         if self.linear_drag is not None:
             dragged = dragged + dot(self.linear_drag, q)
@@ -201,63 +301,44 @@ class Rod(ElasticRod):
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
         q_s = v_t - cross(u, q) + cross(w, v)
         w_s = u_t - cross(u, w)
-        pushed = self.actuator_force(control)
-        if pushed is not None:
-            n_s = n_s - pushed
-        for load in self._distributed(s, motion, radius, control):
-            n_s, m_s = n_s - load.force, m_s - load.moment
-        return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s])
-
-    def _distributed(self, s: Any, motion: Motion, radius: Any, control: Any) -> list[Wrench]:
-        """Return the wrenches of loads and surroundings, per length."""
-        found = [obstacle.wrench(motion, radius) for obstacle in self.surroundings]
-        for load, own in zip(self.loads, self._controls(control).loads, strict=True):
-            if not isinstance(load, SpreadLoad):
-                continue
-            wrench = load.wrench(motion, own)
-            if (load.begin, load.end) != (0.0, 1.0):
-                acts = (s >= load.begin * self.length) & (s <= load.end * self.length)
-                wrench = Wrench(*(jnp.where(acts, each, 0.0) for each in wrench))
-            found.append(wrench)
-        return found
+        point = RodPoint(self, s, t, y, y_t, control, motion, material, z, z_t)
+        rates: Fields = {}
+        for part, own in self.inputs(control):
+            at = point._replace(input=own)
+            load = part.load(at)
+            if load is not None:
+                n_s, m_s = n_s - load.force, m_s - load.moment
+            rates |= part.rates(at)
+        return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
 
     # discontinuities: places where something begins, ends or pulls
 
-    @property
+    @functools.cached_property
     def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
-        """Places where loads and sections begin or end, and where point loads act."""
-        stretches: list[Any] = [
-            *self.sections,
-            *(load for load in self.loads if isinstance(load, SpreadLoad)),
-        ]
-        found = {end for each in stretches for end in (each.begin, each.end)}
-        found -= {0.0}
-        found |= {load.at for load in self.loads if isinstance(load, PointLoad)}
-        return tuple(sorted(cut for cut in found if cut < 1.0))
+        """Places before the tip where parts begin or end, or loads act."""
+        return tuple(sorted({cut for part in self.parts.values() for cut in part.cuts if cut < 1.0}))
 
     @property
-    def jumps(self) -> bool:  # type: ignore[override]
-        """True if a point load acts before the tip."""
-        return any(isinstance(load, PointLoad) and load.at < 1.0 for load in self.loads)
+    def jump(self) -> Any:
+        """Jump of n and m by the point loads before the tip; None without any."""
+        return self._jump if any(part.applied_at in self.cuts for part in self.parts.values()) else None
 
-    def jump(
+    def _jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
-        places = {cut: k for k, cut in enumerate(self.cuts)}
-        weights = {k: acting[places[load.at]] for k, load in self._points() if load.at in places}
-        wrench = self._point_wrench(weights, y, y_t, control)
+        wrench = self._point_wrench(dict(zip(self.cuts, acting, strict=True)), y, y_t, control)
         change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
         return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
 
-    def _points(self) -> list[tuple[int, PointLoad]]:
-        return [(k, load) for k, load in enumerate(self.loads) if isinstance(load, PointLoad)]
-
     def _point_wrench(self, weights: Any, y: Any, y_t: Any, control: Any) -> Wrench:
-        """Return the sum of the point loads, each times its weight."""
-        controls = self._controls(control).loads
+        """Return the sum of the point loads, each times the weight of its place."""
         motion = Motion.of(self.y_layout, y, y_t)
-        acting = [(self.loads[k], weight, controls[k]) for k, weight in weights.items()]
+        acting = [
+            (part, weights[part.applied_at], own)
+            for part, own in self.inputs(control)
+            if part.applied_at in weights
+        ]
         return point_wrench(acting, motion, self.gravity)
 
     # the two ends, and rest
@@ -265,13 +346,20 @@ class Rod(ElasticRod):
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return y and z of the unloaded rod at rest: straight, or with the sections' curvature."""
         s = jnp.asarray(s, dtype=float)
-        p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, self._no_control(0)), s)
-        y = jnp.concatenate([p, h, np.zeros(self.y_layout.size - 7)])
-        return y, jnp.concatenate([self.v_star, u])
+        still, _ = self.end_controls(np.zeros(self.control_layout.size))
+        p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, still), s)
+        more: Fields = {}
+        for part in self.parts.values():
+            more |= part.rest_y(self, s)
+        y = jnp.concatenate([p, h, np.zeros(12), *_ordered(more, self.y_layout)])
+        return y, self.with_internal(jnp.concatenate([self.v_star, u]))
 
-    def _no_control(self, k: int) -> np.ndarray:
-        """Return the zero control of the k-th driven part."""
-        return np.zeros(sum(field.size for field in self._driven[k][1].control_fields))
+    def with_internal(self, strains: Float[Any, "6"]) -> Float[Any, " z"]:
+        """Return z with these strains without stress, and the internal variables of the parts at rest."""
+        z: Fields = {}
+        for part in self.parts.values():
+            z |= part.rest_z(self, strains)
+        return jnp.concatenate([strains, *_ordered(z, self.z_layout, 2)])
 
     def _rest_shape(self, base: Pose, s: Any) -> tuple[Any, Any, Any]:
         if not self.sections:
@@ -292,67 +380,58 @@ class Rod(ElasticRod):
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
-        held = self.base_end.pose(AT_ORIGIN, self._controls(control).base)
+        held = self.base_end.pose(AT_ORIGIN, self.end_controls(control)[0])
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
         return self.y_layout.replaced(y, self.base_unknowns, unknowns)
 
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
-        if type(self.base_end) is Clamped:
-            return y
-        q, w = velocities(self._pose(y), self._pose(y_t))
-        return jnp.concatenate([y[:13], q, w, y[19:]])
-
-    def end_poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
-        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
-        controls, rest = self._controls(control), self._pose(self.rest(self.length)[0])
-        ends = (self.base_end, AT_ORIGIN, controls.base), (self.tip_end, rest, controls.tip)
-        base, tip = (end.pose(at, own) if isinstance(end, Clamped) else None for end, at, own in ends)
-        return base, tip
-
-    def _pose(self, y: Any) -> Pose:
+    def pose(self, y: Any) -> Pose:
+        """Return the pose in a packed y."""
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
-        at_tip = {k: 1.0 for k, load in self._points() if load.at == 1.0}
-        if at_tip:
-            loaded = self._point_wrench(at_tip, y, y_t, control)
+        if any(part.applied_at == 1.0 for part in self.parts.values()):
+            loaded = self._point_wrench({1.0: 1.0}, y, y_t, control)
             n, m = n - loaded.force, m - loaded.moment
         if type(self.tip_end) is Free:
-            left = jnp.concatenate([-n, -m])
+            rows = [-n, -m]
         else:
-            rest = self._pose(self.rest(self.length)[0])
-            held = self.tip_end.pose(rest, self._controls(control).tip)
-            left = self.tip_end.left(held, self._pose(y), n, m)
-        if "h" not in self.base_unknowns:
-            return left
-        h = self.y_layout.get(y, "h")
-        return jnp.concatenate([left, jnp.sum(h * h)[None] - 1.0])
-
-    @property
-    def tip_layout(self) -> Layout:
-        """Layout of the tip's conditions: force and moment, or the constrained pose."""
-        fields = self.tip_end.conditions
+            rest = self.pose(self.rest(self.length)[0])
+            held = self.tip_end.pose(rest, self.end_controls(control)[1])
+            rows = [self.tip_end.left(held, self.pose(y), n, m)]
         if "h" in self.base_unknowns:
-            fields = (*fields, ("norm", 1, "1", "square of the length of the quaternion, less one"))
-        return Layout(*fields)
+            h = self.y_layout.get(y, "h")
+            rows.append(jnp.sum(h * h)[None] - 1.0)
+        point = RodPoint(self, self.length, t, y, y_t, control, Motion.of(self.y_layout, y, y_t))
+        others = (part.tip_rows(point._replace(input=own)) for part, own in self.inputs(control))
+        return jnp.concatenate([*rows, *(row for row in others if row is not None)])
 
     def scales(self) -> Scales:
         """Return the scales of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
         L, EI = self.length, self.Kbt[0, 0]
         T = L * L * jnp.sqrt(self.mass_per_length / EI)
-        sizes = {
-            "p": L, "h": 1.0, "n": EI / (L * L), "m": EI / L, "q": L / T, "w": 1.0 / T,
-            "turn": 1.0, "norm": 1.0,
-        }  # fmt: skip
+        sizes: Fields = {"p": L, "n": EI / (L * L), "m": EI / L, "q": L / T, "w": 1.0 / T}
+        for part in self.parts.values():
+            sizes |= part.scales(self, sizes)
 
         def of(layout: Layout) -> Any:
-            return jnp.concatenate([jnp.full(f.size, self.scale_of(f.name, sizes)) for f in layout.fields])
+            return jnp.concatenate([jnp.full(f.size, sizes.get(f.name, 1.0)) for f in layout.fields])
 
-        return Scales(of(self.y_layout), of(self.tip_layout))
+        return Scales(of(self.y_layout), of(self.ends.layout))
 
-    def scale_of(self, name: str, sizes: dict[str, Any]) -> Any:
-        """Return the natural size of a field of y or of the tip's conditions; `sizes` are those of a beam."""
-        return sizes[name]
+
+def _joined(layout: Layout, fields: Iterable[tuple[Any, ...]]) -> Layout:
+    """Return a layout with the fields of the parts. Raises `ParameterError` if two have the same name."""
+    joined = layout + Layout(*fields)
+    for name in joined.names:
+        if joined.names.count(name) > 1:
+            raise ParameterError(f"two parts have a field {name!r}; allowed is one part of its kind")
+    return joined
+
+
+def _ordered(values: Fields, layout: Layout, first: int = 6) -> list[Any]:
+    """Return the values of a layout's fields from the `first` on, zero without one; `KeyError` for others."""
+    for name in values:
+        layout.slice(name)
+    return [values.get(field.name, np.zeros(field.size)) for field in layout.fields[first:]]

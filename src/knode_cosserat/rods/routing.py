@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -146,6 +146,80 @@ class FunctionRouting(Routing):
             raise ParameterError(f"FunctionRouting: function gives shapes {shapes}; {allowed}")
 
 
+class OffsetPaths(NamedTuple):
+    """Paths of tendons at one distance (m) from the axis; they turn about it by `twist` (rad) to the tip."""
+
+    offset: Any
+    angles: Float[Any, " c"]
+    twist: Any
+    length: Any
+
+    @property
+    def straight(self) -> bool:
+        """True if the tendons do not turn about the rod."""
+        return self.twist is None
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """Fractions of the length at which the tendons are anchored."""
+        return (1.0,) * np.shape(self.angles)[-1]
+
+    @property
+    def routings(self) -> tuple[Routing, ...]:
+        """Routings of the tendons."""
+        angles = jnp.asarray(self.angles)
+        if self.twist is not None:
+            turns = self.twist / (2.0 * np.pi)
+            return tuple(Helical(self.offset, angles[k], turns) for k in range(angles.shape[0]))
+        x, y = self.offset * jnp.cos(angles), self.offset * jnp.sin(angles)
+        return tuple(Straight(x[k], y[k]) for k in range(angles.shape[0]))
+
+    def routes(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
+        """Return r (m) and r′ of the tendons at s (m)."""
+        angles = self._angles(s)
+        r = self.offset * jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], axis=-1)
+        if self.twist is None:
+            return r, np.zeros(r.shape)
+        across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(angles)], axis=-1)
+        return r, self.twist / self.length * across
+
+    def directions(self, s: Any) -> Float[Any, "c 3"]:
+        """Return eᵢ: the direction of u in which each tendon bends the rod at s (m), material frame."""
+        angles = self._angles(s)
+        return jnp.stack([-jnp.sin(angles), jnp.cos(angles), jnp.zeros_like(angles)], axis=-1)
+
+    def _angles(self, s: Any) -> Float[Any, " c"]:
+        angles = jnp.asarray(self.angles)
+        return angles if self.twist is None else angles + self.twist * (s / self.length)
+
+
+class RoutedPaths(NamedTuple):
+    """Paths of tendons with a routing each, in a rod of a length (m)."""
+
+    routings: tuple[Routing, ...]
+    length: Any
+
+    @property
+    def straight(self) -> bool:
+        """False: the tendons may turn about the rod."""
+        return False
+
+    @property
+    def ends(self) -> tuple[float, ...]:
+        """Fractions of the length at which the tendons are anchored."""
+        return tuple(float(routing.end) for routing in self.routings)
+
+    def routes(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
+        """Return r (m) and r′ of the tendons at s (m)."""
+        return routes(self.routings, s / self.length, self.length)
+
+    def directions(self, s: Any) -> Float[Any, "c 3"]:
+        """Return eᵢ: the direction of u in which each tendon bends the rod at s (m), material frame."""
+        r, _ = self.routes(s)
+        across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(r[:, 0])], axis=-1)
+        return across / jnp.sqrt(jnp.sum(across * across, axis=1, keepdims=True) + 1e-24)
+
+
 def routes(
     routings: Sequence[Routing], sigma: Any, length: Any
 ) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
@@ -157,11 +231,6 @@ def routes(
     if all(isinstance(routing, Straight) for routing in routings):
         return r, np.zeros(r.shape)
     return r, _vectors([routing.rate(sigma) for routing in routings]) / length
-
-
-def ends(routings: Sequence[Routing]) -> np.ndarray:
-    """Return the fractions of the length (c,) at which the tendons are anchored."""
-    return np.array([routing.end for routing in routings], dtype=float)
 
 
 def path_lengths(

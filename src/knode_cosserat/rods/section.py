@@ -96,6 +96,11 @@ class SectionChange(Part):
         super().__check_init__()
         require_stretch(self.begin, self.end, type(self).__name__)
 
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Places where it begins and ends."""
+        return tuple(end for end in (self.begin, self.end) if end > 0.0)
+
     @abc.abstractmethod
     def differences(self, part: Any, control: Any) -> Differences:
         """Return the changes at a fraction, 0 to 1, of the way from `begin` to `end`."""

@@ -22,14 +22,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.loads import Motion, Wrench
+from knode_cosserat.rods.loads import Motion
 from knode_cosserat.rods.parameters import choice, parameter
-from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rotation import cross, dot
 
 
 class Obstacle(Part):
     """An obstacle that a rod touches and does not penetrate."""
+
+    held: ClassVar[bool] = True
+    damps: ClassVar[bool] = True
 
     stiffness: Any = parameter(
         "N/m2", "k, contact force per length and depth", low=0.0, high=1e12, default=1e4
@@ -47,6 +50,10 @@ class Obstacle(Part):
     @abc.abstractmethod
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """Return the distance (m) to the obstacle's surface, negative inside, and the outward unit vector."""
+
+    def load(self, point: RodPoint) -> Wrench:
+        """Return the contact's load on the rod per length."""
+        return self.wrench(point.motion, point.material.radius)
 
     def wrench(self, motion: Motion, radius: Any) -> Wrench:
         """Return the load on a rod of this radius (m) at a point, per length (N/m, N), global frame."""

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.law import InternalState, MaterialLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import (
@@ -29,7 +29,6 @@ from knode_cosserat.rods.parameters import (
     unknown_parameter,
 )
 from knode_cosserat.rods.paths import with_value
-from knode_cosserat.rotation import dot, rotation_matrix
 
 #: smallest and largest number of nodes of a rod
 FEWEST_NODES, MOST_NODES = 2, 10_000
@@ -54,12 +53,8 @@ class System(Parametrised):
 
     A subclass defines its layouts and `base_unknowns`, its `length`, `constitutive` and `balance`, `rest` and
     `tip`; most define `base` and `scales` too, and `mixed` where B is zero. All other members have defaults:
-
-        ends             moving_base, end_poses, held, rest_is_guess, tip_layout
-        discontinuities  cuts, jumps, jump
-        several rods     strands, strand
-        learning         actuation, observables, velocities, unstressed, law_factors, correction, nominal
-        drawing          positions, quaternions, curves
+    `cuts` and `jump` for discontinuities, `strand` and `strands` for several rods, `correction` and `nominal`
+    for learned residuals, and the aspects `ends`, `drawing` and `observed`.
 
     Its numeric parameters are leaves of a JAX pytree: one compiled program serves all their values, batches,
     and derivatives.
@@ -73,19 +68,11 @@ class System(Parametrised):
     #: True if B is not zero: time schemes then store y_s
     mixed: ClassVar[bool] = True
 
-    #: True if the state at rest is a guess: a simulation then starts at the equilibrium under zero control
-    rest_is_guess: ClassVar[bool] = False
-
-    #: True if the system is constrained; without constraints an equilibrium needs loads that cancel
-    held: ClassVar[bool] = True
-
-    #: velocities among the observables, on which drag and friction depend; empty: not specified
-    velocities: ClassVar[tuple[str, ...]] = ()
-
     #: places of discontinuity of the right-hand side or of y, as fractions of the length between 0 and 1
     cuts: ClassVar[tuple[float, ...]] = ()
-    #: True if y jumps at some of them
-    jumps: ClassVar[bool] = False
+    #: method (acting, t, y, y_t, control) that returns y on the far side of the acting cuts (ones; zeros
+    #: elsewhere) from y on the near side; None if y does not jump
+    jump: ClassVar[Any] = None
 
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
@@ -130,12 +117,6 @@ class System(Parametrised):
         """Learned correction of y_s and z; None without one."""
         return None
 
-    def jump(
-        self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> Float[Any, " y"]:
-        """Return y on the far side of the acting cuts (ones; zeros elsewhere), from y on the near side."""
-        raise NotImplementedError(f"{type(self).__name__} has `jumps`, but gives no `jump`")
-
     # the two ends, and rest
 
     @abc.abstractmethod
@@ -147,115 +128,40 @@ class System(Parametrised):
         fixed, _ = self.rest(jnp.zeros(()))
         return self.y_layout.replaced(jnp.asarray(fixed), self.base_unknowns, unknowns)
 
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return y at s = 0 with the velocities of a base whose pose has the rate in `y_t`."""
-        return y
-
     @abc.abstractmethod
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residuals of the boundary conditions at s = length, as many as there are unknowns."""
-
-    def end_poses(self, control: Any) -> tuple[Any, Any]:
-        """Return the constrained poses of base and tip under a control; None for a free end."""
-        return None, None
-
-    @property
-    def tip_layout(self) -> Layout:
-        """Layout of the tip's residuals; one generic field by default."""
-        return Layout(("tip", unknown_count(self), "", "conditions at the tip"))
 
     def scales(self) -> Scales:
         """Return the natural sizes of y and of the tip's residuals; ones by default."""
         return Scales(jnp.ones(self.y_layout.size), jnp.ones(unknown_count(self)))
 
-    def eased(self, part: float) -> Self:
-        """Return the system with near-discontinuities (friction, contact) spread over 1/part of their width.
-
-        Solvers use it as an intermediate problem when the direct solution fails. By default it is the system.
-        """
-        return self
-
-    # observables for learning
-
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the part of the control that enters the equations; the whole control by default."""
-        return control
+    # aspects
 
     @property
-    def has_actuation(self) -> bool:
-        """True if the actuation differs from the control."""
-        return _gives(self, "actuation")
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Return z at s of the unstressed material under this control; by default z at rest."""
-        return self.rest(s)[1]
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return factors on C and D of the strains' law at s, for each number of z; None if uniform."""
-        return None
+    def ends(self) -> Ends:
+        """Facts of the two ends."""
+        return Ends(self)
 
     @property
-    def observable_layout(self) -> Layout:
-        """Layout of `observables`: by default y, its rate, the strains relative to rest, and their rate."""
-        state, strain = self.y_layout.fields, self.z_layout.fields
-        return Layout(
-            *state,
-            *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in state),
-            *strain,
-            *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in strain),
-        )
+    def drawing(self) -> Drawing:
+        """Positions, orientations and lines of states."""
+        return Drawing(self)
 
-    def observables(
-        self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
-    ) -> Float[Any, " o"]:
-        """Return the possible arguments of an unmodelled load, beside the control, in the material frame."""
-        bent = z - self.unstressed(s, control)
-        return jnp.concatenate([in_material_frame(self, y, y), in_material_frame(self, y, y_t), bent, z_t])
-
-    # queries that every system answers
-
-    def undelayed(
-        self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
-    ) -> Float[np.ndarray, "T c"]:
-        """Return the acting controls, from measured ones that are held for `dt` (s) each.
-
-        They are equal unless the robot's sensors have a delay. `before` acted before the first row.
-        """
-        return measured
+    @property
+    def observed(self) -> Observed:
+        """Possible arguments of a learned law or load."""
+        return Observed(self)
 
     @property
     def nominal(self) -> System:
         """Robot without learned residuals, whose parameters `replace` changes; by default the system."""
         return self
 
-    def trained_range(self) -> Any:
-        """Return the `TrainedRange` of a model that was learned or identified; None if there is none."""
-        return None
-
     @property
     def control_size(self) -> int:
         """Size of a control."""
         return self.control_layout.size
-
-    def positions(self, y: Any) -> Any:
-        """Return positions (…, 3) in metres of states y (…, y)."""
-        return self._named(y, "p", "position")
-
-    def curves(self, y: Any) -> list[Any]:
-        """Return lines (…, points, 3) in m for drawing the states y (…, N, y) of one robot."""
-        return [np.asarray(self.positions(y))]
-
-    def quaternions(self, y: Any) -> Any:
-        """Return orientations (…, 4), scalar first, of states y (…, y)."""
-        return self._named(y, "h", "orientation")
-
-    def _named(self, y: Any, name: str, meaning: str) -> Any:
-        if name not in self.y_layout.names:
-            raise AttributeError(
-                f"{type(self).__name__} has no {meaning}: its y has no field {name!r} "
-                f"(there are {', '.join(self.y_layout.names)})"
-            )
-        return self.y_layout.get(y, name)
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
@@ -299,22 +205,6 @@ def unknown_count(system: System) -> int:
 def with_length_factor(system: System, factor: Any) -> System:
     """Return the system with the length of its nominal robot multiplied by a factor."""
     return system.replace(length=system.nominal.length * factor)
-
-
-def in_material_frame(system: System, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
-    """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
-    layout, parts = system.y_layout, []
-    for field in layout.fields:
-        part = layout.get(vectors, field.name)
-        if field.frame:
-            part = dot(rotation_matrix(layout.get(y, field.frame)).T, part)
-        parts.append(part)
-    return jnp.concatenate(parts)
-
-
-def _gives(system: System, name: str) -> bool:
-    """True if the class of a system defines a method that `System` only declares."""
-    return getattr(type(system), name) is not getattr(System, name)
 
 
 def is_traced(tree: Any) -> bool:

@@ -2,28 +2,41 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any
 
-import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.loads import transverse_force
+from knode_cosserat.rods.parts import RodPoint, Wrench
+from knode_cosserat.rods.tendon_parts import PulledTendons
 from knode_cosserat.rods.tendon_rod import TendonRod
-from knode_cosserat.rods.tendons import transverse_force
+
+
+@dataclasses.dataclass(frozen=True)
+class TransverseTendons(PulledTendons):
+    """Tendons that push the rod sideways."""
+
+    angles: Float[Any, " c"]
+
+    def load(self, point: RodPoint) -> Wrench:
+        """Return the resultant of the tendons' forces per length."""
+        return Wrench(transverse_force(point.input, self.angles), np.zeros(3))
+
+    def actuation(self, rod: Any, control: Any) -> Float[Any, "3"]:
+        """Return the resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ."""
+        return transverse_force(control, self.angles)
 
 
 class TendonRobot(TendonRod):
     """A round rod with tendons, gravity, drag and material damping, as in the paper.
 
-    The tendons load the rod as in the paper (`tendons.transverse_force`): a force across it, no moment, so
-    that `tendon_offset` does not matter. See `RoutedTendonRobot` for tendons that run beside the rod.
+    The tendons load the rod as in the paper (`transverse_force`): a force across it, no moment, so that
+    `tendon_offset` does not matter. See `RoutedTendonRobot` for tendons that run beside the rod.
     """
 
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the resultant of the tendons' forces per length (N/m), global frame: the paper's τ·φ."""
-        force = self.actuator_force(control)
-        count = self.actuator_layout.size
-        return force if count == self.control_size else jnp.concatenate([force, control[count:]])
-
-    def actuator_force(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """Return the resultant of the tendons' forces per length (N/m), global frame: their only load."""
-        return transverse_force(control[: self.actuator_layout.size], self.tendon_angles)
+    @property
+    def tendons(self) -> TransverseTendons:
+        """Tendons that push the rod sideways."""
+        return TransverseTendons(self.tendon_count, self.tendon_angles)

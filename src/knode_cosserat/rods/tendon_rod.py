@@ -4,20 +4,21 @@ from __future__ import annotations
 
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.parts import Contribution
 from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.routing import OffsetPaths, RoutedPaths
+from knode_cosserat.rods.tendon_parts import PulledTendons
 
 #: angles of the paper's four tendons about the rod, π/4 + iπ/2
 FOUR_TENDONS = tuple(np.pi / 4 + i * np.pi / 2 for i in range(4))
 
 
 class TendonRod(Rod):
-    """A rod with straight tendons around it. A subclass defines the tendons' action on the rod."""
+    """A rod with tendons around it. A subclass defines the part `tendons`, their action on the rod."""
 
     tendon_offset: Any = parameter(
         "m", "distance of the tendons from the rod's axis; the paper's tendon-robot ignores it", low=0.0,
@@ -28,19 +29,28 @@ class TendonRod(Rod):
     )
 
     @property
-    def actuator_layout(self) -> Layout:
-        """One tension per tendon."""
-        return Layout(("tension", np.shape(self.tendon_angles)[-1], "N", "tendon tension"))
+    def tendons(self) -> PulledTendons:
+        """Tendons, with their controls and their action on the rod."""
+        return PulledTendons(self.tendon_count)
+
+    def list_parts(self) -> dict[str, Contribution]:
+        """Return the tendons, and the parts of the rod."""
+        return {"tendons": self.tendons} | super().list_parts()
+
+    @property
+    def paths(self) -> OffsetPaths | RoutedPaths:
+        """Paths of the tendons; straight by default."""
+        return OffsetPaths(self.tendon_offset, self.tendon_angles, None, self.length)
 
     @property
     def tendon_count(self) -> int:
         """Number of tendons."""
-        return int(np.shape(self.tendon_angles)[-1])
+        return len(self.paths.ends)
 
     @property
     def tendon_ends(self) -> tuple[float, ...]:
         """Places where the tendons end, as fractions of the length."""
-        return (1.0,) * self.tendon_count
+        return self.paths.ends
 
     @property
     def moment_arm(self) -> float | None:
@@ -48,7 +58,5 @@ class TendonRod(Rod):
         return None
 
     def routes_at(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
-        """Return the tendons' places r in the cross-section at s (m), and r′; straight at their offset."""
-        angles = jnp.asarray(self.tendon_angles)
-        around = jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], axis=-1)
-        return self.tendon_offset * around, np.zeros(around.shape)
+        """Return the tendons' places r (m) in the cross-section at s (m), and r′."""
+        return self.paths.routes(s)

@@ -91,6 +91,16 @@ class TrainedRange(Part):
         return found
 
 
+def trained_range(system: Any) -> TrainedRange | None:
+    """Return the range of a learned or identified model, or of its nominal model; None without one."""
+    while system is not None:
+        found = getattr(system, "trained", None)
+        if found is not None:
+            return found
+        system = getattr(system, "knowledge", None)
+    return None
+
+
 def _rates(time: Any, z: Any) -> Any:
     """Return the rates of change since the previous row (…, T, N, z); zero in the first row."""
     numeric: Any = jnp if is_traced((time, z)) else np

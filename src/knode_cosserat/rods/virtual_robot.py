@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.rods.tendon_parts import PulledTendons
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
@@ -22,6 +23,16 @@ from knode_cosserat.rotation import cross, dot, rotation_matrix
 RIB_WIDTH = 0.02
 #: the nine ribs, as fractions of the length
 RIBS = tuple((k + 1) / 9 for k in range(9))
+
+
+class VirtualTendons(PulledTendons):
+    """Controls of a virtual robot's tendons."""
+
+    def actuation(self, rod: Any, control: Float[Any, " c"]) -> Float[Any, "3"]:
+        """Return the total tension, and its moment about the axis (N, N·m, N·m)."""
+        angles = rod.tendon_angles
+        moment = jnp.stack([jnp.sum(control * jnp.sin(angles)), -jnp.sum(control * jnp.cos(angles))])
+        return jnp.concatenate([jnp.sum(control)[None], rod.tendon_offset * moment])
 
 
 class VirtualRobot(TendonRod):
@@ -48,12 +59,10 @@ class VirtualRobot(TendonRod):
     sleeve_factor: Any = parameter("", "what the sleeve multiplies Kbt by", low=1.0, high=100.0, default=4.0)
     rib_mass: Any = parameter("kg", "mass of one of the nine ribs", low=0.0, high=1.0, default=0.0015)
 
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, "3"]:
-        """Return the total tension, and its moment about the axis (N, N·m, N·m)."""
-        moment = self.tendon_offset * jnp.stack(
-            [jnp.sum(control * jnp.sin(self.tendon_angles)), -jnp.sum(control * jnp.cos(self.tendon_angles))]
-        )
-        return jnp.concatenate([jnp.sum(control)[None], moment])
+    @property
+    def tendons(self) -> VirtualTendons:
+        """Controls of the tendons."""
+        return VirtualTendons(self.tendon_count)
 
     def stiffness(self, s: Any) -> Float[Any, "3 3"]:
         """Return Kbt at s (N·m²), increased within the sleeve."""

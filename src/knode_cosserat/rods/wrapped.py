@@ -10,19 +10,16 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.system import System
 
-#: members of `Wrapped.knowledge`: layouts, and queries that no parameter of the equations changes
+#: members of `Wrapped.knowledge`: layouts, and facts that no parameter of the equations changes
 FACTS = (
-    "y_layout", "z_layout", "control_layout", "base_unknowns", "mixed", "cuts", "jumps", "rest_is_guess",
-    "held", "has_actuation", "velocities", "strands", "tip_layout", "observable_layout", "end_poses",
-    "actuation", "positions", "curves", "quaternions", "undelayed", "trained_range", "nominal",
+    "y_layout", "z_layout", "control_layout", "base_unknowns", "mixed", "cuts", "strands", "nominal", "ends",
+    "drawing",
 )  # fmt: skip
 #: members of `Wrapped.adapted`: equations and other members that depend on parameters
-EQUATIONS = (
-    "constitutive", "balance", "correction", "jump", "base", "moving_base", "scales", "unstressed",
-    "law_factors", "observables",
-)  # fmt: skip
+EQUATIONS = ("constitutive", "balance", "correction", "base", "scales", "observed")
 
 
 class Wrapped(System):
@@ -65,10 +62,10 @@ class Wrapped(System):
         """Return the residuals of the boundary conditions at the tip, from the wrapped system."""
         return self.adapted.tip(t, control, y, y_t)
 
-    def eased(self, part: float) -> Self:
-        """Return the system with eased friction and contact of the wrapped system."""
-        easier = self.knowledge.eased(part)
-        return self if easier is self.knowledge else self.around(easier)
+    @property
+    def jump(self) -> Any:
+        """Jump of the wrapped system; None if its y does not jump."""
+        return None if self.knowledge.jump is None else self.adapted.jump
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy in which the wrapped system has other parameters (or nodes), by name."""
@@ -91,3 +88,9 @@ def _delegated(name: str, owner: str) -> Any:
 for _owner, _names in (("knowledge", FACTS), ("adapted", EQUATIONS)):
     for _name in _names:
         setattr(Wrapped, _name, _delegated(_name, _owner))
+
+
+@eased.register
+def _(system: Wrapped, part: float) -> Wrapped:
+    easier = eased(system.knowledge, part)
+    return system if easier is system.knowledge else system.around(easier)

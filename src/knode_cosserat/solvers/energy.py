@@ -42,7 +42,9 @@ SOFT, SOFT_BY_FORCE = 1e4, 200.0
 def is_tested(system: System) -> bool:
     """True for a rod, or a model of one, without actuators and contact, with dead loads only."""
     rod = system.nominal
-    if not isinstance(rod, Rod) or rod.actuator_layout.size or rod.surroundings:
+    if not isinstance(rod, Rod) or rod.surroundings or rod.effects:
+        return False
+    if any(part.actuates for part in rod.parts.values()):
         return False
     for load in rod.loads:
         lever = getattr(load, "moment", getattr(load, "offset", None))

@@ -66,7 +66,7 @@ def _poses(system: System, control: Any) -> Any:
         if isinstance(end, Pinned):
             p, h = rod.y_layout.split(rod.rest(k * jnp.asarray(rod.length))[0])[:2]
             pinned[k] = Pose(end.pose(Pose(p, h), control[:0]).p, None)
-    return system.end_poses(control), tuple(pinned)
+    return system.ends.poses(control), tuple(pinned)
 
 
 def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:

@@ -57,7 +57,7 @@ def initial_state(
     many, made = np.ndim(system.length) > 0, history_settings(settings)
     result: Any = int(Result.CONVERGED)
     control = np.zeros(system.control_size) if held is None else np.asarray(held, dtype=float)
-    if held is not None or system.rest_is_guess:
+    if held is not None or system.ends.rest_is_guess:
         record, result = _settled(system, settings, recovery_budget, control)
 
         def at_record(system: System, record: Any) -> StateHistory:

@@ -124,7 +124,7 @@ class StepProblem(eqx.Module):
     def far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""
         grid = self.grid
-        if not self.system.jumps:
+        if self.system.jump is None:
             return y[:-1]
         return jax.vmap(self.jump)(jnp.asarray(grid.acting), y[:-1], self.history[: grid.tip])
 

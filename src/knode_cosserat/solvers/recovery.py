@@ -17,6 +17,7 @@ import numpy as np
 from knode_cosserat.engine import loops as engine
 from knode_cosserat.engine.places import values_along
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.history import EXTRAPOLATIONS
 from knode_cosserat.solvers.result import Result
@@ -205,12 +206,12 @@ class Recovery(abc.ABC):
     def ease(self, control: Any) -> SolvedStep | None:
         """Continue from eased friction and contact to the system's own."""
         system = self.system
-        easiest = system.eased(EASIEST)
+        easiest = eased(system, EASIEST)
         if easiest is system:
             return None
 
         def at_part(part: float, y: Any) -> SolvedStep:
-            easier = system.eased(EASIEST ** (1.0 - part)) if part < 1.0 else system
+            easier = eased(system, EASIEST ** (1.0 - part)) if part < 1.0 else system
             return self.solve(control, y, system=easier)
 
         return self._in_parts(lambda guess: self.solve(control, guess, system=easiest), at_part)
@@ -242,7 +243,7 @@ def likely_cause(result: Result, system: System, settings: Settings, control: An
     unit = other_unit(system, np.asarray(control))
     if unit:
         return unit
-    if not system.held and settings.time is None:
+    if not system.ends.held and settings.time is None:
         return (
             "Likely cause: nothing holds the robot, which is at rest only where all loads on it cancel out; "
             "hold an end of it, or simulate its motion."

@@ -178,7 +178,7 @@ def base(
 ) -> Float[Any, " y"]:
     """Return y at the base; its velocities are those of a moving base."""
     y = system.base(t, control, unknowns)
-    return system.moving_base(y, history.y_t(y))
+    return system.ends.moving_base(y, history.y_t(y))
 
 
 def tip(system: System, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:

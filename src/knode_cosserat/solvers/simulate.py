@@ -16,7 +16,7 @@ import numpy as np
 from knode_cosserat._numbers import real_array
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
 from knode_cosserat.solvers.history import at_stages
@@ -160,7 +160,7 @@ def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
     The first row takes the mark of the last row of the trajectory that it continues.
     """
     system = trajectory.system
-    trained = system.trained_range()
+    trained = trained_range(system)
     if trained is None:
         return trajectory
     time, control, z = trajectory.time, trajectory.control, trajectory.z

@@ -89,7 +89,7 @@ class Configuration:
             ValueError: the robot's conditions at the tip are not forces and moments.
         """
         if not self._compliance.shape[1]:
-            raise ValueError("the robot's tip_layout has no force n or moment m: a wrench cannot be added")
+            raise ValueError("the robot's tip has no force n or moment m: a wrench cannot be added")
         return self._compliance
 
     @property

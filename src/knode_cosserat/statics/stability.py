@@ -155,7 +155,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
         y = np.asarray(found.y[0])
     # the velocities of an equilibrium are rounding of the solver
     y, layout = y.copy(), system.strand.y_layout
-    for name in set(system.strand.velocities) & set(layout.names):
+    for name in set(system.strand.observed.velocities) & set(layout.names):
         in_strands(system, y)[..., layout.slice(name)] = 0.0
     by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * system.strands <= POINTS]
     return _decided(system, y, control, by)

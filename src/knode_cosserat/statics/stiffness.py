@@ -151,7 +151,7 @@ def _along(
 
     def piece(y: Any, low: Any, high: Any, acting: Any) -> Any:
         jump = jnp.eye(12)
-        if system.jumps:
+        if system.jump is not None:
             near, (y, slope) = y, (problem.jump(acting, y, rest), jax.jacfwd(problem.jump, 1))
             jump = narrow(strand, y) @ slope(acting, near, rest) @ wide(strand, near)
 

@@ -82,9 +82,9 @@ def stored_of(systems: System, records: Any, store: tuple[str, ...]) -> dict[str
     ny = systems.y_layout.size
     y, z = records[..., :ny], records[..., ny:]
     known = {
-        "tip_position": lambda one, y: one.positions(y[:, -1]),
-        "tip_quaternion": lambda one, y: one.quaternions(y[:, -1]),
-        "position": lambda one, y: one.positions(y),
+        "tip_position": lambda one, y: one.drawing.positions(y[:, -1]),
+        "tip_quaternion": lambda one, y: one.drawing.quaternions(y[:, -1]),
+        "position": lambda one, y: one.drawing.positions(y),
     }
     axes = (0 if jnp.ndim(systems.length) else None, 0)
     found = {name: jax.vmap(known[name], in_axes=axes)(systems, y) for name in store if name in known}
@@ -203,7 +203,7 @@ def _settled(plan: Plan, robot: int, values: dict[str, Any], size: int) -> Settl
     from rest, which the chunk's program evaluates.
     """
     system, settings = _bare(plan, robot), plan.settings
-    if not system.rest_is_guess:
+    if not system.ends.rest_is_guess:
         return Settled(None, np.full(size, int(Result.CONVERGED)), {})
     found: list[InitialState | None] = []
     reasons: dict[int, str] = {}

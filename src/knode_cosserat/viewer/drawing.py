@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
@@ -193,7 +194,7 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
         ValueError: the system does not define positions.
     """
     try:
-        found = np.asarray(system.positions(y), dtype=float)
+        found = np.asarray(system.drawing.positions(y), dtype=float)
     except AttributeError as error:
         raise ValueError(f"{error}; without positions there is nothing to draw") from None
     if found.ndim == 3 and found.shape[-1] == 2:
@@ -209,15 +210,15 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
 def quaternions_of(system: System, y: np.ndarray) -> np.ndarray | None:
     """Return the orientations (T, N, 4), scalar first, or None if the system has none."""
     try:
-        return np.asarray(system.quaternions(y), dtype=float)
+        return np.asarray(system.drawing.quaternions(y), dtype=float)
     except AttributeError:
         return None
 
 
 def drawn_lines(system: System, y: np.ndarray, positions: np.ndarray) -> list[dict[str, Any]]:
     """Lines to be drawn beside that of the positions, if there are others: rods, and outlines that close."""
-    flat = type(system).curves is System.curves
-    found = [] if flat else [np.asarray(curve, dtype=float) for curve in system.curves(y)]
+    flat = type(system.drawing).curves is Drawing.curves
+    found = [] if flat else [np.asarray(curve, dtype=float) for curve in system.drawing.curves(y)]
     if not found or (len(found) == 1 and np.array_equal(found[0], positions, equal_nan=True)):
         return []
     rods = system.strands if system.strands > 1 else len(found)

@@ -190,11 +190,11 @@ def last_row(system: System, trajectory: Trajectory, names: Sequence[str]) -> np
     """Return the values of a trajectory's last row, array after array, for the live page."""
     nodes, _ = kept(np.shape(trajectory.y), system.z_layout.size)
     y = np.asarray(trajectory.y)[-1:]
-    curves = list(system.curves(y)) if any(name.startswith("curve") for name in names) else []
+    curves = list(system.drawing.curves(y)) if any(name.startswith("curve") for name in names) else []
     own = {"y": lambda: y[:, nodes], "z": lambda: np.asarray(trajectory.z)[-1:, nodes],
            "control": lambda: np.asarray(trajectory.control)[-1:],
            "position": lambda: positions_of(system, y)[:, nodes],
-           "orientation": lambda: np.asarray(system.quaternions(y))[:, nodes]}  # fmt: skip
+           "orientation": lambda: np.asarray(system.drawing.quaternions(y))[:, nodes]}  # fmt: skip
     parts = []
     for name in names:
         if name in own:

@@ -49,7 +49,7 @@ def structured(knowledge=ROBOT, seed=0):
         return dataclasses.replace(found, weights=1e-4 * rng.normal(size=found.weights.shape))
 
     balanced = loaded(knowledge).size
-    load = Load(law(knowledge.observable_layout, balanced), law(ambient_layout(knowledge), balanced))
+    load = Load(law(knowledge.observed.layout, balanced), law(ambient_layout(knowledge), balanced))
     tip = Load(None, law(ambient_layout(knowledge), unknown_count(knowledge)))
     assert y.size > balanced
     return Structured(np.asarray(0.01 * seed), law(z + rates, z.size, u=CURVED), load, tip)

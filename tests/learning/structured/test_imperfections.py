@@ -117,11 +117,11 @@ def test_a_body_at_the_tip_hangs_by_its_weight_and_resists_being_moved():
     y = np.zeros(19)
     y[3] = 1.0
     still = History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
-    left = np.asarray(semi_discrete.tip(robot, 0.0, None, y, still))
+    left = np.asarray(semi_discrete.tip(robot, 0.0, np.zeros(4), y, still))
     np.testing.assert_allclose(left, [0, 0, -0.02 * 9.81, -0.1 * 0.02 * 9.81, 0, 0], atol=1e-15)
     # turned about its own axis ever faster: α = 5 about z, the centre on a lever along y
     faster = History(np.zeros(()), np.r_[np.zeros(16), 0.0, 0.0, 5.0], np.zeros(6), np.zeros(19))
-    more = np.asarray(semi_discrete.tip(robot, 0.0, None, y, faster)) - left
+    more = np.asarray(semi_discrete.tip(robot, 0.0, np.zeros(4), y, faster)) - left
     np.testing.assert_allclose(
         more, [0.02 * 5 * 0.1, 0, 0, 0, 0, -1e-4 * 5 - 0.1 * 0.02 * 5 * 0.1], atol=1e-15
     )

@@ -58,7 +58,7 @@ def surveyed(robot: System, limits: ControlLimits, seed: int) -> Survey:
             f"{'the safe controls' if not valid[-1] else 'any of the random controls'} "
             f"({limits.safe.tolist()}); give other limits"
         )
-    position = np.asarray(robot.positions(y))
+    position = np.asarray(robot.drawing.positions(y))
     frame = frames(robot, y)
     origin, lateral = position[-1], frame[-1][:2]
     apart = np.linalg.norm((position[:SURVEYED][usable] - origin) @ lateral.T, axis=1)
@@ -71,7 +71,7 @@ def surveyed(robot: System, limits: ControlLimits, seed: int) -> Survey:
 def frames(robot: System, y: Float[np.ndarray, "n y"]) -> Float[np.ndarray, "n 3 3"]:
     """Return the unit vectors of cross-sections, the tangent last; those of the axes if there are none."""
     try:
-        h = robot.quaternions(y)
+        h = robot.drawing.quaternions(y)
     except AttributeError:
         return np.tile(np.eye(3), (len(y), 1, 1))
     return np.swapaxes(np.asarray(jax.vmap(rotation_matrix)(jnp.asarray(h))), 1, 2)

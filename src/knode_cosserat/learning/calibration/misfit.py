@@ -125,7 +125,7 @@ class SegmentMisfit:
         self.robot, self.unknowns, self.trajectories = robot, unknowns, list(trajectories)
         self.data: Dataset = samples(robot, trajectories, model=model)
         self.length = float(np.asarray(robot.length))
-        y, z, tip = robot.y_layout, robot.z_layout, robot.tip_layout
+        y, z, tip = robot.y_layout, robot.z_layout, robot.ends.layout
         self.fields = (*y.names, *z.names, *(f"tip {name}" if name != "tip" else name for name in tip.names))
         sizes = [field.size for layout in (y, z, tip) for field in layout.fields]
         numbers = np.repeat(np.arange(len(sizes)), sizes)
@@ -188,7 +188,7 @@ class SegmentMisfit:
         natural = [np.asarray(part) for part in self.robot.scales()]
         least = np.concatenate([LEAST * natural[0], np.zeros(len(squares) - len(natural[0]))])
         own = np.maximum(own, by_group(least, self.state_groups))
-        tip_fields = [field.size for field in self.robot.tip_layout.fields]
+        tip_fields = [field.size for field in self.robot.ends.layout.fields]
         tips = [np.mean(part) for part in np.split(natural[1], np.cumsum(tip_fields)[:-1])]
         return np.concatenate([np.where(own > 0.0, own, 1.0), tips])
 

@@ -198,11 +198,11 @@ class RolloutMisfit:
         self.robot, self.unknowns, self.near = robot, unknowns, near
         y = np.asarray(robot.rest(0.0)[0])
         try:
-            sizes = [np.size(robot.positions(y))]
+            sizes = [np.size(robot.drawing.positions(y))]
         except AttributeError as error:
             raise DataError(f"rollouts are compared in positions, and {error}") from None
         with contextlib.suppress(AttributeError):
-            sizes.append(np.size(robot.quaternions(y)))
+            sizes.append(np.size(robot.drawing.quaternions(y)))
         self.oriented = len(sizes) == 2
         #: number of a position's coordinates
         self._dimension = sizes[0]
@@ -399,7 +399,7 @@ def _held_at_start(
         seen: their positions in row 0 (m), NaN where not measured.
         ratio: the robot is unstressed if the distance to that shape is below so many times the other one.
     """
-    if not robot.rest_is_guess:
+    if not robot.ends.rest_is_guess:
         try:
             settled = np.asarray(initial_state(robot, settings, held=control).record)
         except SimulationError:

@@ -274,7 +274,7 @@ def _views(knowledge: System, points: Points) -> _Views:
     def one(row: Points) -> Any:
         point, z = _point(knowledge, row), row.z
         z_t = point.history.z_t(z)
-        observables = knowledge.observables(point.s, point.y, point.y_t, z, z_t, point.control)
+        observables = knowledge.observed.observables(point.s, point.y, point.y_t, z, z_t, point.control)
         matrix = None
         if knowledge.mixed:
             matrix = semi_discrete.load_matrix(knowledge, point, z)
@@ -343,8 +343,8 @@ def _candidates(
     knowledge: System, inputs: Layout, layout: Layout, views: _Views, curved: bool
 ) -> list[Expansion]:
     """Return the candidate expansions of a load: a simple one, and a nonlinear one if `curved`."""
-    stated = knowledge.velocities or knowledge.observable_layout.names
-    simple: dict[str, Sequence[str]] = dict.fromkeys(knowledge.velocities, DRAG)
+    stated = knowledge.observed.velocities or knowledge.observed.layout.names
+    simple: dict[str, Sequence[str]] = dict.fromkeys(knowledge.observed.velocities, DRAG)
     rich: dict[str, Sequence[str]] = dict.fromkeys(stated, CURVED)
     return [
         expansion(inputs, views.material, forms, layout.size)
@@ -396,5 +396,5 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
 def _tip_load(seen: _Seen, residual: Structured, counting: Counting) -> Load | None:
     knowledge, tips = seen.knowledge, seen.data.tips
     left, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(knowledge), tips))
-    sides = _sides(knowledge, knowledge.tip_layout, tips.y, views, curved=False)
+    sides = _sides(knowledge, knowledge.ends.layout, tips.y, views, curved=False)
     return _load(sides, -left, TOLERANCE * np.asarray(knowledge.scales().tip), counting)

@@ -154,7 +154,8 @@ class Structured(Residual):
         if self.stress is None:
             return z0
         s, _, _, control, history = point
-        z_rest, factors = knowledge.unstressed(s, control), knowledge.law_factors(s, control)
+        observed = knowledge.observed
+        z_rest, factors = observed.unstressed(s, control), observed.law_factors(s, control)
         M, linear = nominal.matrix(z0), nominal.linear
         whole = None if linear else (knowledge, point)
         law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors, whole)
@@ -189,7 +190,7 @@ class Structured(Residual):
         if self.tip_load is None:
             return conditions
         observed = tip_observables(knowledge, y, y_t, control)
-        layout, inputs = knowledge.tip_layout, ambient_inputs(knowledge, control)
+        layout, inputs = knowledge.ends.layout, ambient_inputs(knowledge, control)
         return conditions + self.tip_load(layout, knowledge.y_layout, y, observed, inputs)
 
     @staticmethod
@@ -197,12 +198,13 @@ class Structured(Residual):
         if load.material is None:
             return None
         s, _, y, control, history = point
-        return knowledge.observables(s, y, history.y_t(y), z, history.z_t(z), control)
+        return knowledge.observed.observables(s, y, history.y_t(y), z, history.z_t(z), control)
 
 
 def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
     """Return the inputs of stress: strain and rate, scaled by the local factors of the section."""
-    strain, factors = z - knowledge.unstressed(s, control), knowledge.law_factors(s, control)
+    observed = knowledge.observed
+    strain, factors = z - observed.unstressed(s, control), observed.law_factors(s, control)
     if factors is None:
         return jnp.concatenate([strain, z_t])
     return jnp.concatenate([strain * factors[0], z_t * factors[1]])
@@ -212,7 +214,7 @@ def tip_observables(knowledge: System, y: Float[Any, " y"], y_t: Any, control: A
     """Return the observables for a tip load, without the strains there, which it determines itself."""
     s = knowledge.length
     _, z = knowledge.rest(s)
-    return knowledge.observables(s, y, y_t, z, jnp.zeros_like(z), control)
+    return knowledge.observed.observables(s, y, y_t, z, jnp.zeros_like(z), control)
 
 
 def loaded(knowledge: System) -> Layout:
@@ -229,23 +231,23 @@ def geometric(knowledge: System) -> tuple[str, ...]:
 
 def material_layout(knowledge: System) -> Layout:
     """Return the input layout of a material-frame load: the observables, and the ambient inputs."""
-    return knowledge.observable_layout + ambient_layout(knowledge)
+    return knowledge.observed.layout + ambient_layout(knowledge)
 
 
 def ambient_layout(knowledge: System) -> Layout:
     """Return the input layout of an ambient load: the control, and its actuation if that differs."""
-    if not knowledge.has_actuation:
+    if not knowledge.observed.has_actuation:
         return knowledge.control_layout
-    size = jax.eval_shape(knowledge.actuation, np.zeros(knowledge.control_size)).shape[0]
+    size = jax.eval_shape(knowledge.observed.actuation, np.zeros(knowledge.control_size)).shape[0]
     actuation = Field("actuation", size, "", "what of the control enters the equations")
     return knowledge.control_layout + Layout(actuation)
 
 
 def ambient_inputs(knowledge: System, control: Any) -> Any:
     """Return the numbers laid out by `ambient_layout`."""
-    if not knowledge.has_actuation:
+    if not knowledge.observed.has_actuation:
         return control
-    return jnp.concatenate([control, knowledge.actuation(control)])
+    return jnp.concatenate([control, knowledge.observed.actuation(control)])
 
 
 def turned_back(layout: Layout, frames: Layout, y: Any, load: Any) -> Any:

@@ -155,8 +155,8 @@ def simulated_batch(
 def _tip_errors(model: System, parts: tuple[TrajectoryBatch, ...], settings: Settings, dt: float) -> Any:
     errors = []
     for course in parts:
-        found = model.positions(simulated_batch(model, course, settings, dt)[:, :, -1])
-        distance = jnp.sum((found - model.positions(course.y[:, :, -1])) ** 2, axis=-1)
+        found = model.drawing.positions(simulated_batch(model, course, settings, dt)[:, :, -1])
+        distance = jnp.sum((found - model.drawing.positions(course.y[:, :, -1])) ** 2, axis=-1)
         errors.append(jnp.sqrt(jnp.mean(distance, axis=-1)))
     return jnp.concatenate(errors)
 

@@ -1,0 +1,128 @@
+"""Aspects of a system that most systems need not state: its ends, its drawing, its observables.
+
+`System.ends`, `System.drawing` and `System.observed` return them. A system that differs from the defaults
+returns a subclass.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rotation import dot, rotation_matrix
+
+
+class Aspect:
+    """Aspect of a system."""
+
+    def __init__(self, system: Any):
+        self.system = system
+
+
+class Ends(Aspect):
+    """Facts of a system's two ends, beside their conditions (`System.base`, `System.tip`)."""
+
+    @property
+    def held(self) -> bool:
+        """True if the system is constrained; without constraints an equilibrium needs loads that cancel."""
+        return True
+
+    @property
+    def rest_is_guess(self) -> bool:
+        """True if the state at rest is a guess: a simulation starts at the equilibrium without control."""
+        return False
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the tip's residuals; one generic field by default."""
+        count = len(self.system.y_layout.indices(self.system.base_unknowns))
+        return Layout(("tip", count, "", "conditions at the tip"))
+
+    def poses(self, control: Any) -> tuple[Any, Any]:
+        """Return the constrained poses of base and tip under a control; None for a free end."""
+        return None, None
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of a base whose pose has the rate in `y_t`."""
+        return y
+
+
+class Drawing(Aspect):
+    """Positions, orientations and lines of a system's states."""
+
+    def positions(self, y: Any) -> Any:
+        """Return positions (…, 3) in metres of states y (…, y)."""
+        return self._named(y, "p", "position")
+
+    def quaternions(self, y: Any) -> Any:
+        """Return orientations (…, 4), scalar first, of states y (…, y)."""
+        return self._named(y, "h", "orientation")
+
+    def curves(self, y: Any) -> list[Any]:
+        """Return lines (…, points, 3) in m for drawing the states y (…, N, y) of one robot."""
+        return [np.asarray(self.positions(y))]
+
+    def _named(self, y: Any, name: str, meaning: str) -> Any:
+        layout = self.system.y_layout
+        if name not in layout.names:
+            raise AttributeError(
+                f"{type(self.system).__name__} has no {meaning}: its y has no field {name!r} "
+                f"(there are {', '.join(layout.names)})"
+            )
+        return layout.get(y, name)
+
+
+class Observed(Aspect):
+    """Possible arguments of a learned law or load of a system, beside its control."""
+
+    #: velocities among the observables, on which drag and friction depend; empty: not specified
+    velocities: ClassVar[tuple[str, ...]] = ()
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of `observables`: by default y, its rate, the strains relative to rest, and their rate."""
+        state, strain = self.system.y_layout.fields, self.system.z_layout.fields
+        return Layout(
+            *state,
+            *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in state),
+            *strain,
+            *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in strain),
+        )
+
+    def observables(
+        self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
+    ) -> Float[Any, " o"]:
+        """Return the possible arguments of an unmodelled load, beside the control, in the material frame."""
+        bent = z - self.unstressed(s, control)
+        return jnp.concatenate([self._in_material_frame(y, y), self._in_material_frame(y, y_t), bent, z_t])
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the part of the control that enters the equations; the whole control by default."""
+        return control
+
+    @property
+    def has_actuation(self) -> bool:
+        """True if the actuation differs from the control."""
+        return type(self).actuation is not Observed.actuation
+
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """Return z at s of the unstressed material under this control; by default z at rest."""
+        return self.system.rest(s)[1]
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Return factors on C and D of the strains' law at s, for each number of z; None if uniform."""
+        return None
+
+    def _in_material_frame(self, y: Float[Any, " y"], vectors: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return numbers with the layout of y, with vectors of the global frame in the material frame."""
+        layout, parts = self.system.y_layout, []
+        for field in layout.fields:
+            part = layout.get(vectors, field.name)
+            if field.frame:
+                part = dot(rotation_matrix(layout.get(y, field.frame)).T, part)
+            parts.append(part)
+        return jnp.concatenate(parts)
