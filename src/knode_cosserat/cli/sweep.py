@@ -15,9 +15,7 @@ from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
-    from knode_cosserat.sweeps.description import Sweep
-    from knode_cosserat.sweeps.executors import Executor
-    from knode_cosserat.sweeps.plan import Plan
+    from knode_cosserat.sweeps import Sweep
 
 
 @app.command(
@@ -105,57 +103,59 @@ def sweep(
     versions of all packages. The same command continues a sweep that was stopped or killed. Needs the extra
     `sweep`.
     """
-    executor = _executor(workers, dask, cluster, slurm)
-    given = {
-        "controls": controls,
-        "steps": steps,
-        "dt": dt,
-        "sampler": sampler,
-        "samples": samples,
-        "seed": seed,
-    }
-    described = _described(description, given, vary, store)
-    require_writable(folders=[] if dry_run else [out])
-    from knode_cosserat.sweeps.plan import Plan
+    from knode_cosserat.sweeps import Dask, Local, Plan, Slurm, run_sweep
 
+    if dask and (workers or cluster):
+        raise ValueError("--dask is for a running cluster; allowed is --dask without --workers and --cluster")
+    if slurm and not cluster:
+        raise ValueError("--slurm has parameters of jobs; required is --cluster slurm")
+    parameters: dict[str, Any] = {}
+    for text in slurm or ():
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {text!r})")
+        parameters[name] = int(value) if value.isdecimal() else value
+    options = {
+        "controls": controls, "steps": steps, "dt": dt, "sampler": sampler, "samples": samples, "seed": seed,
+        "store": None if store is None else [name.strip() for name in store.split(",")],
+    }  # fmt: skip
+    described = _described(description, options, vary or [])
+    require_writable(folders=[] if dry_run else [out])
     plan = Plan.of(described)
     facts = {
         "cases": described.case_count, "robots": len(plan.systems), "shards": plan.shard_count,
         "shard_cases": plan.shard_cases, "megabytes": round(plan.total_bytes / 1e6, 3),
     }  # fmt: skip
     if dry_run:
-        write_output(as_json, facts, [*str(described).splitlines(), _size(plan)])
+        size = (
+            f"{plan.shard_count} files of up to {plan.shard_cases} cases; "
+            f"{plan.total_bytes / 1e6:.3g} MB of numbers before compression"
+        )
+        write_output(as_json, facts, [*str(described).splitlines(), size])
         return
-    from knode_cosserat.sweeps.run import run_sweep
-
+    local = Slurm(workers or 1, cluster, parameters) if cluster else Local(workers)
     began = perf_counter()
-    data = run_sweep(described, out, executor=executor, progress=shows_progress(progress))
+    data = run_sweep(
+        described, out, executor=Dask(dask) if dask else local, progress=shows_progress(progress)
+    )
     seconds = perf_counter() - began
     facts |= {"failed": data.failed_count, "computing_time": round(seconds, 2)}
     write_output(as_json, facts, [*str(data).splitlines(), f"computed in {seconds:.1f} s"], out=out)
 
 
-def _size(plan: Plan) -> str:
-    return (
-        f"{plan.shard_count} files of up to {plan.shard_cases} cases; "
-        f"{plan.total_bytes / 1e6:.3g} MB of numbers before compression"
-    )
-
-
-def _described(name: str, given: dict[str, Any], vary: list[str] | None, store: str | None) -> Sweep:
+def _described(name: str, options: dict[str, Any], vary: list[str]) -> Sweep:
     """Return the sweep of a description, or of a robot, with the options' values."""
-    from knode_cosserat.sweeps.description import Sweep, read_mapping
+    from knode_cosserat.sweeps import Sweep
+    from knode_cosserat.sweeps._description import read_mapping
 
-    options = {key: value for key, value in given.items() if value not in (None, [])}
-    if store is not None:
-        options["store"] = [each.strip() for each in store.split(",")]
     mapping: dict[Any, Any] = {"robots": name}
     if os.path.isfile(name) and name.endswith((".yaml", ".yml")):
         content = read_mapping(name)
         mapping = mapping if "kind" in content else content
-    varied = dict(_variation(each) for each in vary or ())
-    if len(varied) < len(vary or ()):
+    varied = dict(map(_variation, vary))
+    if len(varied) < len(vary):
         raise ValueError("--vary: a name is given twice; allowed is each name once")
+    options = {key: value for key, value in options.items() if value not in (None, [])}
     if varied:
         options["vary"] = {**(mapping.get("vary") or {}), **varied}
     return Sweep.of({**mapping, **options}, name)
@@ -163,43 +163,21 @@ def _described(name: str, given: dict[str, Any], vary: list[str] | None, store: 
 
 def _variation(text: str) -> tuple[str, Any]:
     """Return the name and the values of an option NAME=VALUES."""
-    name, equals, rest = (part.strip() for part in text.partition("="))
+    name, _, rest = (part.strip() for part in text.partition("="))
     low, *more = rest.split(":")
-    ends = [numbers_in(each) for each in (low, *more[:1])]
-    if name and equals and not more and ends[0]:
-        return name, ends[0]
-    if name and equals and len(more) in (1, 2) and all(each and len(each) == 1 for each in ends):
-        found: dict[str, Any] = {"low": ends[0][0], "high": ends[1][0]}  # type: ignore[index]
+    values = numbers_in(low)
+    high = numbers_in(more[0]) if more else None
+    if name and values and not more:
+        return name, values
+    if name and values and high and len(values) == len(high) == 1 and len(more) < 3:
+        ends: dict[str, Any] = {"low": values[0], "high": high[0]}
         if len(more) == 1:
-            return name, found
+            return name, ends
         if more[1] == "log":
-            return name, found | {"scale": "log"}
+            return name, ends | {"scale": "log"}
         if more[1].isdecimal():
-            return name, found | {"count": int(more[1])}
+            return name, ends | {"count": int(more[1])}
     raise ValueError(
         f"--vary must be NAME=LOW:HIGH, NAME=LOW:HIGH:log, NAME=LOW:HIGH:COUNT or NAME=A,B,C, such as "
         f"length=0.4:0.8 (got {text!r})"
     )
-
-
-def _executor(
-    workers: int | None, dask: str | None, cluster: str | None, slurm: list[str] | None
-) -> Executor:
-    """Return the executor that the options choose."""
-    if dask and (workers or cluster):
-        raise ValueError("--dask is for a running cluster; allowed is --dask without --workers and --cluster")
-    if slurm and not cluster:
-        raise ValueError("--slurm has parameters of jobs; required is --cluster slurm")
-    from knode_cosserat.sweeps import Dask, Local, Slurm
-
-    if dask:
-        return Dask(dask)
-    if not cluster:
-        return Local(workers)
-    parameters: dict[str, Any] = {}
-    for each in slurm or ():
-        name, equals, value = (part.strip() for part in each.partition("="))
-        if not (name and equals and value):
-            raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {each!r})")
-        parameters[name] = int(value) if value.isdecimal() else value
-    return Slurm(workers or 1, cluster, parameters)

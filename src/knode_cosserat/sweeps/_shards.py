@@ -1,16 +1,14 @@
 """Shards as Parquet files: one row a case, with a version and a checksum in the file's metadata.
 
-Parquet, not Zarr: a shard is one file, so that it is there whole or not at all by one rename, whereas a Zarr
-array has a file for each chunk and array. Most tools for tables read it, and columns are read alone. A column
-with an array in each row, such as the tip's positions, is a list of fixed size; its shape is in the metadata.
+Parquet, not Zarr: a shard is one file, so that it is there whole or not at all by one rename. A column with
+an array in each row, such as the tip's positions, is a list of fixed size; its shape is in the metadata.
 """
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,14 +19,12 @@ from knode_cosserat._files.parquet_file import expansion_limit, open_parquet, re
 from knode_cosserat._files.reading import ReadError
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.errors import first_line
-from knode_cosserat.sweeps.errors import SweepError
+from knode_cosserat.sweeps._description import SweepError
 
-#: key of the metadata, and version of the format
-KEY, VERSION = b"knode-cosserat sweep", 1
-#: key of the checksum of all other metadata, and columns of text
-METADATA_CHECKSUM, TEXTS = "own_checksum", ("reason",)
-#: compression: level 1 of zstd with split bytes takes a tenth off doubles at 300 MB/s
-COMPRESSION, LEVEL = "zstd", 1
+#: key of the metadata, version of the format, and key of the checksum of all other metadata
+KEY, VERSION, METADATA_CHECKSUM = b"knode-cosserat sweep", 1, "own_checksum"
+#: columns of text
+TEXTS = ("reason",)
 
 
 class Shard(NamedTuple):
@@ -41,19 +37,27 @@ class Shard(NamedTuple):
 def shard_bytes(columns: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
     """Return the content of a shard's file; equal columns and metadata give equal bytes."""
     pyarrow = require_pyarrow()
-    arrays, shapes = {}, {}
+    arrays, shapes, split = {}, {}, []
     for name, values in columns.items():
-        shapes[name] = list(np.shape(values)[1:])
-        arrays[name] = _arrow(pyarrow, values)
+        array = np.ascontiguousarray(values)
+        shapes[name] = list(array.shape[1:])
+        if name in TEXTS:
+            arrays[name] = pyarrow.array([str(text) for text in array], pyarrow.string())
+            continue
+        arrays[name] = pyarrow.array(array.reshape(-1))
+        if shapes[name]:
+            size = int(np.prod(shapes[name]))
+            arrays[name] = pyarrow.FixedSizeListArray.from_arrays(arrays[name], size)
+        if array.dtype.kind == "f":
+            split.append(f"{name}.list.element" if shapes[name] else name)
     stated = {**about, "version": VERSION, "shapes": shapes, "checksum": checksum(columns)}
     stated[METADATA_CHECKSUM] = json_checksum(stated)
     table = pyarrow.table(arrays).replace_schema_metadata({KEY: json.dumps(stated, sort_keys=True).encode()})
-    floating = [name for name, values in columns.items() if np.asarray(values).dtype.kind == "f"]
-    paths = [name if not shapes[name] else f"{name}.list.element" for name in floating]
     sink = pyarrow.BufferOutputStream()
+    # level 1 of zstd with split bytes takes a tenth off doubles at 300 MB/s
     pyarrow.parquet.write_table(
-        table, sink, compression=COMPRESSION, compression_level=LEVEL, use_byte_stream_split=paths,
-        use_dictionary=list(TEXTS), write_statistics=[n for n in columns if not shapes[n]],
+        table, sink, compression="zstd", compression_level=1, use_byte_stream_split=split,
+        use_dictionary=list(TEXTS), write_statistics=[name for name in columns if not shapes[name]],
         row_group_size=len(table) or 1, store_schema=True,
     )  # fmt: skip
     return bytes(sink.getvalue())
@@ -82,41 +86,28 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool =
     Raises:
         SweepError: the file cannot be read, has another version, or was changed.
     """
-    with _open_shard(path) as file:
-        about = _metadata(file, path)
-        require_limited_expansion(file.metadata, path)
-        table = file.read(columns=None if verify else names)
-        try:
-            columns = {
-                name: _numpy(table.column(name), about["shapes"][name], path) for name in table.column_names
-            }
-        except (KeyError, TypeError, AttributeError) as error:
-            raise SweepError(f"{path}: damaged: {first_line(error)}") from None
-    if verify and checksum(columns) != about["checksum"]:
-        raise SweepError(f"{path}: damaged: the checksum of its columns is not the stated one")
-    missing = set(names or ()) - set(columns)
-    if missing:
-        raise SweepError(f"{path}: damaged: it has no column {min(missing)}")
-    return Shard(columns if names is None else {name: columns[name] for name in names}, about)
-
-
-def read_about(path: Path) -> dict[str, Any]:
-    """Return the metadata of a shard. Raises `SweepError`."""
-    with _open_shard(path) as file:
-        return _metadata(file, path)
-
-
-@contextlib.contextmanager
-def _open_shard(path: Path) -> Iterator[Any]:
     require_pyarrow()
     if not path.exists():
         raise SweepError(f"{path}: there is no such shard; the sweep is not complete")
     try:
         # a text that many rows have is stored once, and must not be written out for each
         with open_parquet(path, read_dictionary=TEXTS) as file:
-            yield file
+            about = _metadata(file, path)
+            require_limited_expansion(file.metadata, path)
+            table = file.read(columns=None if verify or names is None else list(names))
+            columns = {
+                name: _numpy(table.column(name).combine_chunks(), about["shapes"][name], path)
+                for name in table.column_names
+            }
     except ReadError as error:
         raise SweepError(f"{path}: damaged: {error}") from None
+    except (TypeError, AttributeError) as error:
+        raise SweepError(f"{path}: damaged: {first_line(error)}") from None
+    if verify and checksum(columns) != about["checksum"]:
+        raise SweepError(f"{path}: damaged: the checksum of its columns is not the stated one")
+    if missing := set(names or ()) - set(columns):
+        raise SweepError(f"{path}: damaged: it has no column {min(missing)}")
+    return Shard(columns if names is None else {name: columns[name] for name in names}, about)
 
 
 def _metadata(file: Any, path: Path) -> dict[str, Any]:
@@ -129,8 +120,7 @@ def _metadata(file: Any, path: Path) -> dict[str, Any]:
             f"{path}: the shard has the version {about.get('version')!r}; allowed is {VERSION}, which this "
             "version of the package reads and writes. Nothing was changed"
         )
-    # shards of earlier versions have none
-    if about.pop(METADATA_CHECKSUM, None) not in (None, json_checksum(about)):
+    if about.pop(METADATA_CHECKSUM, None) != json_checksum(about):
         raise SweepError(f"{path}: damaged: the checksum of its metadata is not the stated one")
     return about
 
@@ -144,43 +134,30 @@ def checksum(columns: Mapping[str, Any]) -> str:
             content, kind = "\0".join(map(str, values)).encode(), "text"
         else:
             content, kind = np.ascontiguousarray(values).tobytes(), values.dtype.str
-        digest.update(f"{name} {kind} {values.shape} {len(content)}\n".encode())
-        digest.update(content)
+        digest.update(f"{name} {kind} {values.shape} {len(content)}\n".encode() + content)
     return digest.hexdigest()
-
-
-def _arrow(pyarrow: Any, values: Any) -> Any:
-    array = np.ascontiguousarray(values)
-    if array.dtype.kind in "OU":
-        return pyarrow.array([str(each) for each in array], pyarrow.string())
-    if array.ndim == 1:
-        return pyarrow.array(array)
-    size = int(np.prod(array.shape[1:]))
-    return pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(array.reshape(-1)), size)
 
 
 def _numpy(column: Any, shape: Sequence[int], path: Path) -> Any:
     """Return a column (rows, *shape) as an array."""
-    rows = len(column)
-    column = column.combine_chunks()
     if hasattr(column, "chunks"):
         column = column.chunk(0)
     if hasattr(column, "dictionary"):
-        texts = column.dictionary.to_numpy(zero_copy_only=False)
-        found = texts[column.indices.to_numpy(zero_copy_only=False)]
-        total, (most, words) = sum(map(len, found)), expansion_limit(path)
+        words = column.dictionary.to_numpy(zero_copy_only=False)
+        texts = words[column.indices.to_numpy(zero_copy_only=False)]
+        total, (most, limit) = sum(map(len, texts)), expansion_limit(path)
         if total > most:
-            raise ReadError(f"its texts have {total} characters; {words}")
-        return found
-    if not shape:
-        return column.to_numpy(zero_copy_only=False)
-    return column.flatten().to_numpy(zero_copy_only=False).reshape(rows, *shape)
+            raise ReadError(f"its texts have {total} characters; {limit}")
+        return texts
+    flat = column.flatten() if shape else column
+    return flat.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
 
 
 def require_pyarrow() -> Any:
     """Return pyarrow. Raises `ImportError` with the command that installs it."""
     try:
         import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.compute  # type: ignore[import-not-found, import-untyped, unused-ignore]
         import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
     except ImportError:
         raise ImportError("sweeps need pyarrow: pip install 'knode-cosserat[sweep]'") from None

@@ -10,14 +10,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 
 from knode_cosserat._reprs import count_of, quantity, wrapped
+from knode_cosserat.errors import first_line
 from knode_cosserat.solvers.result import ResultCodes
-from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.folder import shard_numbers, shard_path
-from knode_cosserat.sweeps.manifest import read_manifest
-from knode_cosserat.sweeps.shard_file import read_about, read_shard
-
-#: most failed cases that a text lists
-MOST_LISTED = 3
+from knode_cosserat.sweeps._description import SweepError
+from knode_cosserat.sweeps._folder import read_manifest, shard_numbers, shard_path
+from knode_cosserat.sweeps._shards import read_shard, require_pyarrow
 
 
 class FailedCase(NamedTuple):
@@ -32,8 +29,9 @@ class FailedCase(NamedTuple):
 class SweepData:
     """Data of a sweep in a folder. Columns are read when they are asked for.
 
-    `data["tip_position"]` is an array of all cases; `data.shards()` gives the shards one by one, for data
-    larger than memory. A sweep that is not complete has the shards that are there.
+    `data["tip_position"]` is an array of all cases; `data.shards()` gives the shards one by one, and
+    `data.dataset()` a dataset of pyarrow, for data larger than memory. A sweep that is not complete has the
+    shards that are there.
     """
 
     folder: Path
@@ -48,22 +46,14 @@ class SweepData:
         manifest = read_manifest(folder)
         return cls(folder, manifest, shard_numbers(folder, manifest["shards"]))
 
-    # extent
-
     @property
     def is_complete(self) -> bool:
         """True if all shards are there."""
         return len(self.present) == self.manifest["shards"]
 
     def __len__(self) -> int:
-        return sum(self._rows(number) for number in self.present)
-
-    def _rows(self, number: int) -> int:
-        """Return the number of cases in a shard."""
-        each = self.manifest["cases"] // len(self.manifest["robots"])
-        size = self.manifest["shard_cases"]
-        part = number % -(-each // size)
-        return int(min(size, each - part * size))
+        cases, size = self.manifest["cases"] // len(self.manifest["robots"]), self.manifest["shard_cases"]
+        return sum(min(size, cases - number % -(-cases // size) * size) for number in self.present)
 
     @property
     def names(self) -> list[str]:
@@ -88,8 +78,7 @@ class SweepData:
     @property
     def time(self) -> np.ndarray:
         """Times (rows,) in s."""
-        sweep = self.manifest["sweep"]
-        return np.arange(sweep["steps"] + 1) * float(sweep["dt"])
+        return np.arange(self.manifest["sweep"]["steps"] + 1) * float(self.manifest["sweep"]["dt"])
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -100,16 +89,13 @@ class SweepData:
 
     def __getitem__(self, name: str) -> Any:
         """Return a column of all cases that are there, by name, in their order."""
-        column = self._column(name)
-        parts = [part[name] for part in self.shards([name])]
-        if not parts:
-            return np.zeros((0, *column["shape"]))
-        if len({np.shape(part)[1:] for part in parts}) > 1:
+        parts = [np.zeros((0, *self._column(name)["shape"])), *(part[name] for part in self.shards([name]))]
+        if len({np.shape(part)[1:] for part in parts[1:]}) > 1:
             raise SweepError(
                 f"{name} has other shapes for other robots, which are no single array; read it by shards()"
             )
-        found = np.concatenate(parts)
-        return ResultCodes.of(found) if name == "result" else found
+        column = np.concatenate(parts[1:] or parts)
+        return ResultCodes.of(column) if name == "result" else column
 
     def shards(self, names: Sequence[str] | None = None, *, verify: bool = False) -> Iterator[dict[str, Any]]:
         """Yield the columns of each shard, by name.
@@ -137,63 +123,77 @@ class SweepData:
             SweepError: a shard is missing, damaged, of another version, or of another sweep.
         """
         if not self.is_complete:
-            missing = sorted(set(range(self.manifest["shards"])) - set(self.present))
+            first = next(k for k, number in enumerate((*self.present, -1)) if k != number)
             raise SweepError(
-                f"{self.folder}: {len(missing)} of {self.manifest['shards']} shards are missing, first "
-                f"{missing[0]}; the command that began the sweep solves them"
+                f"{self.folder}: {self.manifest['shards'] - len(self.present)} of {self.manifest['shards']} "
+                f"shards are missing, first {first}; the command that began the sweep solves them"
             )
         return sum(1 for _ in self.shards(verify=True))
 
+    def dataset(self) -> Any:
+        """Return the shards as a `pyarrow.dataset.Dataset`, for filters and batches of rows."""
+        require_pyarrow()
+        import pyarrow.dataset  # type: ignore[import-not-found, import-untyped, unused-ignore]
+
+        paths = [str(shard_path(self.folder, number)) for number in self.present]
+        return pyarrow.dataset.dataset(paths, format="parquet")
+
+    def _table(self, names: list[str], failed: bool = False) -> Any:
+        """Return a table (pyarrow) of columns, of all cases or of failed ones. Raises `SweepError`."""
+        pyarrow = require_pyarrow()
+        if not self.present:
+            return pyarrow.table({name: [] for name in names})
+        try:
+            dataset = self.dataset()
+            condition = pyarrow.compute.field("reason") != "" if failed else None
+            return dataset.to_table(columns=names, filter=condition)
+        except (pyarrow.ArrowException, OSError) as error:
+            raise SweepError(f"{self.folder}: damaged: {first_line(error)}") from None
+
     def to_pandas(self) -> Any:
         """Return a table (pandas) of all columns with one number or text a case."""
-        import pandas as pd  # type: ignore[import-untyped]
-
-        names = [name for name in self.names if not self._column(name)["shape"]]
-        parts = [pd.DataFrame({name: part[name] for name in names}) for part in self.shards(names)]
-        return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame(columns=names)
+        return self._table([name for name in self.names if not self._column(name)["shape"]]).to_pandas()
 
     # failed cases
 
     @property
     def failed_count(self) -> int:
-        """Number of failed cases, from the metadata of the shards."""
-        return sum(read_about(shard_path(self.folder, number))["failed"] for number in self.present)
+        """Number of failed cases."""
+        return len(self._table(["case"], failed=True))
 
     def failed(self) -> Iterator[FailedCase]:
         """Yield the failed cases, with their reasons."""
-        names = ["case", *self.varied, "reason"]
-        for part in self.shards(names):
-            for k in np.flatnonzero(part["reason"] != ""):
-                values = {name: part[name][k].tolist() for name in self.varied}
-                yield FailedCase(int(part["case"][k]), values, str(part["reason"][k]))
+        for row in self._table(["case", *self.varied, "reason"], failed=True).to_pylist():
+            yield FailedCase(row.pop("case"), reason=row.pop("reason"), values=row)
 
     def __repr__(self) -> str:
-        manifest = self.manifest
-        sweep, robots = manifest["sweep"], manifest["robots"]
+        manifest, sweep = self.manifest, self.manifest["sweep"]
         state = "complete" if self.is_complete else f"{len(self.present)} of {manifest['shards']} shards"
         failed = self.failed_count
         lines = [
-            f"Sweep of {', '.join(each['label'] for each in robots[:MOST_LISTED])}: {len(self):,} of "
+            f"Sweep of {', '.join(robot['label'] for robot in manifest['robots'][:3])}: {len(self):,} of "
             f"{manifest['cases']:,} cases ({state}), {failed} failed",
             f"{count_of(sweep['steps'], 'step')} of {quantity(sweep['dt'], 's')}; "
             f"sampler {sweep['sampler']}, seed {sweep['seed']}",
         ]
-        lines += [f"varied: {', '.join(map(self._varied_text, self.varied))}"] if self.varied else []
-        lines.append(f"columns: {', '.join(map(self._column_text, self.names))}")
-        first = next(self.failed(), None) if failed else None
-        lines += [f"failed case {first.case}: {first.reason}"] if first else []
+        varied = [
+            f"{name} {values['low']:.4g} to {values['high']:.4g} {self.unit(name)}".strip()
+            if isinstance(values, dict)
+            else f"{name} {count_of(len(values), 'value')}"
+            for name, values in sweep["vary"].items()
+        ]
+        lines += [f"varied: {', '.join(varied)}"] if varied else []
+        columns = [
+            " ".join(
+                filter(None, [name, str(tuple(column["shape"])) * bool(column["shape"]), column["unit"]])
+            )
+            for name, column in manifest["robots"][0]["columns"].items()
+        ]
+        lines.append(f"columns: {', '.join(columns)}")
+        if failed:
+            first = next(self.failed())
+            lines.append(f"failed case {first.case}: {first.reason}")
         return "\n".join(map(wrapped, lines))
-
-    def _varied_text(self, name: str) -> str:
-        each, unit = self.manifest["sweep"]["vary"][name], self.unit(name)
-        if isinstance(each, dict):
-            return f"{name} {each['low']:.4g} to {each['high']:.4g} {unit}".strip()
-        return f"{name} {count_of(len(each), 'value')}"
-
-    def _column_text(self, name: str) -> str:
-        column = self._column(name)
-        shape = f" {tuple(column['shape'])}" if column["shape"] else ""
-        return f"{name}{shape}" + (f" {column['unit']}" if column["unit"] else "")
 
 
 def load_sweep(folder: str | Path) -> SweepData:

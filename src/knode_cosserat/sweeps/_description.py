@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -11,9 +12,8 @@ import numpy as np
 
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, mapping_of, read_yaml, shown
 from knode_cosserat._reprs import quantity
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System
-from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.sampling import MOST_SOBOL, SAMPLERS
 
 #: stored quantities by name: meaning and unit
 STORED = {
@@ -24,10 +24,19 @@ STORED = {
     "z": ("strains at all nodes, in the order of the robot's z_layout", "SI"),
     "controls": ("controls, row i held from time i dt", "SI"),
 }
-#: most cases of a shard, and most megabytes of numbers in one, if the description does not say
-SHARD_CASES, SHARD_MEGABYTES = 4096, 16
+#: samplers by name, and their largest numbers of samples: SciPy's Sobol points have 30 bits, and its Latin
+#: hypercube is computed as a whole by every worker
+SAMPLERS = {
+    "grid": math.inf, "sobol": 2**30, "halton": math.inf, "latin-hypercube": 10**7, "random": math.inf,
+}  # fmt: skip
 #: most cases of a sweep
 MOST_CASES = 10**12
+
+
+class SweepError(KnodeCosseratError, ValueError):
+    """A sweep is not possible, or its folder cannot be read or written; the message is one line."""
+
+    code = "sweep"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -45,11 +54,9 @@ class Range:
     def __post_init__(self) -> None:
         for name in ("low", "high"):
             value = getattr(self, name)
-            if not _is_number(value):
-                raise SweepError(f"{name} is {shown(value)}; allowed is a finite number")
+            _require(_is_number(value), name, value, "a finite number")
             object.__setattr__(self, name, float(value))
-        if self.scale not in ("linear", "log"):
-            raise SweepError(f"scale is {shown(self.scale)}; allowed is linear or log")
+        _require(self.scale in ("linear", "log"), "scale", self.scale, "linear or log")
         if not self.low < self.high:
             raise SweepError(f"low is {self.low:g} and high {self.high:g}; allowed is low below high")
         if self.scale == "log" and not self.low > 0.0:
@@ -57,35 +64,30 @@ class Range:
         if self.count is not None:
             _require_count("count", self.count, least=2)
 
-    def at(self, part: np.ndarray) -> np.ndarray:
+    def values(self, fraction: np.ndarray) -> np.ndarray:
         """Return the values at fractions 0 to 1 of the range; they never leave it."""
+        low, high = self.low, self.high
         if self.scale == "log":
-            low, high = np.log(self.low), np.log(self.high)
-            return np.clip(np.exp(low + part * (high - low)), self.low, self.high)
-        return np.clip(self.low + part * (self.high - self.low), self.low, self.high)
-
-    def described(self) -> dict[str, Any]:
-        """Return the range as plain data."""
-        return {name: each for name, each in dataclasses.asdict(self).items() if each is not None}
+            return np.clip(np.exp(np.log(low) + fraction * (np.log(high) - np.log(low))), low, high)
+        return np.clip(low + fraction * (high - low), low, high)
 
 
 @dataclasses.dataclass(frozen=True)
-class Robot:
+class RobotEntry:
     """One robot of a sweep: a catalog name, a robot or model file, or a system, and changed parameters."""
 
     robot: str | System
     changes: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
+    def name(self) -> str:
+        """Name or file of the robot; of a system, its class."""
+        return self.robot if isinstance(self.robot, str) else type(self.robot).__name__
+
+    @property
     def label(self) -> str:
         """Name of the robot in tables, with its changes."""
-        name = self.robot if isinstance(self.robot, str) else type(self.robot).__name__
-        return name + "".join(f", {key}={shown(value)}" for key, value in self.changes.items())
-
-    def described(self) -> Any:
-        """Return the entry as plain data."""
-        name = self.robot if isinstance(self.robot, str) else type(self.robot).__name__
-        return {"robot": name, "set": dict(self.changes)} if self.changes else name
+        return self.name + "".join(f", {key}={shown(value)}" for key, value in self.changes.items())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +116,9 @@ class Sweep:
         space: space scheme, as for `simulate`.
         recovery: try to recover failed steps, without a limit of time. It can take minutes a case.
         shard: cases in a file; by default up to 4096 and 16 MB.
+
+    Raises:
+        SweepError: a value is not allowed.
     """
 
     robots: Any
@@ -133,66 +138,52 @@ class Sweep:
     shard: int | None = None
 
     def __post_init__(self) -> None:
+        _require_count("steps", self.steps)
+        _require(_is_number(self.dt) and self.dt > 0.0, "dt", self.dt, "a number of seconds above 0")
+        _require(isinstance(self.vary, Mapping), "vary", self.vary, "a mapping from names to ranges or lists")
+        _require(
+            isinstance(self.seeds, Sequence | np.ndarray), "seeds", self.seeds, "a list of whole numbers"
+        )
+        robots = self.robots if isinstance(self.robots, list | tuple) else [self.robots]
+        if not robots:
+            raise SweepError("robots is empty; allowed is one robot or more")
         for name, value in {
-            "robots": _robots(self.robots),
+            "dt": float(self.dt),
+            "robots": tuple(map(_robot, robots)),
             "controls": _words("controls", self.controls),
-            "vary": _variations(self.vary),
-            "seeds": tuple(self.seeds) if isinstance(self.seeds, Sequence | np.ndarray) else self.seeds,
+            "vary": {name: _variation(name, values) for name, values in self.vary.items()},
+            "seeds": tuple(self.seeds),
             "store": _words("store", self.store) if self.store else (),
         }.items():
             object.__setattr__(self, name, value)
-        _require_count("steps", self.steps)
-        if not _is_number(self.dt) or not self.dt > 0.0:
-            raise SweepError(f"dt is {shown(self.dt)}; allowed is a number of seconds above 0")
-        object.__setattr__(self, "dt", float(self.dt))
         _require_count("seed", self.seed, least=0)
-        if self.shard is not None:
-            _require_count("shard", self.shard)
-        self._check_words()
-        self._check_sampler()
-
-    def _check_words(self) -> None:
-        for name in self.store:
-            if name not in STORED:
-                raise SweepError(
-                    f"store: {name!r} is unknown; allowed is {', '.join(STORED)}{did_you_mean(name, STORED)}"
-                )
-        if len(set(self.store)) < len(self.store):
-            raise SweepError(f"store is {', '.join(self.store)}; allowed is each name once")
-        for name, allowed in (("precision", ("double", "single")), ("recovery", (False, True))):
-            if getattr(self, name) not in allowed:
-                words = " or ".join(str(each).lower() for each in allowed)
-                raise SweepError(f"{name} is {shown(getattr(self, name))}; allowed is {words}")
-        if not isinstance(self.seeds, tuple):
-            raise SweepError(f"seeds is {shown(self.seeds)}; allowed is a list of whole numbers")
         for seed in self.seeds:
             _require_count("seeds", seed, least=0)
-
-    def _check_sampler(self) -> None:
-        if self.sampler not in SAMPLERS:
-            raise SweepError(
-                f"sampler is {shown(self.sampler)}; allowed is {', '.join(SAMPLERS)}"
-                f"{did_you_mean(self.sampler, SAMPLERS)}"
-            )
-        ranges = {name: each for name, each in self.vary.items() if isinstance(each, Range)}
+        if self.shard is not None:
+            _require_count("shard", self.shard)
+        for name in self.store:
+            _require_known(f"store: {name!r} is unknown", name, STORED)
+        if len(set(self.store)) < len(self.store):
+            raise SweepError(f"store is {', '.join(self.store)}; allowed is each name once")
+        _require(self.precision in ("double", "single"), "precision", self.precision, "double or single")
+        _require(self.recovery in (False, True), "recovery", self.recovery, "false or true")
+        _require_known(f"sampler is {shown(self.sampler)}", self.sampler, SAMPLERS)
         if self.sampler == "grid":
+            more = "a grid has all combinations, and no samples; leave it out, or use the sampler sobol"
             if self.samples is not None:
-                raise SweepError(
-                    f"samples is {shown(self.samples)}; a grid has all combinations, and no "
-                    "samples; leave it out, or use the sampler sobol"
-                )
-            for name, each in ranges.items():
-                if each.count is None:
+                raise SweepError(f"samples is {shown(self.samples)}; {more}")
+            for name, values in self.vary.items():
+                if isinstance(values, Range) and values.count is None:
                     raise SweepError(
                         f"vary: {name} has no count; required on a grid is the number of values, such as "
                         "count: 5; or use the sampler sobol"
                     )
+        elif self.samples is None:
+            raise SweepError(f"samples is missing; required is a number of samples for {self.sampler}")
         else:
-            if self.samples is None:
-                raise SweepError(f"samples is missing; required is a number of samples for {self.sampler}")
             _require_count("samples", self.samples)
-            if self.sampler == "sobol" and self.samples > MOST_SOBOL:
-                raise SweepError(f"samples is {self.samples}; allowed with sobol is up to {MOST_SOBOL}")
+            if self.samples > (most := SAMPLERS[self.sampler]):
+                raise SweepError(f"samples is {self.samples}; allowed with {self.sampler} is up to {most}")
         if self.case_count > MOST_CASES:
             raise SweepError(f"there are {self.case_count} cases; allowed is up to {MOST_CASES:.0e}")
 
@@ -203,21 +194,15 @@ class Sweep:
         Raises:
             SweepError: a key is unknown or missing, or a value is not allowed.
         """
-        known = [field.name for field in dataclasses.fields(cls)]
         if not isinstance(mapping, Mapping):
             raise SweepError(f"{source}: the sweep is {shown(mapping)}; allowed is a mapping of settings")
-        for key in mapping:
-            if key not in known:
-                raise SweepError(
-                    f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}"
-                    f"{did_you_mean(key, known)}"
-                )
-        for key in ("robots", "controls", "steps", "dt"):
-            if key not in mapping:
-                raise SweepError(
-                    f"{source}: the key {key!r} is missing; required is robots, controls, steps, dt"
-                )
+        known = [field.name for field in dataclasses.fields(cls)]
         try:
+            for key in mapping:
+                _require_known(f"the key {shown(key)} is unknown", key, known)
+            for key in known[:4]:
+                if key not in mapping:
+                    raise SweepError(f"the key {key!r} is missing; required is {', '.join(known[:4])}")
             return cls(**mapping)
         except SweepError as error:
             raise SweepError(f"{source}: {error}") from None
@@ -232,10 +217,7 @@ class Sweep:
         """Number of samples."""
         if self.sampler != "grid":
             return int(self.samples or 0)
-        count = 1
-        for each in self.vary.values():
-            count *= int(each.count or 1) if isinstance(each, Range) else len(each)
-        return count
+        return math.prod(value_count(values) for values in self.vary.values())
 
     @property
     def case_count(self) -> int:
@@ -244,22 +226,24 @@ class Sweep:
 
     def described(self) -> dict[str, Any]:
         """Return the sweep as plain data, as in a YAML file."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return values | {
-            "robots": [each.described() for each in self.robots],
-            "controls": list(self.controls),
-            "vary": {
-                name: each.described() if isinstance(each, Range) else list(each)
-                for name, each in self.vary.items()
-            },
-            "seeds": [int(each) for each in self.seeds],
+        varied = {
+            name: {key: value for key, value in dataclasses.asdict(values).items() if value is not None}
+            if isinstance(values, Range) else list(values)
+            for name, values in self.vary.items()
+        }  # fmt: skip
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {
+            "robots": [
+                {"robot": robot.name, "set": dict(robot.changes)} if robot.changes else robot.name
+                for robot in self.robots
+            ],
+            "controls": list(self.controls), "vary": varied, "seeds": [int(seed) for seed in self.seeds],
             "store": list(self.store),
-        }
+        }  # fmt: skip
 
     def __repr__(self) -> str:
         varied = ", ".join(
-            f"{name} {quantity(np.array([each.low, each.high]))}" if isinstance(each, Range) else name
-            for name, each in self.vary.items()
+            f"{name} {quantity(np.array([values.low, values.high]))}" if isinstance(values, Range) else name
+            for name, values in self.vary.items()
         )
         return (
             f"Sweep: {self.case_count:,} cases ({len(self.robots)} robots, {len(self.controls)} controls, "
@@ -276,83 +260,81 @@ def read_mapping(path: str | Path) -> dict[Any, Any]:
         raise SweepError(f"{path}: {error}") from None
 
 
+def value_count(variation: Range | tuple[Any, ...]) -> int:
+    """Return the number of values of a variation on a grid."""
+    return int(variation.count or 1) if isinstance(variation, Range) else len(variation)
+
+
 # checks
 
 
+def _require(fair: bool, name: str, value: Any, allowed: str) -> None:
+    if not fair:
+        raise SweepError(f"{name} is {shown(value)}; allowed is {allowed}")
+
+
+def _require_known(problem: str, name: Any, known: Collection[str]) -> None:
+    if name not in known:
+        raise SweepError(f"{problem}; allowed is {', '.join(known)}{did_you_mean(name, known)}")
+
+
 def _is_number(value: Any) -> bool:
-    whole = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return whole and bool(np.isfinite(value))
+    real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return real and bool(np.isfinite(value))
 
 
 def _require_count(name: str, value: Any, least: int = 1) -> None:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
-        raise SweepError(f"{name} is {shown(value)}; allowed is a whole number from {least} on")
+    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+    _require(whole and value >= least, name, value, f"a whole number from {least} on")
 
 
-def _words(name: str, given: Any) -> tuple[str, ...]:
-    words = (given,) if isinstance(given, str) else tuple(given) if isinstance(given, list | tuple) else ()
-    if not words or not all(isinstance(each, str) for each in words):
-        raise SweepError(f"{name} is {shown(given)}; allowed is a word or a list of words")
+def _words(name: str, value: Any) -> tuple[str, ...]:
+    words = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list | tuple) else ()
+    fair = bool(words) and all(isinstance(word, str) for word in words)
+    _require(fair, name, value, "a word or a list of words")
     return words
 
 
-def _robots(given: Any) -> tuple[Robot, ...]:
-    entries = list(given) if isinstance(given, list | tuple) else [given]
-    if not entries:
-        raise SweepError("robots is empty; allowed is one robot or more")
-    found = []
-    for entry in entries:
-        if isinstance(entry, Robot):
-            found.append(entry)
-        elif isinstance(entry, str | System):
-            found.append(Robot(entry))
-        elif isinstance(entry, Mapping) and {"robot"} <= entry.keys() <= {"robot", "set"}:
-            changes = entry.get("set") or {}
-            if not isinstance(entry["robot"], str | System) or not isinstance(changes, Mapping):
-                raise SweepError(f"robots: {shown(entry)} is not understood; allowed is a name and a mapping")
-            found.append(Robot(entry["robot"], dict(changes)))
-        else:
-            raise SweepError(
-                f"robots: {shown(entry)} is not understood; allowed is a name, a file, or robot: NAME with "
-                "set: {PARAMETER: VALUE}"
-            )
-    return tuple(found)
+def _robot(entry: Any) -> RobotEntry:
+    if isinstance(entry, RobotEntry):
+        return entry
+    if isinstance(entry, str | System):
+        return RobotEntry(entry)
+    if not isinstance(entry, Mapping) or not {"robot"} <= entry.keys() <= {"robot", "set"}:
+        raise SweepError(
+            f"robots: {shown(entry)} is not understood; allowed is a name, a file, or robot: NAME with "
+            "set: {PARAMETER: VALUE}"
+        )
+    changes = entry.get("set") or {}
+    if not isinstance(entry["robot"], str | System) or not isinstance(changes, Mapping):
+        raise SweepError(f"robots: {shown(entry)} is not understood; allowed is a name and a mapping")
+    return RobotEntry(entry["robot"], dict(changes))
 
 
-def _variations(given: Any) -> dict[str, Range | tuple[Any, ...]]:
-    if not isinstance(given, Mapping):
-        raise SweepError(f"vary is {shown(given)}; allowed is a mapping from names to ranges or lists")
-    return {name: _variation(name, each) for name, each in given.items()}
-
-
-def _variation(name: Any, given: Any) -> Range | tuple[Any, ...]:
+def _variation(name: Any, values: Any) -> Range | tuple[Any, ...]:
     if not isinstance(name, str):
         raise SweepError(f"vary: the name {shown(name)} is not text")
-    fields = [field.name for field in dataclasses.fields(Range)]
-    if isinstance(given, Range):
-        return given
+    if isinstance(values, Range):
+        return values
     try:
-        if isinstance(given, Mapping):
-            for key in given:
-                if key not in fields:
-                    raise SweepError(
-                        f"the key {shown(key)} is unknown; allowed is {', '.join(fields)}"
-                        f"{did_you_mean(key, fields)}"
-                    )
-            if not {"low", "high"} <= given.keys():
+        if isinstance(values, Mapping):
+            known = [field.name for field in dataclasses.fields(Range)]
+            for key in values:
+                _require_known(f"the key {shown(key)} is unknown", key, known)
+            if not {"low", "high"} <= values.keys():
                 raise SweepError("low and high are required")
-            return Range(**given)
-        values = given.tolist() if isinstance(given, np.ndarray) else given
+            return Range(**values)
+        values = values.tolist() if isinstance(values, np.ndarray) else values
         if not isinstance(values, list | tuple) or not values:
             raise SweepError(
-                f"{shown(given)} is not understood; allowed is low and high, or a list of values"
+                f"{shown(values)} is not understood; allowed is low and high, or a list of values"
             )
         try:
             array = np.asarray(values, dtype=float)
         except (TypeError, ValueError):
             array = np.array(np.nan)
         if not np.all(np.isfinite(array)):
-            raise SweepError(f"{shown(given)} is not a list of finite numbers, or of vectors of one size")
+            raise SweepError(f"{shown(values)} is not a list of finite numbers, or of vectors of one size")
         return tuple(array.tolist())
     except SweepError as error:
         raise SweepError(f"vary: {name}: {error}") from None
