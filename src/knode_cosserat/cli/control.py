@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import webbrowser
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,71 +17,28 @@ from knode_cosserat.cli.program import app, examples
 
 #: distance from the nearest tip at rest at which a warning is given, as part of the length
 OUT_OF_REACH = 2e-3
-#: names of controllers, as `control.named` has them
-CONTROLLERS = ("predictive", "ilqr", "mppi", "lqr", "koopman", "kinematic", "pid")
 
 
-def parsed_reference(text: str) -> Any:
-    """Return a reference by its text, or from a CSV file with the columns t, x, y and, if tracked, z."""
-    from knode_cosserat.control import ReferenceFormatError, parse_reference, table
+def _listed(method: str) -> str:
+    """Return the name of a controller; for `list`, print all controllers with their options, and exit."""
+    if method == "list":
+        from knode_cosserat.control import CONTROLLERS
 
-    if not text.endswith(".csv"):
-        return parse_reference(text)
-    import pandas as pd  # type: ignore[import-untyped]
-
-    if reason := size_excess(Path(text)):
-        raise ReferenceFormatError(f"{text}: {reason}")
-    rows = pd.read_csv(text)
-    missing = [name for name in ("t", "x", "y") if name not in rows]
-    if missing:
-        raise ReferenceFormatError(
-            f"{text} has no column {missing[0]}; a reference has t (s), x, y and perhaps z (m)"
-        )
-    if "z" not in rows:
-        rows["z"] = np.nan
-    return table(rows["t"].to_numpy(), rows[["x", "y", "z"]].to_numpy())
+        for name, controller in CONTROLLERS.items():
+            options = ",".join(f"{key}={value}" for key, value in controller.options.items())
+            typer.echo(f"{name}: {controller.help}" + (f" ({name}:{options})" if options else ""))
+        raise typer.Exit
+    return method
 
 
-def _plant(text: str | None, model: Any, dt: float, sensor: Any) -> Any:
-    """Return the controlled robot by its text; None: the model itself."""
-    from knode_cosserat.control import SimulatedPlant
-
-    if text is None or not text.startswith("elastica:"):
-        return SimulatedPlant(model if text is None else load_system(text), dt, sensor)
-    from knode_cosserat.control.elastica_plant import ElasticaPlant
-    from knode_cosserat.control.elastica_rod import Imperfections
-
-    name, *given = text.removeprefix("elastica:").split(",")
-    known = {field.name: field.type for field in dataclasses.fields(Imperfections)}
-    changes: dict[str, Any] = {}
-    for each in given:
-        key, _, value = each.partition("=")
-        if key not in known:
-            raise ValueError(f"--plant has {each!r}; allowed is NAME=NUMBER with {', '.join(known)}")
-        changes[key] = parse_limits(f"--plant {key}", value, 1)
-    robot: Any = load_system(name)
-    return ElasticaPlant.like(robot, dt, sensor, Imperfections(**changes))
-
-
-def _live(
-    controller: Any, plant: Any, title: str, viewing: tuple[Path | None, int, bool], as_json: bool
-) -> Any:
-    """Show the loop in the browser until Ctrl-C; return the log of the last run, or None.
-
-    `viewing` are the file to export to, the port, and True if the browser is to be opened.
-    """
-    from knode_cosserat import viewer
-
-    export, port, opens = viewing
-
-    def announce(address: str) -> None:
-        write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
-        if opens:
-            viewer.serve.open_page(address)
-
-    return viewer.control_live(
-        controller, plant, title=title, export=export, port=port, open_browser=announce
-    )
+#: option of commands with a controller
+Method = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME", callback=_listed, is_eager=True,
+        help="Controller, such as predictive, pid or predictive:horizon=10; `list` prints all.",
+    ),
+]  # fmt: skip
 
 
 @app.command(
@@ -113,9 +71,7 @@ def control(
             show_default="the model itself",
         ),
     ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="NAME", help=f"Controller: {', '.join(CONTROLLERS)}.")
-    ] = "predictive",
+    method: Method = "predictive",
     seconds: Annotated[float, typer.Option(metavar="S", help="Duration (s).")] = 10.0,
     dt: Annotated[float, typer.Option(metavar="S", help="Period of the control (s).")] = 0.05,
     low: Annotated[
@@ -189,29 +145,48 @@ def control(
     if not live and (export is not None or port or no_open):
         raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
     for path in (out, recording, states, figure, export):
-        if path is not None:
-            require_writable(path)
+        require_writable(path)
     from knode_cosserat import control as kcc
     from knode_cosserat.estimation import TipPosition
 
     model = load_system(str(robot), changes)
-    count = model.control_size
+    count, length = model.control_size, float(model.nominal.length)
     ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
     limits = kcc.ControlLimits(*ends, rate, lag=lag)
-    if method not in CONTROLLERS:
-        raise ValueError(f"--method is {method!r}; allowed is {', '.join(CONTROLLERS)}")
     controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))
-    controlled = _plant(plant, model, dt, kcc.Sensor(TipPosition(), noise))
-    if reference is None:
-        title = robot if plant is None else f"{plant}, controlled by {robot}"
-        beyond = None  # the target moves
-        log = _live(controller, controlled, str(title), (export, port, not no_open), as_json)
-        if log is None:
-            return
+    sensor = kcc.Sensor(TipPosition(), noise)
+    if plant is not None and plant.startswith("elastica:"):
+        controlled = _elastica(plant.removeprefix("elastica:"), dt, sensor)
     else:
+        controlled = kcc.SimulatedPlant(model if plant is None else load_system(plant), dt, sensor)
+    beyond = None  # with --live, the target moves
+    if reference is not None:
         wanted = parsed_reference(reference)
-        beyond = _out_of_reach(model, limits, wanted, seconds)
+        beyond, time = kcc.distance_out_of_reach(model, limits, wanted, seconds)
+        if beyond > OUT_OF_REACH * length:
+            typer.echo(
+                f"warning: the {wanted.name} is {1e3 * beyond:.3g} mm out of reach at t = {time:.3g} s: no "
+                "controls within the limits were found that bring the tip nearer at rest",
+                err=True,
+            )
+        else:
+            beyond = 0.0
         log = kcc.run_loop(controller, controlled, wanted, seconds)
+    else:
+        from knode_cosserat import viewer
+
+        def announce(address: str) -> None:
+            write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+            if not no_open:
+                webbrowser.open(address)
+
+        title = str(robot) if plant is None else f"{plant}, controlled by {robot}"
+        run = viewer.control_live(
+            controller, controlled, title=title, export=export, port=port, open_browser=announce
+        )
+        if run is None:
+            return
+        log = run
     if out is not None:
         log.to_csv(out)
     if recording is not None:
@@ -226,36 +201,52 @@ def control(
         from knode_cosserat.evaluation.control_figures import closed_loop
 
         closed_loop(log).savefig(figure)
-    length = float(model.nominal.length)
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
-    write_output(as_json, facts, _lines(facts, log, dt), out=out, export=export)
-
-
-def _out_of_reach(model: Any, limits: Any, reference: Any, seconds: float) -> float:
-    """Return the distance (m) that the tip lacks to the reference; warn of it before the loop starts."""
-    from knode_cosserat.control.checks import check_within_length, distance_out_of_reach
-
-    check_within_length(model, reference, seconds)
-    apart, time = distance_out_of_reach(model, limits, reference, seconds)
-    if apart > OUT_OF_REACH * float(model.nominal.length):
-        typer.echo(
-            f"warning: the {reference.name} is {1e3 * apart:.3g} mm out of reach at t = {time:.3g} s: no "
-            "controls within the limits were found that bring the tip nearer at rest",
-            err=True,
-        )
-        return float(apart)
-    return 0.0
-
-
-def _lines(facts: dict[str, Any], log: Any, dt: float) -> list[str]:
-    found = [
+    lines = [
         f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "
         f"{facts['tip_rmse_percent']:.3g} % of the length",
+        *([f"the reference is up to {1e3 * beyond:.3g} mm out of reach"] if beyond else []),
         f"{facts['periods']} periods, {facts['fallbacks']} without a solution; feedback "
         f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians); "
         f"{facts['missed']} took longer than the period of {1e3 * dt:g} ms",
+        *(f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()),
     ]
-    if facts["out_of_reach"]:
-        found.insert(1, f"the reference is up to {1e3 * facts['out_of_reach']:.3g} mm out of reach")
-    found += [f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()]
-    return found
+    write_output(as_json, facts, lines, out=out, export=export)
+
+
+def parsed_reference(text: str) -> Any:
+    """Return a reference by its text, or from a CSV file with the columns t, x, y and, if tracked, z."""
+    from knode_cosserat.control import ReferenceFormatError, parse_reference, table
+
+    if not text.endswith(".csv"):
+        return parse_reference(text)
+    import pandas as pd  # type: ignore[import-untyped]
+
+    if reason := size_excess(Path(text)):
+        raise ReferenceFormatError(f"{text}: {reason}")
+    rows = pd.read_csv(text)
+    missing = [name for name in ("t", "x", "y") if name not in rows]
+    if missing:
+        raise ReferenceFormatError(
+            f"{text} has no column {missing[0]}; a reference has t (s), x, y and perhaps z (m)"
+        )
+    if "z" not in rows:
+        rows["z"] = np.nan
+    return table(rows["t"].to_numpy(), rows[["x", "y", "z"]].to_numpy())
+
+
+def _elastica(text: str, dt: float, sensor: Any) -> Any:
+    """Return a robot that PyElastica moves, by a text such as ROBOT,friction=0.2."""
+    from knode_cosserat.control.elastica_plant import ElasticaPlant
+    from knode_cosserat.control.elastica_rod import Imperfections
+
+    name, *words = text.split(",")
+    known = [field.name for field in dataclasses.fields(Imperfections)]
+    changes: dict[str, Any] = {}
+    for word in words:
+        key, _, value = word.partition("=")
+        if key not in known:
+            raise ValueError(f"--plant has {word!r}; allowed is NAME=NUMBER with {', '.join(known)}")
+        changes[key] = parse_limits(f"--plant {key}", value, 1)
+    robot: Any = load_system(name)
+    return ElasticaPlant.like(robot, dt, sensor, Imperfections(**changes))

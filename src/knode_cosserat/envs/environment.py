@@ -11,8 +11,7 @@ from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
-from knode_cosserat.control.commands import ControlLimits
-from knode_cosserat.control.references import Reference
+from knode_cosserat.control import ControlLimits, Reference
 from knode_cosserat.envs import dynamics, programs
 from knode_cosserat.envs.dynamics import EpisodeState, Transition
 from knode_cosserat.envs.errors import TaskError

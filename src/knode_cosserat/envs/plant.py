@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.plants import Plant
+from knode_cosserat.control import Plant
 from knode_cosserat.envs.dynamics import EpisodeState
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.errors import TaskError

@@ -8,8 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, Controller, Status
-from knode_cosserat.control.references import Reference
+from knode_cosserat.control import Command, Controller, Reference, Status
 from knode_cosserat.envs import dynamics
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.errors import TaskError

@@ -9,9 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Controller
-from knode_cosserat.control.loop import run_loop
-from knode_cosserat.control.named import WITH_OBSERVER, controller_named
+from knode_cosserat.control import CONTROLLERS, Controller, controller_named, run_loop
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.envs.dynamics import EpisodeState
 from knode_cosserat.envs.environment import Environment
@@ -32,7 +30,8 @@ def reference_controller(
     middle = {name: 0.5 * (arrays.least[name] + arrays.greatest[name]) for name in spec.names}
     robot: System = spec.task.placed(arrays.robot.replace(**middle), state.goal)
     noise = max(float(arrays.noise), LEAST_NOISE)
-    adapt = [each for each in spec.task.adapted if name in WITH_OBSERVER and each in spec.names]
+    has_observer = CONTROLLERS[name].cls.has_observer
+    adapt = [key for key in spec.task.adapted if has_observer and key in spec.names]
     return controller_named(name, robot, spec.dt, environment.limits, adapt, TipPosition(sigma=noise))
 
 

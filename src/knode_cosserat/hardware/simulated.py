@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat.control.lag import mean_part, remaining_part
+from knode_cosserat.control.commands import mean_part, remaining_part
 from knode_cosserat.hardware.driver import Driver, DriverState, HardwareError, Latency, Limits, Reading
 from knode_cosserat.hardware.faults import FAULTS, fault_message
 from knode_cosserat.hardware.limits import LatencyWindow, TensionLimiter

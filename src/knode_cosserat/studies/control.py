@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.control import LoopLog, Sensor, SimulatedPlant, run_loop
-from knode_cosserat.control.commands import Controller
-from knode_cosserat.control.named import NAMES
+from knode_cosserat.control import CONTROLLERS, Controller, LoopLog, Sensor, SimulatedPlant, run_loop
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.estimation import TipPosition
 from knode_cosserat.evaluation.tables import markdown_table
@@ -38,7 +36,8 @@ from knode_cosserat.studies.runner import Job, Product, run
 def jobs(quick: bool) -> list[Job]:
     """Return one job for each controller, and one for each further check."""
     made = [
-        Job(f"tracking-{name}", tracking, {"controller": name, "quick": quick}) for name in (ADAPTIVE, *NAMES)
+        Job(f"tracking-{name}", tracking, {"controller": name, "quick": quick})
+        for name in (ADAPTIVE, *CONTROLLERS)
     ]
     if stand_in.is_available():
         made.append(Job("tracking-stand-in", on_stand_in, {"quick": quick}))
@@ -101,9 +100,9 @@ def tracking(settings: Any) -> Product:
 
 def on_stand_in(settings: Any) -> Product:
     """Return the tracking errors of all controllers on the PyElastica stand-in, with its identified model."""
-    names, paths = [ADAPTIVE, *NAMES], references()
+    names, paths = [ADAPTIVE, *CONTROLLERS], references()
     # a loop around the stand-in takes almost as long as the robot would
-    few = {name: [] if name in SLOW else list(paths)[:2] for name in NAMES} if settings["quick"] else {}
+    few = {name: [] if name in SLOW else list(paths)[:2] for name in CONTROLLERS} if settings["quick"] else {}
     given = {"robot": NOMINAL, "controllers": names, "adaptive": ADAPTIVE, "few": few}
     return Product(stand_in.tracked(given, paths, DT, LIMITS, SECONDS, _rmse), {})
 

@@ -15,10 +15,10 @@ import jax
 import numpy as np
 
 from knode_cosserat import controls
+from knode_cosserat.control import Sensor, run_loop
 from knode_cosserat.control.elastica_plant import ElasticaPlant
 from knode_cosserat.control.elastica_rod import ElasticaRod
-from knode_cosserat.control.loop import _COMPILATIONS, run_loop
-from knode_cosserat.control.plants import Sensor
+from knode_cosserat.control.loop import _COMPILATIONS
 from knode_cosserat.envs.environment import Environment, make
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.envs.pictures import animate_episode

@@ -7,9 +7,7 @@ import gc
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat.control.commands import Controller
-from knode_cosserat.control.loop import LoopLog
-from knode_cosserat.control.plants import Plant
+from knode_cosserat.control import Controller, LoopLog, Plant
 from knode_cosserat.viewer.document import document
 from knode_cosserat.viewer.live import require_websockets
 from knode_cosserat.viewer.loop_session import FollowedTarget, LoopSession

@@ -18,10 +18,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Controller
+from knode_cosserat.control import Controller, Plant, Reference, constant
 from knode_cosserat.control.loop import Loop, Period
-from knode_cosserat.control.plants import Plant
-from knode_cosserat.control.references import Reference, constant
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.viewer.connection import PATIENCE, PageSession, sequence_of

@@ -11,10 +11,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.writing import replacing
-from knode_cosserat.control.commands import Controller, Status
-from knode_cosserat.control.loop import Period
-from knode_cosserat.control.plants import Plant
-from knode_cosserat.control.states import estimated, joined
+from knode_cosserat.control import Controller, Plant, Status
+from knode_cosserat.control.loop import Period, estimated, joined
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.paths import parameter_at
 from knode_cosserat.trajectory import Trajectory

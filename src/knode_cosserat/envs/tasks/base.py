@@ -15,8 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import ControlLimits
-from knode_cosserat.control.references import Reference
+from knode_cosserat.control import ControlLimits, Reference
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.envs.randomisation import Randomisation
 from knode_cosserat.envs.tasks.survey import Survey, surveyed

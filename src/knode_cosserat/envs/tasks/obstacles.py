@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.references import Reference, table
+from knode_cosserat.control import Reference, table
 from knode_cosserat.envs.errors import TaskError
 from knode_cosserat.envs.tasks.base import Outcome, Task, Tip, with_part
 from knode_cosserat.envs.tasks.survey import Survey

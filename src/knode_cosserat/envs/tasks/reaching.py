@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import ControlLimits
+from knode_cosserat.control import ControlLimits
 from knode_cosserat.envs.tasks.base import Task, Tip
 from knode_cosserat.envs.tasks.survey import Survey, check_reachable, surveyed
 from knode_cosserat.rods.system import System

@@ -9,33 +9,21 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, ControlLimits
-from knode_cosserat.control.planning import PlanController
-from knode_cosserat.control.program import Weights
+from knode_cosserat.control.commands import Command, ControlLimits, register_controller
+from knode_cosserat.control.planning import PlanController, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
-from knode_cosserat.estimation.online import OnlineModel, errors_of
+from knode_cosserat.estimation.online import errors_of
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
 
 
-def sampled_errors(
-    model: OnlineModel, x: Any, past: Any, plans: Float[Any, "k knots c"], basis: Float[Any, "T knots"],
-    reference: Float[Any, "T p"], target: Output,
-) -> Any:  # fmt: skip
-    """Return the errors (k, T, e) of each plan's motion, and which motions were solved."""
-    system, steps = model.moved(x)[0], len(basis)
-    controls = np.einsum("tn,knc->ktc", basis, plans)
-    pasts = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (len(plans), *np.shape(leaf))), past)
-    done, _, rows = model.task(steps).solve_many(system, controls, pasts)
-    return _errors(system, target, rows.records, reference), done == steps
-
-
 @functools.partial(jax.jit, static_argnames="target")
 def _errors(system: System, target: Output, records: Any, reference: Any) -> Any:
-    return jax.vmap(lambda each: errors_of(system, target, each, reference))(records)
+    return jax.vmap(lambda record: errors_of(system, target, record, reference))(records)
 
 
+@register_controller("mppi", "weighted mean of 32 random plans")
 class MPPI(PlanController):
     """Path integral control: the mean of random plans, weighted by the exponential of their costs."""
 
@@ -65,21 +53,31 @@ class MPPI(PlanController):
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the first control of the weighted mean of random plans."""
         self.observer.update(measured)
-        belief, limits = self.observer.belief, self.limits
+        limits = self.limits
         spread = self.deviation * (np.asarray(limits.high) - np.asarray(limits.low))
         moves = self._random.normal(size=(self.samples, *self._plan.shape)) * spread
         plans = np.clip(np.concatenate([self._plan[None], self._plan + moves]), limits.low, limits.high)
-        wanted = self.wanted(time, reference)
-        errors, solved = sampled_errors(
-            self.observer.model, belief.x, belief.past, self.with_acting(plans), self._basis, wanted,
-            self.target,
-        )  # fmt: skip
-        solved = np.asarray(solved)
+        errors, solved = self._sampled(plans, self.wanted(time, reference))
         if not solved.any():
-            self._plan = np.tile(self._control, (self.knots.count, 1))
+            self._hold()
             return self.fallback("no sampled plan was solved")
-        each = zip(np.asarray(errors)[solved], plans[solved], strict=True)
-        costs = np.array([self.tracking.cost(error, plan, self._control) for error, plan in each])
+        costs = np.array([
+            self.tracking.cost(error, plan, self._control)
+            for error, plan in zip(errors[solved], plans[solved], strict=True)
+        ])  # fmt: skip
         scale = max(self.temperature * float(costs.std()), 1e-12)
         share = np.exp(-(costs - costs.min()) / scale)
         return self.planned(np.tensordot(share / share.sum(), plans[solved], 1))
+
+    def _sampled(
+        self, plans: Float[np.ndarray, "k knots c"], wanted: Float[np.ndarray, "T p"]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the errors (k, T, e) of each plan's motion, and True for solved motions."""
+        model, belief, steps = self.observer.model, self.observer.belief, len(self._basis)
+        system = model.moved(belief.x)[0]
+        controls = np.einsum("tn,knc->ktc", self._basis, self.with_acting(plans))
+        histories = jax.tree.map(
+            lambda leaf: np.broadcast_to(leaf, (len(plans), *np.shape(leaf))), belief.past
+        )
+        done, _, rows = model.task(steps).solve_many(system, controls, histories)
+        return np.asarray(_errors(system, self.target, rows.records, wanted)), np.asarray(done == steps)

@@ -8,18 +8,23 @@ controls.
 from __future__ import annotations
 
 import itertools
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.lag import lagged
-from knode_cosserat.control.plans import Knots
-from knode_cosserat.control.program import Tracking, Weights, applied_changes
-from knode_cosserat.control.qp import QPSolver, solver_named
+from knode_cosserat.control import qp
+from knode_cosserat.control.commands import (
+    Command,
+    Controller,
+    ControlLimits,
+    Status,
+    lagged,
+    register_controller,
+)
+from knode_cosserat.control.planning import Knots, Tracking, Weights
 from knode_cosserat.control.references import Reference
-from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.simulate import simulate
 
@@ -85,12 +90,13 @@ class LiftedModel:
         return found.reshape(-1, steps, p)
 
 
+@register_controller("koopman", "predictive control by a lifted linear model, fitted to simulated motions")
 class KoopmanController(Controller):
     """Predictive control by a lifted linear model and one quadratic program a period."""
 
     def __init__(
         self, robot: System, dt: float, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, weights: Weights = Weights(), solver: str | QPSolver = "daqp", seed: int = 0,
+        knots: int = 8, weights: Weights = Weights(), seed: int = 0,
     ):  # fmt: skip
         """Simulate random motions of the robot and fit the lifted model.
 
@@ -102,18 +108,24 @@ class KoopmanController(Controller):
             horizon: number of predicted periods.
             knots: number of controls in the plan.
             weights: of the cost.
-            solver: of the quadratic programs.
             seed: of the random motions.
 
         Raises:
             SimulationError: a motion cannot be simulated.
+            ImportError: DAQP is not installed.
         """
+        qp.require_daqp()
         self.dt, self.target, self.limits = float(dt), target, limits.of(robot)
-        self.knots, self.solver = Knots.spaced(horizon, knots), solver_named(solver)
+        self.knots = Knots.spaced(horizon, knots)
         self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self.model = LiftedModel(*training_motions(robot, self.dt, target, self.limits, seed))
         self._slopes = self.model.slopes(self.knots.basis)
         self.reset(np.asarray(self.limits.safe))
+
+    @classmethod
+    def for_tip(cls, robot: System, dt: float, limits: ControlLimits, **options: Any) -> Self:
+        """Return a controller of the tip's position."""
+        return cls(robot, dt, TipPosition(), limits, **options)
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Start from a control that acts now."""
@@ -138,10 +150,10 @@ class KoopmanController(Controller):
         later = self.dt * (1.0 + np.arange(self.knots.horizon))
         error = self.model.predicted(lifted, self.knots.controls(self._plan)) + self._offset
         error = error - reference.expected(time, later)
-        found = self.solver.solve(self._tracking.program(error, self._slopes, self._plan, self._control))
-        if not found.solved:
+        x = qp.solve(self._tracking.program(error, self._slopes, self._plan, self._control))
+        if x is None:
             return self.fallback("the quadratic program was not solved")
-        self._plan = applied_changes(self._plan, found.x)
+        self._plan = self._plan + x.reshape(self._plan.shape)
         return Command(self.limits.applied(self._plan[0], self._control, self.dt), Status.OPTIMAL)
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
@@ -151,10 +163,6 @@ class KoopmanController(Controller):
         if self._now is not None:
             lifted = self.model.lifted(self._now, self._last, self._control)
             self._expected = self.model.predicted(lifted, self._control[None])[0]
-
-    def fallback(self, reason: str) -> Command:
-        """Return the control that acts now."""
-        return Command(self._control, Status.HELD, reason)
 
 
 def training_motions(

@@ -5,10 +5,8 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, ControlLimits
-from knode_cosserat.control.planning import PlanController
-from knode_cosserat.control.prediction import linearised_prediction
-from knode_cosserat.control.program import Weights, applied_changes
+from knode_cosserat.control.commands import Command, ControlLimits, register_controller
+from knode_cosserat.control.planning import PlanController, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -17,6 +15,7 @@ from knode_cosserat.estimation.outputs import Output
 TRIED = (1.0, 0.5, 0.25)
 
 
+@register_controller("ilqr", "Gauss-Newton steps of the whole plan, clipped to the limits")
 class ILQR(PlanController):
     """Iterative linear-quadratic regulator over a horizon, after each measurement.
 
@@ -46,35 +45,24 @@ class ILQR(PlanController):
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the first control of the plan after some iterations."""
         self.observer.update(measured)
-        wanted = self.wanted(time, reference)
-        best = self._linearised(self._plan, wanted)
+        wanted, plan = self.wanted(time, reference), self._plan
+        best = self.predicted(plan, wanted)
         if best is None:
-            self._plan = np.tile(self._control, (self.knots.count, 1))
+            self._hold()
             return self.fallback("the prediction was not solved")
-        plan, path = self._plan, best[2]
-        cost = self.tracking.cost(best[0], plan, self._control)
+        cost = self.tracking.cost(best.error, plan, self._control)
         for _ in range(self.iterations):
-            problem = self.tracking.program(best[0], best[1], plan, self._control)
-            step = -np.linalg.solve(problem.H, problem.g)
+            problem = self.tracking.program(best.error, best.by_plan, plan, self._control)
+            step = -np.linalg.solve(problem.H, problem.g).reshape(plan.shape)
             for part in TRIED:
-                there = np.clip(applied_changes(plan, part * step), self.limits.low, self.limits.high)
-                found = self._linearised(there, wanted)
-                lower = np.inf if found is None else self.tracking.cost(found[0], there, self._control)
-                if found is not None and lower < cost:
-                    plan, path, best, cost = there, found[2], found, lower
+                candidate = np.clip(plan + part * step, self.limits.low, self.limits.high)
+                prediction = self.predicted(candidate, wanted)
+                if prediction is None:
+                    continue
+                lower = self.tracking.cost(prediction.error, candidate, self._control)
+                if lower < cost:
+                    plan, best, cost = candidate, prediction, lower
                     break
             else:
                 break
-        return self.planned(plan, path)
-
-    def _linearised(
-        self, plan: Float[np.ndarray, "knots c"], wanted: Float[np.ndarray, "T p"]
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return errors, derivatives by the plan, and the path of the tip; None if it was not solved."""
-        observer = self.observer
-        found = linearised_prediction(
-            observer.model, observer.belief, self.with_acting(plan), self._basis, wanted, self.target, ()
-        ).of_plan(plan.size)
-        if not bool(found.solved):
-            return None
-        return np.asarray(found.error), np.asarray(found.by_plan), np.asarray(found.path)
+        return self.planned(plan, best.path)
