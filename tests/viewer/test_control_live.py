@@ -17,9 +17,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.control import ControlLimits, PredictiveController, Sensor, SimulatedPlant, SoftLimit
 from knode_cosserat.estimation import KalmanObserver, TipPose, TipPosition
-from knode_cosserat.viewer.closed_loop import loop_page
-from knode_cosserat.viewer.loop_session import FollowedTarget, LoopSession
-from knode_cosserat.viewer.record import STATUSES
+from knode_cosserat.viewer.closed_loop import STATUSES, FollowedTarget, LoopSession, loop_page
 from tests.commands import run
 from tests.viewer.connection import Connection, numbers
 
@@ -329,7 +327,7 @@ def test_the_page_knows_limits_and_soft_limits(robot):
     soft = [SoftLimit(TipPosition(), [-0.1, -np.inf, 0.2], np.inf)]
     own = controller_of(robot, soft=soft)
     # without a loop: nothing is compiled for another set of limits
-    from knode_cosserat.viewer.record import LoopFacts
+    from knode_cosserat.viewer.closed_loop import LoopFacts
 
     facts = LoopFacts.of(own, robot, np.zeros(4)).for_page()
     assert facts["soft"] == [[-0.1, None, 0.2], [None, None, None]]
@@ -358,7 +356,7 @@ TARGET = (
 
 @pytest.fixture(scope="module")
 def address(loop):
-    from knode_cosserat.viewer.page_server import serve_page
+    from knode_cosserat.viewer.pages import serve_page
 
     found, known = [], threading.Event()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -83,7 +84,7 @@ def view(
     def announce(address: str) -> None:
         write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
         if not no_open:
-            viewer.serve.open_page(address)
+            webbrowser.open(address)
 
     if live:
         if export:

@@ -16,7 +16,7 @@ from knode_cosserat.studies.cables.model import DT
 from knode_cosserat.studies.cables.result import CableResult
 from knode_cosserat.studies.report import Report, as_json, write_figures, write_texts
 from knode_cosserat.trajectory import Trajectory
-from knode_cosserat.viewer.document import export_scene
+from knode_cosserat.viewer import export_scene
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
