@@ -11,7 +11,15 @@ import numpy as np
 import typer
 
 from knode_cosserat._files.csv_rows import size_excess
-from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, parse_limits, require_writable
+from knode_cosserat.cli.arguments import (
+    Changes,
+    Json,
+    Robot,
+    load_system,
+    option,
+    parse_limits,
+    require_writable,
+)
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
@@ -34,11 +42,13 @@ def _listed(method: str) -> str:
 #: option of commands with a controller
 Method = Annotated[
     str,
-    typer.Option(
-        metavar="NAME", callback=_listed, is_eager=True,
-        help="Controller, such as predictive, pid or predictive:horizon=10; `list` prints all.",
+    option(
+        "NAME",
+        "Controller, such as predictive, pid or predictive:horizon=10; `list` prints all.",
+        callback=_listed,
+        is_eager=True,
     ),
-]  # fmt: skip
+]
 
 
 @app.command(
@@ -53,9 +63,9 @@ def control(
     robot: Robot,
     reference: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME|CSV",
-            help="Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
+        option(
+            "NAME|CSV",
+            "Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
             "centre is at x=, y=, z= (m), in plane=xy, yz or xz.",
         ),
     ] = None,
@@ -64,71 +74,46 @@ def control(
     ] = False,
     plant: Annotated[
         str | None,
-        typer.Option(
-            metavar="ROBOT",
-            help="Robot that is controlled, simulated; elastica:ROBOT,lag=0.1: by PyElastica, with friction "
+        option(
+            "ROBOT",
+            "Robot that is controlled, simulated; elastica:ROBOT,lag=0.1: by PyElastica, with friction "
             "and lag (an extra).",
             show_default="the model itself",
         ),
     ] = None,
     method: Method = "predictive",
-    seconds: Annotated[float, typer.Option(metavar="S", help="Duration (s).")] = 10.0,
-    dt: Annotated[float, typer.Option(metavar="S", help="Period of the control (s).")] = 0.05,
-    low: Annotated[
-        str, typer.Option(metavar="NUMBERS", help="Least control: one number, or one for each.")
-    ] = "0",
-    high: Annotated[
-        str, typer.Option(metavar="NUMBERS", help="Greatest control: one number, or one for each.")
-    ] = "10",
-    rate: Annotated[float, typer.Option(metavar="PER_S", help="Greatest change of a control in 1 s.")] = 40.0,
-    lag: Annotated[
-        float, typer.Option(metavar="S", help="Time constant of the motors that the controller expects (s).")
-    ] = 0.0,
+    seconds: Annotated[float, option("S", "Duration (s).")] = 10.0,
+    dt: Annotated[float, option("S", "Period of the control (s).")] = 0.05,
+    low: Annotated[str, option("NUMBERS", "Least control: one number, or one for each.")] = "0",
+    high: Annotated[str, option("NUMBERS", "Greatest control: one number, or one for each.")] = "10",
+    rate: Annotated[float, option("PER_S", "Greatest change of a control in 1 s.")] = 40.0,
+    lag: Annotated[float, option("S", "Time constant of the motors that the controller expects (s).")] = 0.0,
     adapt: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="Adapt this parameter of the model while running; may be repeated."
-        ),
+        list[str] | None, option("NAME", "Adapt this parameter of the model while running; may be repeated.")
     ] = None,
-    noise: Annotated[
-        float, typer.Option(metavar="FACTOR", help="Noise of the tip sensor, in multiples of 0.2 mm.")
-    ] = 0.0,
+    noise: Annotated[float, option("FACTOR", "Noise of the tip sensor, in multiples of 0.2 mm.")] = 0.0,
     deviation: Annotated[
         float,
-        typer.Option(
+        option(
+            "M",
+            "Standard deviation of the measured tip for the observer (m): noise and error of the model.",
             "--tip-deviation",
-            metavar="M",
-            help="Standard deviation of the measured tip for the observer (m): noise and error of the model.",
         ),
     ] = 2e-4,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write one row a period to this CSV file.")
-    ] = None,
+    out: Annotated[Path | None, option("FILE", "Write one row a period to this CSV file.")] = None,
     recording: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Write the measured tip and the controls as a recording: .csv, .bag, .mcap or .db3.",
-        ),
+        option("FILE", "Write the measured tip and the controls as a recording: .csv, .bag, .mcap or .db3."),
     ] = None,
     states: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write the estimated states as a trajectory (.nc), to view or plot."
-        ),
+        Path | None, option("FILE", "Write the estimated states as a trajectory (.nc), to view or plot.")
     ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw path, error and controls into this file.")
-    ] = None,
+    figure: Annotated[Path | None, option("FILE", "Draw path, error and controls into this file.")] = None,
     export: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="With --live: at the end, write the last run as one HTML file."),
+        Path | None, option("FILE", "With --live: at the end, write the last run as one HTML file.")
     ] = None,
     port: Annotated[
-        int,
-        typer.Option(
-            metavar="N", help="With --live: port of the local web server.", show_default="any free port"
-        ),
+        int, option("N", "With --live: port of the local web server.", show_default="any free port")
     ] = 0,
     no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False,
     changes: Changes = None,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat.cli.arguments import Json, Progress, require_writable, shows_progress
+from knode_cosserat.cli.arguments import Json, Progress, argument, option, require_writable, shows_progress
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
@@ -31,63 +31,54 @@ if TYPE_CHECKING:
     )
 )
 def sweep(
-    description: Annotated[
-        str, typer.Argument(metavar="DESCRIPTION", help="Description of the sweep (YAML), or a robot.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder; created if it does not exist.")],
+    description: Annotated[str, argument("DESCRIPTION", "Description of the sweep (YAML), or a robot.")],
+    out: Annotated[Path, option("DIR", "Output folder; created if it does not exist.")],
     controls: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="CONTROLS",
-            help="Controls as for `simulate`; a name in braces is a varied number: sine:{period}, "
+        option(
+            "CONTROLS",
+            "Controls as for `simulate`; a name in braces is a varied number: sine:{period}, "
             "random:{seed}. May be repeated.",
         ),
     ] = None,
     vary: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUES",
-            help="Vary a parameter, or a name in braces: LOW:HIGH, LOW:HIGH:log, LOW:HIGH:COUNT on a grid, "
+        option(
+            "NAME=VALUES",
+            "Vary a parameter, or a name in braces: LOW:HIGH, LOW:HIGH:log, LOW:HIGH:COUNT on a grid, "
             "or values A,B,C. May be repeated.",
         ),
     ] = None,
     sampler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="grid, sobol, halton, latin-hypercube or random.", show_default="grid"
-        ),
+        str | None, option("NAME", "grid, sobol, halton, latin-hypercube or random.", show_default="grid")
     ] = None,
-    samples: Annotated[int | None, typer.Option(metavar="N", help="Samples, except on a grid.")] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed.", show_default="0")] = None,
-    steps: Annotated[int | None, typer.Option(metavar="N", help="Number of time steps.")] = None,
-    dt: Annotated[float | None, typer.Option(metavar="S", help="Time step (s).")] = None,
+    samples: Annotated[int | None, option("N", "Samples, except on a grid.")] = None,
+    seed: Annotated[int | None, option("N", "Seed.", show_default="0")] = None,
+    steps: Annotated[int | None, option("N", "Number of time steps.")] = None,
+    dt: Annotated[float | None, option("S", "Time step (s).")] = None,
     store: Annotated[
         str | None,
-        typer.Option(
-            metavar="A,B,…",
-            help="Stored quantities: tip_position, tip_quaternion, position, y, z, controls.",
+        option(
+            "A,B,…",
+            "Stored quantities: tip_position, tip_quaternion, position, y, z, controls.",
             show_default="tip_position",
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", min=1, help="Processes of this machine, or jobs of --cluster.",
-            show_default="one per core; 1 job",
+        option(
+            "N", "Processes of this machine, or jobs of --cluster.", min=1, show_default="one per core; 1 job"
         ),
     ] = None,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Run on the Dask cluster of this scheduler.")
-    ] = None,
+    dask: Annotated[str | None, option("ADDRESS", "Run on the Dask cluster of this scheduler.")] = None,
     cluster: Annotated[
-        str | None,
-        typer.Option(metavar="KIND", help="Run as jobs: slurm; local or debug to try it on this machine."),
+        str | None, option("KIND", "Run as jobs: slurm; local or debug to try it on this machine.")
     ] = None,
     slurm: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="Parameter of the jobs: timeout_min, cpus_per_task, mem_gb, slurm_partition, … of submitit. "
+        option(
+            "NAME=VALUE",
+            "Parameter of the jobs: timeout_min, cpus_per_task, mem_gb, slurm_partition, … of submitit. "
             "May be repeated.",
         ),
     ] = None,
@@ -96,7 +87,7 @@ def sweep(
     ] = False,
     progress: Progress = None,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Simulate many cases: a grid or a sampler over robots, parameters, controls and seeds.
 
     Writes Parquet files with parameters, results, tips and reasons of failed cases, and a manifest with the

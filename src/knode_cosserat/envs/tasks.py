@@ -47,10 +47,6 @@ class Uniform:
     low: float
     high: float
 
-    def __post_init__(self) -> None:
-        if not -np.inf < self.low <= self.high < np.inf:
-            raise TaskError(f"the distribution is {self!r}; allowed are finite numbers, low not above high")
-
     def ends(self, value: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return the least and the greatest value of a parameter whose nominal value is `value`."""
         return np.full(np.shape(value), self.low), np.full(np.shape(value), self.high)
@@ -94,6 +90,8 @@ class Randomisation:
                     f"the distribution of {name} is {distribution!r}; allowed is Uniform(low, high) or "
                     "Factor(low, high)"
                 )
+            if not -np.inf < distribution.low <= distribution.high < np.inf:
+                raise TaskError(f"the distribution of {name} is {distribution!r}; low must not exceed high")
         if not 0.0 <= self.change <= 1.0:
             raise TaskError(f"change is {self.change!r}; allowed is a probability, 0 to 1")
         least, most = self.delay
