@@ -39,7 +39,7 @@ def costs() -> dict[str, Any]:
     import numpy as np
 
     from knode_cosserat.control import circle
-    from knode_cosserat.control.prediction import linearised_prediction
+    from knode_cosserat.control.planning import linearised_prediction
     from knode_cosserat.engine.pattern import Pattern
     from knode_cosserat.estimation.online import Spread, errors_of
     from knode_cosserat.solvers.rollout import rollout

@@ -28,8 +28,7 @@ from typing import Any
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.viewer.live import view_live
-from knode_cosserat.viewer.session import Session
+from knode_cosserat.viewer.live import Session, view_live
 from tests.viewer.browser import Browser
 
 DT = 0.05

@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control import LoopLog, Sensor, SimulatedPlant, circle, run_loop, steps
+from knode_cosserat.control import CONTROLLERS, LoopLog, Sensor, SimulatedPlant, circle, run_loop, steps
 from knode_cosserat.control.commands import Controller
-from knode_cosserat.control.named import NAMES
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.estimation import (
     Adapted,
@@ -58,7 +57,8 @@ from studies.tables import markdown_table
 def jobs(quick: bool) -> list[Job]:
     """Return one job for each controller, and one for each further check."""
     made = [
-        Job(f"tracking-{name}", tracking, {"controller": name, "quick": quick}) for name in (ADAPTIVE, *NAMES)
+        Job(f"tracking-{name}", tracking, {"controller": name, "quick": quick})
+        for name in (ADAPTIVE, *CONTROLLERS)
     ]
     if stand_in.is_available():
         made.append(Job("tracking-stand-in", on_stand_in, {"quick": quick}))
@@ -121,9 +121,9 @@ def tracking(settings: Any) -> Product:
 
 def on_stand_in(settings: Any) -> Product:
     """Return the tracking errors of all controllers on the PyElastica stand-in, with its identified model."""
-    names, paths = [ADAPTIVE, *NAMES], references()
+    names, paths = [ADAPTIVE, *CONTROLLERS], references()
     # a loop around the stand-in takes almost as long as the robot would
-    few = {name: [] if name in SLOW else list(paths)[:2] for name in NAMES} if settings["quick"] else {}
+    few = {name: [] if name in SLOW else list(paths)[:2] for name in CONTROLLERS} if settings["quick"] else {}
     given = {"robot": NOMINAL, "controllers": names, "adaptive": ADAPTIVE, "few": few}
     return Product(stand_in.tracked(given, paths, DT, LIMITS, SECONDS, _rmse), {})
 

@@ -8,9 +8,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from knode_cosserat.control import ControlLimits, PredictiveController, Reference, circle, figure_eight, steps
-from knode_cosserat.control.commands import Controller
-from knode_cosserat.control.named import controller_named
+from knode_cosserat.control import (
+    Controller,
+    ControlLimits,
+    PredictiveController,
+    Reference,
+    circle,
+    controller_named,
+    figure_eight,
+    steps,
+)
 from knode_cosserat.estimation import Adapted
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.robot_file import load_robot

@@ -15,18 +15,23 @@ import jax
 import numpy as np
 
 from knode_cosserat import controls
-from knode_cosserat.control.loop import _COMPILATIONS, run_loop
-from knode_cosserat.control.plants import Sensor
-from knode_cosserat.envs.environment import Environment, make
-from knode_cosserat.envs.errors import TaskError
-from knode_cosserat.envs.pictures import animate_episode
-from knode_cosserat.envs.policy import Policy
-from knode_cosserat.envs.policy_controller import PolicyController
-from knode_cosserat.envs.ppo import Training
-from knode_cosserat.envs.randomisation import Factor, Randomisation
-from knode_cosserat.envs.scores import controller_scores, policy_scores
-from knode_cosserat.envs.tasks import TASKS
-from knode_cosserat.envs.tasks.base import Tip
+from knode_cosserat.control import Sensor, run_loop
+from knode_cosserat.control.loop import _COMPILATIONS
+from knode_cosserat.envs import (
+    TASKS,
+    Environment,
+    Factor,
+    Policy,
+    PolicyController,
+    PolicyTraining,
+    Randomisation,
+    TaskError,
+    Tip,
+    animate_episode,
+    controller_scores,
+    make,
+    policy_scores,
+)
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
@@ -137,7 +142,7 @@ def as_markdown(made: Sequence[Mapping[str, Any]], facts: Mapping[str, Any]) -> 
 
 def rate(settings: Any) -> Product:
     """Measure the rate of steps against a batch of simulations of the same motions; count compilations."""
-    from knode_cosserat.envs.vector import VectorEnv
+    from knode_cosserat.envs import VectorEnv
 
     count = settings["episodes"]
     environment, robot = make("follow"), load_robot("delrin-tendon-robot")
@@ -181,7 +186,7 @@ def task(settings: Any) -> Product:
     """Check a task by Gymnasium's checker, and score the predictive controller."""
     from gymnasium.utils.env_checker import check_env
 
-    from knode_cosserat.envs.single import SingleEnv
+    from knode_cosserat.envs import SingleEnv
 
     environment, refused = make(settings["task"]), ""
     try:
@@ -204,7 +209,7 @@ def ppo(settings: Any) -> Product:
     """Train a policy on follow, and compare its score with that of the predictive controller."""
     environment = make("follow")
     reference = float(controller_scores(environment, keys(settings["episodes"])).mean())
-    training = Training(environment)
+    training = PolicyTraining(environment)
     held_out, until = keys(64), float("inf")
 
     def report(progress: Any) -> None:
@@ -264,7 +269,7 @@ def real(settings: Any) -> Product:
     # the tendons of the stand-in are routed ones, not those of the model of the paper
     environment = make("follow", RoutedTendonRobot.like(nominal), randomisation=randomisation)
     rod = stand_in.true_rod(nominal)
-    training = Training(environment)
+    training = PolicyTraining(environment)
     training.run(settings["seconds"])
     chosen = keys(settings["episodes"])
     own = policy_scores(environment, training.policy, chosen)

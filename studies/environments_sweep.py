@@ -22,19 +22,19 @@ from typing import Any
 import numpy as np
 import yaml
 
+from knode_cosserat.rods.paths import parameter_at
 from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.sweeps.description import Range, Sweep
-from knode_cosserat.sweeps.executors import SHARDS_EACH
-from knode_cosserat.sweeps.folder import LOG, SHARDS
-from knode_cosserat.sweeps.plan import Plan
-from knode_cosserat.sweeps.shard_file import require_pyarrow
+from knode_cosserat.sweeps import Plan, Range, Sweep
+from knode_cosserat.sweeps._folder import LOG, SHARDS
+from knode_cosserat.sweeps._run import SHARDS_EACH
+from knode_cosserat.sweeps._shards import require_pyarrow
 
 #: steps of a rollout, and time step (s)
 STEPS, DT = 20, 0.05
 #: cases of a shard of the measured sweeps: enough shards for short sweeps too
 SHARD = 1024
-#: cases of a raw batch, and repetitions of which the fastest counts
-RAW, ROUNDS = 1024, 3
+#: repetitions of a raw batch, of which the fastest counts
+ROUNDS = 3
 #: largest time (s) for a killed run to write its next shard
 PATIENCE = 600.0
 #: limits of the study
@@ -106,8 +106,8 @@ def measure_sweep(
 def _raw_batch(sweep: Sweep) -> dict[str, float]:
     """Return the rate of `simulate` for a batch of the same cases, and the time of a case on a core (s)."""
     plan = Plan.of(sweep)
-    cases = plan.cases_of(0, 0, min(RAW, sweep.case_count))
-    values = plan.robot_values(0, cases.values)
+    cases, nominal = plan.cases(0), plan.systems[0].nominal
+    values = {name: array for name, array in cases.values.items() if parameter_at(nominal, name)}
     count = len(cases.case)
     robots = [
         plan.systems[0].replace(**{name: each[k] for name, each in values.items()}) for k in range(count)

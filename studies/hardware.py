@@ -13,8 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.control.loop import run_loop
-from knode_cosserat.control.references import circle, figure_eight
+from knode_cosserat.control import circle, figure_eight, run_loop
 from knode_cosserat_hardware.driver import DriverState, HardwareError
 from knode_cosserat_hardware.emulation import EmulatedRobot, built, firmware_folder, missing
 from knode_cosserat_hardware.lines import GRAM_FORCE

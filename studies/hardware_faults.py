@@ -8,9 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.control.commands import Controller
-from knode_cosserat.control.loop import LoopLog, run_loop
-from knode_cosserat.control.references import circle
+from knode_cosserat.control import Controller, LoopLog, circle, run_loop
 from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.emulation import EmulatedRobot
 from knode_cosserat_hardware.lines import GRAM_FORCE

@@ -16,13 +16,17 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat import controls
-from knode_cosserat.control.commands import Controller, ControlLimits
-from knode_cosserat.control.lag import identified_lag
-from knode_cosserat.control.loop import LoopLog, run_loop
-from knode_cosserat.control.named import controller_named
+from knode_cosserat.control import (
+    Controller,
+    ControlLimits,
+    LoopLog,
+    Reference,
+    Sensor,
+    controller_named,
+    identified_lag,
+    run_loop,
+)
 from knode_cosserat.control.planning import PlanController
-from knode_cosserat.control.plants import Sensor
-from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.outputs import TipPosition
 from knode_cosserat.identification import identify

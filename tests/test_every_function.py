@@ -19,7 +19,7 @@ from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
-from knode_cosserat.viewer import drawing
+from knode_cosserat.viewer import scene as drawing
 
 DT, STEPS = 0.05, 12
 NETWORK = kc.FitConfig(residual=kc.learning.NetworkOptions(hidden=2), segments=kc.learning.Training(epochs=2))

@@ -20,7 +20,7 @@ from knode_cosserat._files.yaml_text import MOST_CHARACTERS, YAMLTextError, mapp
 from knode_cosserat._numbers import real_array
 from knode_cosserat.cli import app
 from knode_cosserat.cli.output import printable
-from knode_cosserat.viewer.serve import view
+from knode_cosserat.viewer.pages import view
 from tools.attack import attacked, good_files
 
 ROBOT = kc.load_robot("delrin-tendon-robot")

@@ -94,7 +94,7 @@ def sine(
     phase = 2 * np.pi * np.arange(tendons) / tendons
     t = step_times(steps, dt, sampled)
     _require_period(period, float(t[-1]))
-    return checked_tensions(base + amplitude * np.sin(2 * np.pi * t[:, None] / period + phase), "sine")
+    return checked_tensions(sine_values(t[:, None], period, base, amplitude, phase), "sine")
 
 
 def step(
@@ -104,7 +104,7 @@ def step(
     """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
     require_numbers(at=at)
     t = step_times(steps, dt, sampled)
-    return _raised("step", height, t >= at - SAME_TIME * dt, base, tendons, count)
+    return _raised("step", height, step_values(t, 1.0, 0.0, at, dt), base, tendons, count)
 
 
 def ramp(
@@ -127,8 +127,7 @@ def ramp(
     require_numbers(start=start, end=end)
     if end <= start:
         raise ControlsError(f"ramp: end is {end!r} s; allowed is a time after its start, {start!r} s")
-    part = np.clip((t - start) / (end - start), 0.0, 1.0)
-    return _raised("ramp", height, part, base, tendons, count)
+    return _raised("ramp", height, ramp_values(t, 1.0, 0.0, start, end), base, tendons, count)
 
 
 def random(
@@ -142,6 +141,24 @@ def random(
         raise ControlsError(f"random: high is {high!r} N; allowed is a tension from low, {low!r} N, on")
     draws = np.random.default_rng(seed).uniform(low, high, (-(-steps // hold), tendons))
     return checked_tensions(np.repeat(draws, hold, axis=0)[:steps], "random")
+
+
+# values of signals at times t (s), without checks; numbers may be arrays that broadcast
+
+
+def sine_values(t: Any, period: Any, base: Any, amplitude: Any, phase: Any) -> Any:
+    """Return base + amplitude sin(2πt/period + phase)."""
+    return base + amplitude * np.sin(2.0 * np.pi * t / period + phase)
+
+
+def step_values(t: Any, height: Any, base: Any, at: Any, dt: Any) -> Any:
+    """Return `base`, and base + height from the time `at` on, to rounding errors of steps `dt` (s)."""
+    return base + height * (t >= at - SAME_TIME * dt)
+
+
+def ramp_values(t: Any, height: Any, base: Any, start: Any, end: Any) -> Any:
+    """Return `base` with a linear rise by `height` from `start` to `end`."""
+    return base + height * np.clip((t - start) / (end - start), 0.0, 1.0)
 
 
 def _raised(

@@ -15,10 +15,19 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
+from knode_cosserat._files.csv_rows import Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat.controls import ControlsError, Sampled, checked_tensions, require_effect, step_times
+from knode_cosserat.controls import (
+    ControlsError,
+    Sampled,
+    checked_tensions,
+    ramp_values,
+    require_effect,
+    sine_values,
+    step_times,
+    step_values,
+)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 
@@ -151,17 +160,17 @@ def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: 
         raise ControlsError(f"ramp: start is {start!r} s; allowed is a time before the last step, {last:g} s")
     if last <= start:
         raise ControlsError(f"ramp: end is {last!r} s; allowed is a time after its start, {start!r} s")
-    return base + height * np.clip((t - start) / (last - start), 0.0, 1.0)
+    return ramp_values(t, height, base, start, last)
 
 
 def _step(t: Any, height: float, *, base: float = 0.0, at: float = 0.0) -> Any:
-    return base + height * (t >= at - SAME_TIME * t[0])
+    return step_values(t, height, base, at, t[0])
 
 
 def _sine(t: Any, period: float, *, base: float = 0.0, amplitude: float = 1.0, phase: float = 0.0) -> Any:
     if period <= 0.0:
         raise ControlsError(f"sine: the period is {period!r} s; allowed is a number above 0")
-    return base + amplitude * np.sin(2.0 * np.pi * t / period + phase)
+    return sine_values(t, period, base, amplitude, phase)
 
 
 def _constant(t: Any, value: float) -> Any:

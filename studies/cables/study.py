@@ -20,7 +20,7 @@ from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.trajectory import Trajectory
-from knode_cosserat.viewer.document import export_scene
+from knode_cosserat.viewer import export_scene
 from studies.cables.correction import Correction, learned_correction
 from studies.cables.identification import STAGES, SearchStage, identify_cable
 from studies.cables.model import DT, CableModel, CableParameters, Grips

@@ -7,21 +7,17 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 import knode_cosserat as kc
-from knode_cosserat.cli.control import CONTROLLERS
 from knode_cosserat.control import (
-    PID,
     ControlLimits,
     ReferenceFormatError,
     circle,
-    controller_named,
     figure_eight,
     parse_reference,
     steps,
     table,
 )
-from knode_cosserat.control.named import NAMES
-from knode_cosserat.control.plans import Knots
-from knode_cosserat.control.qp import DAQP, QuadraticProgram, solved_program
+from knode_cosserat.control.planning import Knots
+from knode_cosserat.control.qp import QuadraticProgram, solve
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -131,6 +127,12 @@ def test_wrong_references_are_told_in_one_line(text, message):
         parse_reference(text)
 
 
+@pytest.fixture(autouse=True)
+def patient(monkeypatch):
+    """A program may take longer on a busy machine than a period allows."""
+    monkeypatch.setattr("knode_cosserat.control.qp.TIME_LIMIT", 1.0)
+
+
 def test_quadratic_programs_agree_with_scipy():
     """The oracle is SLSQP, an unrelated method."""
     rng = np.random.default_rng(0)
@@ -140,30 +142,27 @@ def test_quadratic_programs_agree_with_scipy():
         H, g, A = root @ root.T + 0.1 * np.eye(n), rng.normal(size=n), rng.normal(size=(m, n))
         low, high = -np.ones(n), np.ones(n)
         problem = QuadraticProgram(H, g, low, high, A, -0.5 * np.ones(m), 0.5 * np.ones(m))
-        found = DAQP(time_limit=1.0).solve(problem)
+        x = solve(problem)
         within = [{"type": "ineq", "fun": lambda x, s=s, A=A: 0.5 - s * (A @ x)} for s in (1.0, -1.0)]
         expected = minimize(
             lambda x, H=H, g=g: 0.5 * x @ H @ x + g @ x, np.zeros(n), jac=lambda x, H=H, g=g: H @ x + g,
             bounds=list(zip(low, high, strict=True)), constraints=within, method="SLSQP",
             options={"ftol": 1e-12, "maxiter": 500},
         )  # fmt: skip
-        assert found.solved
-        assert np.allclose(found.x, expected.x, atol=1e-5)
+        assert np.allclose(x, expected.x, atol=1e-5)
 
 
 def test_an_infeasible_program_is_not_solved_and_a_soft_row_yields():
     one = np.eye(1)
     hard = QuadraticProgram(one, np.zeros(1), -one[0], one[0], one, np.array([2.0]), np.array([3.0]))
-    solver = DAQP(time_limit=1.0)
-    assert not solver.solve(hard).solved and not solved_program(solver, hard).solved
-    soft = solved_program(solver, hard._replace(soft=1))
-    assert soft.solved and soft.x[0] == pytest.approx(1.0, abs=1e-3)
+    assert solve(hard) is None
+    assert solve(hard._replace(soft=1))[0] == pytest.approx(1.0, abs=1e-3)
 
 
 @pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
 def test_soft_rows_are_violated_as_little_as_the_hard_limits_allow(unit):
     """The oracle is SLSQP. The cost is badly conditioned, as that of a plan may be."""
-    rng, solver = np.random.default_rng(1), DAQP(time_limit=1.0)
+    rng = np.random.default_rng(1)
     for _ in range(20):
         n, rows = 6, 5
         H = np.diag(10.0 ** rng.uniform(-6.0, 6.0, n))
@@ -172,8 +171,8 @@ def test_soft_rows_are_violated_as_little_as_the_hard_limits_allow(unit):
         problem = QuadraticProgram(
             H, rng.normal(size=n), low, high, A, below, np.full(rows, np.inf), soft=rows
         )
-        found = solved_program(solver, problem)
-        assert found.solved and np.all(np.abs(found.x) <= 1.0 + 1e-6)
+        x = solve(problem)
+        assert np.all(np.abs(x) <= 1.0 + 1e-6)
 
         def violation(x, A=A, below=below):
             return float(np.sum(np.maximum(0.0, (below - A @ x) / unit) ** 2))
@@ -182,7 +181,7 @@ def test_soft_rows_are_violated_as_little_as_the_hard_limits_allow(unit):
             minimize(violation, start, bounds=list(zip(low, high, strict=True)), method="SLSQP").fun
             for start in rng.uniform(-1.0, 1.0, (5, n))
         )
-        assert violation(found.x) <= least + 1e-3 * (1.0 + least)
+        assert violation(x) <= least + 1e-3 * (1.0 + least)
 
 
 def test_steps_are_not_expected_and_circles_are():
@@ -191,13 +190,3 @@ def test_steps_are_not_expected_and_circles_are():
     assert steps([[0.0], [0.1]], 2.0, announced=True).expected(1.0, [0.5, 1.5])[:, 0].tolist() == [0.0, 0.1]
     moving = circle(0.1, 4.0)
     assert np.array_equal(moving.expected(5.0, [0.1, 1.0]), moving.at([5.1, 6.0]), equal_nan=True)
-
-
-def test_the_command_line_has_all_controllers_and_each_is_made_by_its_name():
-    assert set(CONTROLLERS) == set(NAMES)
-    limits = ControlLimits(0.0, 10.0, 40.0)
-    assert isinstance(controller_named("pid", ROBOT, 0.05, limits), PID)
-    with pytest.raises(ValueError, match="there is no controller 'mpc'; there are predictive, "):
-        controller_named("mpc", ROBOT, 0.05, limits)
-    with pytest.raises(ValueError, match="the controller 'pid' adapts no parameters"):
-        controller_named("pid", ROBOT, 0.05, limits, ["youngs_modulus"])

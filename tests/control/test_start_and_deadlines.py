@@ -6,10 +6,19 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.control import ControlLimits, circle, constant, run_loop
-from knode_cosserat.control.checks import distance_out_of_reach
-from knode_cosserat.control.commands import Command, Controller, Status
-from knode_cosserat.control.plants import Plant, Sensor, SimulatedPlant
+from knode_cosserat.control import (
+    Command,
+    Controller,
+    ControlLimits,
+    Plant,
+    Sensor,
+    SimulatedPlant,
+    Status,
+    circle,
+    constant,
+    distance_out_of_reach,
+    run_loop,
+)
 from knode_cosserat.estimation import KalmanObserver, TipPosition
 
 #: a soft rod that is clamped sideways and sags by a twentieth of its length

@@ -75,7 +75,7 @@ def trained(environment):
     settings = envs.PPOSettings(episodes=4, rollout=2 * environment.steps, epochs=2, batch=32, hidden=(16,))
 
     def once():
-        training = envs.Training(environment, settings, steps=3 * 4 * 2 * environment.steps, seed=1)
+        training = envs.PolicyTraining(environment, settings, steps=3 * 4 * 2 * environment.steps, seed=1)
         training.run()
         return training
 
@@ -85,7 +85,7 @@ def trained(environment):
 def test_the_same_seed_gives_the_same_policy(trained):
     one, two = trained
     assert one.is_done and len(one.history) == 3
-    for a, b in zip(jax.tree.leaves(one.weights), jax.tree.leaves(two.weights), strict=True):
+    for a, b in zip(jax.tree.leaves(one.networks), jax.tree.leaves(two.networks), strict=True):
         np.testing.assert_array_equal(a, b)
     assert all(0.0 <= each.reward <= 1.0 for each in one.history)
     assert one.history[-1].steps == 3 * 4 * 2 * one.environment.steps
@@ -100,7 +100,7 @@ def test_settings_of_a_training_that_are_not_allowed(environment):
     with pytest.raises(envs.TaskError, match="episodes × rollout"):
         envs.PPOSettings(episodes=2, rollout=2, batch=64)
     with pytest.raises(envs.TaskError, match="at least one rollout"):
-        envs.Training(environment, steps=10)
+        envs.PolicyTraining(environment, steps=10)
 
 
 @pytest.mark.slow
@@ -143,7 +143,7 @@ def test_the_predictive_controller_and_a_trained_policy_follow(robot):
     keys = jax.random.split(jax.random.PRNGKey(4), 2)
     reference = envs.controller_scores(environment, keys).mean()
     assert reference > 0.98
-    training = envs.Training(environment, steps=500_000)
+    training = envs.PolicyTraining(environment, steps=500_000)
     training.run(seconds=400.0)
     assert envs.policy_scores(environment, training.policy, keys).mean() > 0.9 * reference
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from knode_cosserat._files import parquet_file
-from knode_cosserat.sweeps import manifest as manifests
-from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.shard_file import KEY, checksum, read_about, read_shard, shard_bytes
+from knode_cosserat.sweeps import SweepError, _folder
+from knode_cosserat.sweeps._shards import KEY, checksum, read_shard, shard_bytes
 from tests.limits import Readers, assert_limited, limit_size
 
 pyarrow = pytest.importorskip("pyarrow")
@@ -41,7 +40,7 @@ def test_a_shard_is_read_as_it_was_written(tmp_path):
         read_shard(path, ["z"], verify=False)
     pyarrow_parquet.write_table(pyarrow_parquet.read_table(path).drop_columns("reason"), path)
     with pytest.raises(SweepError, match="damaged: it has no column reason"):
-        read_about(path)
+        read_shard(path, ["case"], verify=False)
 
 
 def test_a_long_text_that_all_rows_share_is_refused(tmp_path):
@@ -77,10 +76,10 @@ def test_changed_metadata_are_found(tmp_path):
         assert old in text
         pyarrow_parquet.write_table(table.replace_schema_metadata({KEY: text.replace(old, new)}), path)
         with pytest.raises(SweepError, match="the checksum of its metadata is not the stated one"):
-            read_about(path)
+            read_shard(path, ["case"], verify=False)
     pyarrow_parquet.write_table(table.replace_schema_metadata({KEY: b"[" * 100_000}), path)
     with pytest.raises(SweepError, match="its metadata are missing or damaged"):
-        read_about(path)
+        read_shard(path, ["case"], verify=False)
 
 
 def test_the_number_of_values_of_each_page_is_read(tmp_path):
@@ -131,13 +130,13 @@ def shard_texts(folder, patch):
 @READERS
 def manifest_size(folder, patch):
     manifest = {
-        "format": manifests.FORMAT, "version": 2, "identity": "", "sweep": {}, "cases": 1, "shards": 1,
-        "shard_cases": 1, "robots": [{"columns": {}}],
+        "format": _folder.FORMAT, "version": 1, "made_by": {}, "machine": {}, "identity": "",
+        "sweep": {}, "cases": 1, "shards": 1, "shard_cases": 1, "robots": [{"columns": {}}],
     }  # fmt: skip
-    text = json.dumps(manifest | {"checksum": manifests.json_checksum(manifest)})
+    text = json.dumps(manifest | {"checksum": _folder.json_checksum(manifest)})
     (folder / "sweep.json").write_text(text)
-    patch.setattr(manifests, "LARGEST_MANIFEST", len(text) - 1)
-    return lambda: manifests.read_manifest(folder)
+    patch.setattr(_folder, "LARGEST_MANIFEST", len(text) - 1)
+    return lambda: _folder.read_manifest(folder)
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
-from knode_cosserat.sweeps.errors import SweepError
-from knode_cosserat.sweeps.signals import placeholders, signals
+from knode_cosserat.sweeps import SweepError
+from knode_cosserat.sweeps._signals import case_controls, placeholders
 
 TENSIONS, NAMED = kc.load_robot("delrin-tendon-robot"), kc.load_robot("soft-slender-robot")
 WORDS = [
@@ -41,18 +41,18 @@ def parsed(robot, text):
 def test_controls_at_once_are_those_case_by_case(robot, word, values):
     a, b = np.array(values).T
     numbers = {"a": a, "b": b, "seed": np.arange(len(a)) + 7}
-    found = signals(robot, word, 6, 0.05, numbers, len(a))
+    controls, refused = case_controls(robot, word, 6, 0.05, numbers, len(a))
     for k in range(len(a)):
         text = word.format(**{name: each[k].item() for name, each in numbers.items()})
         expected = parsed(robot, text)
         if isinstance(expected, str):
             # a signal without effect is no failed case of a sweep
             without_effect = "has the same value" in expected or "after the end of the run" in expected
-            assert found.refused.get(k, expected if without_effect else None) == expected
-            assert without_effect or not np.any(found.controls[k])
+            assert refused.get(k, expected if without_effect else None) == expected
+            assert without_effect or not np.any(controls[k])
             continue
-        assert k not in found.refused
-        np.testing.assert_allclose(found.controls[k], expected, rtol=1e-14, atol=1e-14)
+        assert k not in refused
+        np.testing.assert_allclose(controls[k], expected, rtol=1e-14, atol=1e-14)
 
 
 def test_names_in_braces():

@@ -12,12 +12,13 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute
 import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.sweeps import Dask, Local, Plan, Slurm, Sweep, SweepError, load_sweep, run_sweep
-from knode_cosserat.sweeps.shard_file import require_pyarrow, shard_bytes
-from knode_cosserat.sweeps.work import ShardJob, Work
+from knode_cosserat.sweeps._run import ShardJob, Work
+from knode_cosserat.sweeps._shards import require_pyarrow, shard_bytes
 from tests.commands import run, succeeded, told
 from tests.sweeps.small_sweep import ROBOT, content, described
 
@@ -79,6 +80,8 @@ def test_the_data_say_what_they_are(whole):
     assert whole.provenance["made_by"]["jax"] and whole.provenance["machine"]["cpu"]
     assert str(whole["result"][0, 0]) == "CONVERGED"
     assert sum(len(part["case"]) for part in whole.shards(["case"])) == 48
+    rows = whole.dataset().to_table(columns=["case"], filter=pyarrow.compute.field("length") > 0.6)
+    assert len(rows) == np.count_nonzero(whole["length"] > 0.6)
     with pytest.raises(KeyError, match="no column 'tip'; there are case"):
         whole["tip"]
     for name in ("case", "tip_position"):  # a table of any other tool
@@ -181,10 +184,10 @@ def test_an_interrupted_job_goes_on_where_it_stopped(whole, copied):
     submitit = pytest.importorskip("submitit")
     (copied / "shards" / "000001.parquet").unlink()
     plan = Plan.of(described())
-    work = Work(plan, str(copied), whole.manifest["made_by"])
+    work = Work(plan, copied, whole.manifest["made_by"])
     again = ShardJob(work, (0, 1, 2)).checkpoint()
     assert isinstance(again, submitit.helpers.DelayedSubmission)
-    assert again.result() == 1
+    assert [done.shard for done in again.result()] == [1]
     assert content(copied) == content(whole.folder)
 
 

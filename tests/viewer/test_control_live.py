@@ -16,11 +16,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.control import ControlLimits, PredictiveController, Sensor, SimulatedPlant, SoftLimit
-from knode_cosserat.control.qp import QPSolution
 from knode_cosserat.estimation import KalmanObserver, TipPose, TipPosition
-from knode_cosserat.viewer.closed_loop import loop_page
-from knode_cosserat.viewer.loop_session import FollowedTarget, LoopSession
-from knode_cosserat.viewer.record import STATUSES
+from knode_cosserat.viewer.closed_loop import STATUSES, FollowedTarget, LoopSession, loop_page
 from tests.commands import run
 from tests.viewer.connection import Connection, numbers
 
@@ -191,7 +188,7 @@ def decoded(packed):
     return values.reshape(-1, packed["shape"][0]).T.reshape(packed["shape"])
 
 
-def test_the_exported_file_and_the_log_are_the_run(followed, tmp_path):
+def test_the_exported_file_and_the_log_are_the_run(followed):
     async def talk(connection, session):
         give = connection.given.put_nowait
         session.paused = True
@@ -230,7 +227,7 @@ def test_the_exported_file_and_the_log_are_the_run(followed, tmp_path):
     np.testing.assert_allclose(written["control 1"], log.control[:, 0])
     # a free coordinate of the first target has the tip's value in the picture
     assert np.all(np.isfinite(shown["target"]))
-    assert followed.record.export(tmp_path / "run.html", "a robot").stat().st_size > 1e6
+    assert len(followed.record.page("a robot")) > 1e6
 
 
 def test_messages_are_answered_during_a_slow_period(followed, monkeypatch):
@@ -267,12 +264,9 @@ def test_a_robot_that_is_not_solved_stands_until_it_starts_again(followed, monke
     converse(followed, talk)
 
 
-def test_a_fallback_is_shown_with_its_reason(robot):
-    class Broken:
-        def solve(self, problem):
-            return QPSolution(np.full(len(problem.g), np.nan), False)
-
-    followed = FollowedTarget(controller_of(robot, solver=Broken()), plant_of(robot), "a robot")
+def test_a_fallback_is_shown_with_its_reason(robot, monkeypatch):
+    monkeypatch.setattr("knode_cosserat.control.qp.solve", lambda problem: None)
+    followed = FollowedTarget(controller_of(robot), plant_of(robot), "a robot")
 
     async def talk(connection, session):
         reason = await connection.until(lambda said: isinstance(said, dict) and "reason" in said)
@@ -333,7 +327,7 @@ def test_the_page_knows_limits_and_soft_limits(robot):
     soft = [SoftLimit(TipPosition(), [-0.1, -np.inf, 0.2], np.inf)]
     own = controller_of(robot, soft=soft)
     # without a loop: nothing is compiled for another set of limits
-    from knode_cosserat.viewer.record import LoopFacts
+    from knode_cosserat.viewer.closed_loop import LoopFacts
 
     facts = LoopFacts.of(own, robot, np.zeros(4)).for_page()
     assert facts["soft"] == [[-0.1, None, 0.2], [None, None, None]]
@@ -362,7 +356,7 @@ TARGET = (
 
 @pytest.fixture(scope="module")
 def address(loop):
-    from knode_cosserat.viewer.page_server import serve_page
+    from knode_cosserat.viewer.pages import serve_page
 
     found, known = [], threading.Event()
 
@@ -409,7 +403,8 @@ def test_the_target_is_dragged_and_the_robot_follows(browser, address, loop, tmp
     assert browser.run("viewer.live.target") == pytest.approx(loop.start)
     browser.wait(lambda: browser.run("viewer.time > 0.2"))
     assert browser.errors() == []
-    file = loop.record.export(tmp_path / "run.html", "a robot")
+    file = tmp_path / "run.html"
+    file.write_text(loop.record.page("a robot"), encoding="utf-8")
     browser.open(file.as_uri())
     assert browser.run("document.querySelector('.badge').textContent") == "optimal"
     assert browser.run("viewer.robots.map((r) => r.overlay)") == [False, True]

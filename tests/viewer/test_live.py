@@ -13,10 +13,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.viewer import view_live
-from knode_cosserat.viewer.connection import MOST_PER_SECOND
-from knode_cosserat.viewer.live import require_websockets, usual_step
-from knode_cosserat.viewer.page_server import MOST_PAGES
-from knode_cosserat.viewer.session import Session
+from knode_cosserat.viewer.live import MOST_PER_SECOND, Session, require_websockets, usual_step
+from knode_cosserat.viewer.pages import MOST_PAGES
 from tests.viewer.connection import Connection, numbers
 
 websockets = pytest.importorskip("websockets", reason="the live mode is of the extra viz")

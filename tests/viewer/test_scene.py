@@ -14,10 +14,18 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.cli import main
 from knode_cosserat.rods.aspects import Drawing
-from knode_cosserat.viewer.document import document, export_scene
-from knode_cosserat.viewer.drawing import drawing, sliders
-from knode_cosserat.viewer.scene import LEAST_ROWS, MOST, MOST_NODES, encoded_array, kept, scene, track
-from knode_cosserat.viewer.serve import view
+from knode_cosserat.viewer.pages import document, export_scene, view
+from knode_cosserat.viewer.scene import (
+    LEAST_ROWS,
+    MOST,
+    MOST_NODES,
+    drawing,
+    encoded_array,
+    kept,
+    scene,
+    sliders,
+    track,
+)
 
 
 def unpacked(array):

@@ -114,7 +114,7 @@ class _Sliders:
 
 
 async def _live(seconds: float, every: float) -> tuple[list[tuple[float, float, int]], int, int]:
-    from knode_cosserat.viewer.session import Session
+    from knode_cosserat.viewer.live import Session
 
     robot = kc.load_robot(ROBOTS[0])
     began = time.monotonic()

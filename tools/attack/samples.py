@@ -137,8 +137,8 @@ def _of_learning() -> dict[str, Sample]:
 
 
 def _of_sweeps() -> dict[str, Sample]:
-    from knode_cosserat.sweeps.manifest import FORMAT, VERSIONS, read_manifest, write_manifest
-    from knode_cosserat.sweeps.shard_file import read_shard, shard_bytes, write_shard
+    from knode_cosserat.sweeps._folder import FORMAT, VERSION, read_manifest, write_manifest
+    from knode_cosserat.sweeps._shards import read_shard, shard_bytes, write_shard
 
     def write(path: Path, version: int) -> None:
         columns = {
@@ -150,7 +150,8 @@ def _of_sweeps() -> dict[str, Sample]:
 
     def write_description(path: Path, version: int) -> None:
         manifest = {
-            "format": FORMAT, "version": VERSIONS[-1], "identity": f"{version}", "sweep": {"steps": 10},
+            "format": FORMAT, "version": VERSION, "identity": f"{version}", "sweep": {"steps": 10},
+            "made_by": {}, "machine": {},
             "cases": 50, "shards": 5, "shard_cases": 10, "robots": [{"label": "robot", "columns": {}}],
         }  # fmt: skip
         write_manifest(path.parent, manifest)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.plants import Plant
+from knode_cosserat.control import Plant
 from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Reading, fault_message
 from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion
 

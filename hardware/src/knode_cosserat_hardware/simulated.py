@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat.control.lag import mean_part, remaining_part
+from knode_cosserat.control.commands import mean_part, remaining_part
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions, final_output
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.result import SimulationError

@@ -30,6 +30,17 @@ RECORDINGS = read_suffixes()
 #: kinds of files, see `io.container.kind_of`
 TRAJECTORY, MODEL = "knode-cosserat trajectory", "knode-cosserat model"
 
+
+def option(metavar: str, help: str, *names: str, **more: Any) -> Any:
+    """Return an option of a command; by default its name is that of the argument."""
+    return typer.Option(*names, metavar=metavar, help=help, **more)
+
+
+def argument(metavar: str, help: str, **more: Any) -> Any:
+    """Return an argument of a command."""
+    return typer.Argument(metavar=metavar, help=help, **more)
+
+
 ROBOT = "Name of a catalog robot (listed by `knode-cosserat info`), robot file (YAML), or fitted model."
 
 
@@ -40,29 +51,27 @@ def _robots(incomplete: str) -> list[str]:
     return [name for name in catalog() if name.startswith(incomplete)]
 
 
-Robot = Annotated[str, typer.Argument(metavar="ROBOT", help=ROBOT, autocompletion=_robots)]
+Robot = Annotated[str, argument("ROBOT", ROBOT, autocompletion=_robots)]
 Changes = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=VALUE",
-        help="Change a parameter of the robot, or of a model's nominal robot, in SI units: length=0.4, "
+    option(
+        "NAME=VALUE",
+        "Change a parameter of the robot, or of a model's nominal robot, in SI units: length=0.4, "
         "gravity=0,0,-9.81. May be repeated.",
+        "--set",
     ),
 ]
-Nodes = Annotated[
-    int | None, typer.Option(metavar="N", help="Number of nodes along the rod, including base and tip.")
-]
+Nodes = Annotated[int | None, option("N", "Number of nodes along the rod, including base and tip.")]
 Space = Annotated[
     str,
-    typer.Option(
-        metavar="SCHEME",
-        help="Scheme along the rod: lobatto2 (order 2), lobatto4 (order 4) or euler (order 1, the paper's).",
+    option(
+        "SCHEME",
+        "Scheme along the rod: lobatto2 (order 2), lobatto4 (order 4) or euler (order 1, the paper's).",
     ),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout instead of text.")]
-NetCDF = typer.Option(metavar="FILE", help="Write the trajectory to this netCDF file (.nc).")
-Picture = typer.Option(metavar="FILE", help="Write the figure to this PNG, PDF or SVG file.")
+NetCDF = option("FILE", "Write the trajectory to this netCDF file (.nc).")
+Picture = option("FILE", "Write the figure to this PNG, PDF or SVG file.")
 Progress = Annotated[
     bool | None,
     typer.Option("--progress/--no-progress", help="Show progress on stderr.", show_default="on a terminal"),
@@ -159,12 +168,12 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
             other = "--nodes" if name == "nodes" and nodes is not None else "another --set"
             raise ValueError(f"--set {change!r}: {name} is given by {other} too; allowed is each name once")
         values[name] = value
-    found = system.replace(**values)
+    changed = system.replace(**values)
     if "tendon_offset" in values:
         from knode_cosserat.rods.robot_file import warn_of_paper_tendons
 
-        warn_of_paper_tendons(found.nominal, "--set tendon_offset")
-    return found
+        warn_of_paper_tendons(changed.nominal, "--set tendon_offset")
+    return changed
 
 
 def _parse_value(text: str) -> Any:
@@ -173,7 +182,7 @@ def _parse_value(text: str) -> Any:
 
     value = yaml.safe_load(text)
     # PyYAML reads YAML 1.1, in which 10e9 is text
-    if isinstance(value, str) or (isinstance(value, list) and any(isinstance(each, str) for each in value)):
+    if isinstance(value, str) or (isinstance(value, list) and any(isinstance(part, str) for part in value)):
         numbers = numbers_in(text)
         if numbers is not None:
             return numbers[0] if len(numbers) == 1 and isinstance(value, str) else numbers

@@ -15,6 +15,7 @@ from knode_cosserat.cli.arguments import (
     Picture,
     Progress,
     Space,
+    argument,
     command_line,
     figures,
     is_recording,
@@ -22,6 +23,7 @@ from knode_cosserat.cli.arguments import (
     load_ensemble_folder,
     load_system,
     load_trajectory_file,
+    option,
     require_writable,
     shows_progress,
 )
@@ -60,13 +62,9 @@ class Viewpoint(enum.StrEnum):
     yz = "yz"
 
 
-Trajectories = Annotated[
-    list[Path], typer.Argument(metavar="TRAJECTORY…", help="Trajectory files; the first is the reference.")
-]
+Trajectories = Annotated[list[Path], argument("TRAJECTORY…", "Trajectory files; the first is the reference.")]
 View = Annotated[Viewpoint, typer.Option(help="View in space (xyz), or projection onto a coordinate plane.")]
-Columns = Annotated[
-    int, typer.Option(min=1, max=2, metavar="N", help="Width of the figure: one or two columns of a paper.")
-]
+Columns = Annotated[int, option("N", "Width of the figure: one or two columns of a paper.", min=1, max=2)]
 
 
 @app.command(
@@ -81,27 +79,23 @@ Columns = Annotated[
 def evaluate(
     prediction: Annotated[
         str,
-        typer.Argument(
-            metavar="PREDICTION",
-            help="Trajectory file; or a robot, model or ensemble (a folder; its mean is compared), "
+        argument(
+            "PREDICTION",
+            "Trajectory file; or a robot, model or ensemble (a folder; its mean is compared), "
             "which is simulated under the controls of each reference.",
         ),
     ],
     references: Annotated[
-        list[Path],
-        typer.Argument(metavar="REFERENCE", help="Trajectory files (.nc); or recordings: bags or tables."),
+        list[Path], argument("REFERENCE", "Trajectory files (.nc); or recordings: bags or tables.")
     ],
     changes: Changes = None,
     rows: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, help="Compare only the first N rows; the paper's tables use 100."),
+        int | None, option("N", "Compare only the first N rows; the paper's tables use 100.", min=1)
     ] = None,
     config: Config = None,
     start: Start = None,
     seconds: Seconds = None,
-    dt: Annotated[
-        float, typer.Option(metavar="S", help="Time between compared rows of a recording (s).")
-    ] = 0.0125,
+    dt: Annotated[float, option("S", "Time between compared rows of a recording (s).")] = 0.0125,
     space: Space = "lobatto2",
     progress: Progress = None,
     as_json: Json = False,
@@ -128,7 +122,8 @@ def evaluate(
         raise ValueError(f"--set changes a robot; {prediction} is a trajectory")
     else:
         predictor = load_trajectory_file(Path(prediction))
-    compared = []
+    compared: list[dict[str, Any]] = []
+    measures = (kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse)
     for path in references:
         reference = load_trajectory_file(path)
         try:
@@ -137,10 +132,10 @@ def evaluate(
                 if isinstance(predictor, kc.Trajectory)
                 else _simulated(predictor, reference, rows, shows_progress(progress))
             )
-            measures = {measure.__name__: measure(predicted, reference[:rows]) for measure in _measures()}
+            errors = {measure.__name__: measure(predicted, reference[:rows]) for measure in measures}
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
-        compared.append({"reference": str(path), "rows": len(reference.time[:rows]), **measures})
+        compared.append({"reference": str(path), "rows": len(reference.time[:rows]), **errors})
     lines: list[list[str]] = [["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]"]]
     for name, count, *numbers in (one.values() for one in compared):
         lines.append([name, str(count), *(f"{number:.4g}" for number in numbers)])
@@ -158,8 +153,7 @@ def plot(
     trajectories: Trajectories,
     out: Annotated[Path, Picture],
     kind: Annotated[
-        Kind,
-        typer.Option(help="Kind of figure.", show_default="overview; compare for several trajectories"),
+        Kind, typer.Option(help="Kind of figure.", show_default="overview; compare for several trajectories")
     ] = Kind.overview,
     view: View = Viewpoint.xyz,
     columns: Columns = 1,
@@ -205,11 +199,9 @@ def plot(
 )
 def animate(
     trajectories: Trajectories,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Write the animation to this GIF or MP4 file.")],
-    fps: Annotated[float, typer.Option(metavar="F", help="Frames per second, 1 to 50.")] = 25.0,
-    speed: Annotated[
-        float, typer.Option(metavar="S", help="Playback speed: 1 is real time, 0.5 is half speed.")
-    ] = 1.0,
+    out: Annotated[Path, option("FILE", "Write the animation to this GIF or MP4 file.")],
+    fps: Annotated[float, option("F", "Frames per second, 1 to 50.")] = 25.0,
+    speed: Annotated[float, option("S", "Playback speed: 1 is real time, 0.5 is half speed.")] = 1.0,
     view: View = Viewpoint.xyz,
     columns: Columns = 1,
     as_json: Json = False,
@@ -271,12 +263,6 @@ def _require_one_kind(prediction: str, references: list[Path], config: Path | No
             f"{recordings[0]} is a recording and {trajectories[0]} a trajectory; evaluate them by two "
             f"commands. For recordings, type: {typed}"
         )
-
-
-def _measures() -> tuple[Any, ...]:
-    import knode_cosserat as kc
-
-    return kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse
 
 
 def _simulated(system: System | Ensemble, reference: Trajectory, rows: int | None, progress: bool) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import webbrowser
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
@@ -10,15 +11,197 @@ import numpy as np
 import typer
 
 from knode_cosserat._files.csv_rows import size_excess
-from knode_cosserat.cli.arguments import Changes, Json, Robot, load_system, parse_limits, require_writable
+from knode_cosserat.cli.arguments import (
+    Changes,
+    Json,
+    Robot,
+    load_system,
+    option,
+    parse_limits,
+    require_writable,
+)
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.recordings.formats import written_suffixes
 
 #: distance from the nearest tip at rest at which a warning is given, as part of the length
 OUT_OF_REACH = 2e-3
-#: names of controllers, as `control.named` has them
-CONTROLLERS = ("predictive", "ilqr", "mppi", "lqr", "koopman", "kinematic", "pid")
+#: plants of other simulators by the word before the colon: functions of the rest of the text, dt and sensor
+PLANTS: dict[str, Callable[[str, float, Any], Any]] = {}
+
+
+def _listed(method: str) -> str:
+    """Return the name of a controller; for `list`, print all controllers with their options, and exit."""
+    if method == "list":
+        from knode_cosserat.control import CONTROLLERS
+
+        for name, controller in CONTROLLERS.items():
+            options = ",".join(f"{key}={value}" for key, value in controller.options.items())
+            typer.echo(f"{name}: {controller.help}" + (f" ({name}:{options})" if options else ""))
+        raise typer.Exit
+    return method
+
+
+#: option of commands with a controller
+Method = Annotated[
+    str,
+    option(
+        "NAME",
+        "Controller, such as predictive, pid or predictive:horizon=10; `list` prints all.",
+        callback=_listed,
+        is_eager=True,
+    ),
+]
+
+
+@app.command(
+    epilog=examples(
+        "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
+        "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
+        "control delrin-tendon-robot --live",
+    )
+)
+def control(
+    robot: Robot,
+    reference: Annotated[
+        str | None,
+        option(
+            "NAME|CSV",
+            "Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
+            "centre is at x=, y=, z= (m), in plane=xy, yz or xz.",
+        ),
+    ] = None,
+    live: Annotated[
+        bool, typer.Option("--live", help="Open the viewer: the tip follows a target that you drag.")
+    ] = False,
+    plant: Annotated[
+        str | None,
+        option(
+            "ROBOT",
+            "Robot that is controlled, simulated.",
+            show_default="the model itself",
+        ),
+    ] = None,
+    method: Method = "predictive",
+    seconds: Annotated[float, option("S", "Duration (s).")] = 10.0,
+    dt: Annotated[float, option("S", "Period of the control (s).")] = 0.05,
+    low: Annotated[str, option("NUMBERS", "Least control: one number, or one for each.")] = "0",
+    high: Annotated[str, option("NUMBERS", "Greatest control: one number, or one for each.")] = "10",
+    rate: Annotated[float, option("PER_S", "Greatest change of a control in 1 s.")] = 40.0,
+    lag: Annotated[float, option("S", "Time constant of the motors that the controller expects (s).")] = 0.0,
+    adapt: Annotated[
+        list[str] | None, option("NAME", "Adapt this parameter of the model while running; may be repeated.")
+    ] = None,
+    noise: Annotated[float, option("FACTOR", "Noise of the tip sensor, in multiples of 0.2 mm.")] = 0.0,
+    deviation: Annotated[
+        float,
+        option(
+            "M",
+            "Standard deviation of the measured tip for the observer (m): noise and error of the model.",
+            "--tip-deviation",
+        ),
+    ] = 2e-4,
+    out: Annotated[Path | None, option("FILE", "Write one row a period to this CSV file.")] = None,
+    recording: Annotated[
+        Path | None,
+        option(
+            "FILE",
+            f"Write the measured tip and the controls as a recording: {', '.join(written_suffixes())}.",
+        ),
+    ] = None,
+    states: Annotated[
+        Path | None, option("FILE", "Write the estimated states as a trajectory (.nc), to view or plot.")
+    ] = None,
+    figure: Annotated[Path | None, option("FILE", "Draw path, error and controls into this file.")] = None,
+    export: Annotated[
+        Path | None, option("FILE", "With --live: at the end, write the last run as one HTML file.")
+    ] = None,
+    port: Annotated[
+        int, option("N", "With --live: port of the local web server.", show_default="any free port")
+    ] = 0,
+    no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False,
+    changes: Changes = None,
+    as_json: Json = False,
+) -> None:
+    """Control the tip of a robot in closed loop, and report the tracking error.
+
+    ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so
+    that the effect of a wrong model is seen. Controls stay within --low, --high and --rate in every period.
+    With --live, the target is dragged in the browser, and the report is of the last run, until Ctrl-C.
+    """
+    if live == (reference is not None):
+        raise ValueError("give either --reference, or --live to drag the target in the browser")
+    if not live and (export is not None or port or no_open):
+        raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
+    for path in (out, recording, states, figure, export):
+        require_writable(path)
+    from knode_cosserat import control as kcc
+    from knode_cosserat.estimation import TipPosition
+
+    model = load_system(str(robot), changes)
+    count, length = model.control_size, float(model.nominal.length)
+    ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
+    limits = kcc.ControlLimits(*ends, rate, lag=lag)
+    controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))
+    sensor = kcc.Sensor(TipPosition(), noise)
+    word, _, rest = (plant or "").partition(":")
+    if word in PLANTS:
+        controlled = PLANTS[word](rest, dt, sensor)
+    else:
+        controlled = kcc.SimulatedPlant(model if plant is None else load_system(plant), dt, sensor)
+    beyond = None  # with --live, the target moves
+    if reference is not None:
+        wanted = parsed_reference(reference)
+        beyond, time = kcc.distance_out_of_reach(model, limits, wanted, seconds)
+        if beyond > OUT_OF_REACH * length:
+            typer.echo(
+                f"warning: the {wanted.name} is {1e3 * beyond:.3g} mm out of reach at t = {time:.3g} s: no "
+                "controls within the limits were found that bring the tip nearer at rest",
+                err=True,
+            )
+        else:
+            beyond = 0.0
+        log = kcc.run_loop(controller, controlled, wanted, seconds)
+    else:
+        from knode_cosserat import viewer
+
+        def announce(address: str) -> None:
+            write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
+            if not no_open:
+                webbrowser.open(address)
+
+        title = str(robot) if plant is None else f"{plant}, controlled by {robot}"
+        run = viewer.control_live(
+            controller, controlled, title=title, export=export, port=port, open_browser=announce
+        )
+        if run is None:
+            return
+        log = run
+    if out is not None:
+        log.to_csv(out)
+    if recording is not None:
+        log.measurements(simulated=True).save(recording)
+    if states is not None:
+        if log.estimated is None:
+            raise ValueError(
+                f"--states: the method {method} estimates no states; predictive, ilqr and mppi do"
+            )
+        log.estimated.save(states)
+    if figure is not None:
+        from knode_cosserat.evaluation.control_figures import closed_loop
+
+        closed_loop(log).savefig(figure)
+    facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
+    lines = [
+        f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "
+        f"{facts['tip_rmse_percent']:.3g} % of the length",
+        *([f"the reference is up to {1e3 * beyond:.3g} mm out of reach"] if beyond else []),
+        f"{facts['periods']} periods, {facts['fallbacks']} without a solution; feedback "
+        f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians); "
+        f"{facts['missed']} took longer than the period of {1e3 * dt:g} ms",
+        *(f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()),
+    ]
+    write_output(as_json, facts, lines, out=out, export=export)
 
 
 def parsed_reference(text: str) -> Any:
@@ -40,214 +223,3 @@ def parsed_reference(text: str) -> Any:
     if "z" not in rows:
         rows["z"] = np.nan
     return table(rows["t"].to_numpy(), rows[["x", "y", "z"]].to_numpy())
-
-
-#: plants of other simulators by the word before the colon: functions of the rest of the text, dt and sensor
-PLANTS: dict[str, Callable[[str, float, Any], Any]] = {}
-
-
-def _plant(text: str | None, model: Any, dt: float, sensor: Any) -> Any:
-    """Return the controlled robot by its text; None: the model itself."""
-    from knode_cosserat.control import SimulatedPlant
-
-    if text is None:
-        return SimulatedPlant(model, dt, sensor)
-    word, _, rest = text.partition(":")
-    return PLANTS[word](rest, dt, sensor) if word in PLANTS else SimulatedPlant(load_system(text), dt, sensor)
-
-
-def _live(
-    controller: Any, plant: Any, title: str, viewing: tuple[Path | None, int, bool], as_json: bool
-) -> Any:
-    """Show the loop in the browser until Ctrl-C; return the log of the last run, or None.
-
-    `viewing` are the file to export to, the port, and True if the browser is to be opened.
-    """
-    from knode_cosserat import viewer
-
-    export, port, opens = viewing
-
-    def announce(address: str) -> None:
-        write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
-        if opens:
-            viewer.serve.open_page(address)
-
-    return viewer.control_live(
-        controller, plant, title=title, export=export, port=port, open_browser=announce
-    )
-
-
-@app.command(
-    epilog=examples(
-        "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
-        "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
-        "control delrin-tendon-robot --live",
-    )
-)
-def control(
-    robot: Robot,
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|CSV",
-            help="Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
-            "centre is at x=, y=, z= (m), in plane=xy, yz or xz.",
-        ),
-    ] = None,
-    live: Annotated[
-        bool, typer.Option("--live", help="Open the viewer: the tip follows a target that you drag.")
-    ] = False,
-    plant: Annotated[
-        str | None,
-        typer.Option(
-            metavar="ROBOT",
-            help="Robot that is controlled, simulated.",
-            show_default="the model itself",
-        ),
-    ] = None,
-    method: Annotated[
-        str, typer.Option(metavar="NAME", help=f"Controller: {', '.join(CONTROLLERS)}.")
-    ] = "predictive",
-    seconds: Annotated[float, typer.Option(metavar="S", help="Duration (s).")] = 10.0,
-    dt: Annotated[float, typer.Option(metavar="S", help="Period of the control (s).")] = 0.05,
-    low: Annotated[
-        str, typer.Option(metavar="NUMBERS", help="Least control: one number, or one for each.")
-    ] = "0",
-    high: Annotated[
-        str, typer.Option(metavar="NUMBERS", help="Greatest control: one number, or one for each.")
-    ] = "10",
-    rate: Annotated[float, typer.Option(metavar="PER_S", help="Greatest change of a control in 1 s.")] = 40.0,
-    lag: Annotated[
-        float, typer.Option(metavar="S", help="Time constant of the motors that the controller expects (s).")
-    ] = 0.0,
-    adapt: Annotated[
-        list[str] | None,
-        typer.Option(
-            metavar="NAME", help="Adapt this parameter of the model while running; may be repeated."
-        ),
-    ] = None,
-    noise: Annotated[
-        float, typer.Option(metavar="FACTOR", help="Noise of the tip sensor, in multiples of 0.2 mm.")
-    ] = 0.0,
-    deviation: Annotated[
-        float,
-        typer.Option(
-            "--tip-deviation",
-            metavar="M",
-            help="Standard deviation of the measured tip for the observer (m): noise and error of the model.",
-        ),
-    ] = 2e-4,
-    out: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Write one row a period to this CSV file.")
-    ] = None,
-    recording: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help=f"Write the measured tip and the controls as a recording: {', '.join(written_suffixes())}.",
-        ),
-    ] = None,
-    states: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Write the estimated states as a trajectory (.nc), to view or plot."
-        ),
-    ] = None,
-    figure: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Draw path, error and controls into this file.")
-    ] = None,
-    export: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="With --live: at the end, write the last run as one HTML file."),
-    ] = None,
-    port: Annotated[
-        int,
-        typer.Option(
-            metavar="N", help="With --live: port of the local web server.", show_default="any free port"
-        ),
-    ] = 0,
-    no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False,
-    changes: Changes = None,
-    as_json: Json = False,
-) -> None:
-    """Control the tip of a robot in closed loop, and report the tracking error.
-
-    ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so
-    that the effect of a wrong model is seen. Controls stay within --low, --high and --rate in every period.
-    With --live, the target is dragged in the browser, and the report is of the last run, until Ctrl-C.
-    """
-    if live == (reference is not None):
-        raise ValueError("give either --reference, or --live to drag the target in the browser")
-    if not live and (export is not None or port or no_open):
-        raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
-    for path in (out, recording, states, figure, export):
-        if path is not None:
-            require_writable(path)
-    from knode_cosserat import control as kcc
-    from knode_cosserat.estimation import TipPosition
-
-    model = load_system(str(robot), changes)
-    count = model.control_size
-    ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
-    limits = kcc.ControlLimits(*ends, rate, lag=lag)
-    if method not in CONTROLLERS:
-        raise ValueError(f"--method is {method!r}; allowed is {', '.join(CONTROLLERS)}")
-    controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))
-    controlled = _plant(plant, model, dt, kcc.Sensor(TipPosition(), noise))
-    if reference is None:
-        title = robot if plant is None else f"{plant}, controlled by {robot}"
-        beyond = None  # the target moves
-        log = _live(controller, controlled, str(title), (export, port, not no_open), as_json)
-        if log is None:
-            return
-    else:
-        wanted = parsed_reference(reference)
-        beyond = _out_of_reach(model, limits, wanted, seconds)
-        log = kcc.run_loop(controller, controlled, wanted, seconds)
-    if out is not None:
-        log.to_csv(out)
-    if recording is not None:
-        log.measurements(simulated=True).save(recording)
-    if states is not None:
-        if log.estimated is None:
-            raise ValueError(
-                f"--states: the method {method} estimates no states; predictive, ilqr and mppi do"
-            )
-        log.estimated.save(states)
-    if figure is not None:
-        from knode_cosserat.evaluation.control_figures import closed_loop
-
-        closed_loop(log).savefig(figure)
-    length = float(model.nominal.length)
-    facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
-    write_output(as_json, facts, _lines(facts, log, dt), out=out, export=export)
-
-
-def _out_of_reach(model: Any, limits: Any, reference: Any, seconds: float) -> float:
-    """Return the distance (m) that the tip lacks to the reference; warn of it before the loop starts."""
-    from knode_cosserat.control.checks import check_within_length, distance_out_of_reach
-
-    check_within_length(model, reference, seconds)
-    apart, time = distance_out_of_reach(model, limits, reference, seconds)
-    if apart > OUT_OF_REACH * float(model.nominal.length):
-        typer.echo(
-            f"warning: the {reference.name} is {1e3 * apart:.3g} mm out of reach at t = {time:.3g} s: no "
-            "controls within the limits were found that bring the tip nearer at rest",
-            err=True,
-        )
-        return float(apart)
-    return 0.0
-
-
-def _lines(facts: dict[str, Any], log: Any, dt: float) -> list[str]:
-    found = [
-        f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "
-        f"{facts['tip_rmse_percent']:.3g} % of the length",
-        f"{facts['periods']} periods, {facts['fallbacks']} without a solution; feedback "
-        f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians); "
-        f"{facts['missed']} took longer than the period of {1e3 * dt:g} ms",
-    ]
-    if facts["out_of_reach"]:
-        found.insert(1, f"the reference is up to {1e3 * facts['out_of_reach']:.3g} mm out of reach")
-    found += [f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()]
-    return found

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 import sys
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
 
 from knode_cosserat.cli.arguments import (
     Changes,
@@ -16,8 +15,10 @@ from knode_cosserat.cli.arguments import (
     Progress,
     Robot,
     Space,
+    argument,
     load_recordings,
     load_system,
+    option,
     require_writable,
     shows_progress,
 )
@@ -28,31 +29,23 @@ from knode_cosserat.recordings.formats import read_suffixes
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
 
-Recordings = Annotated[
-    list[Path],
-    typer.Argument(metavar="RECORDING", help=f"Recordings ({', '.join(read_suffixes())})."),
-]
+Recordings = Annotated[list[Path], argument("RECORDING", f"Recordings ({', '.join(read_suffixes())}).")]
 Config = Annotated[
     Path | None,
-    typer.Option(
-        metavar="YAML",
-        help="Meaning of the recordings' topics or columns.",
+    option(
+        "YAML",
+        "Meaning of the recordings' topics or columns.",
         show_default="the paper's robot for bags; titles and comments for tables",
     ),
 ]
 Start = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S", help="Start time in the recording (s), at which the robot rests.", show_default="0"
-    ),
+    float | None, option("S", "Start time in the recording (s), at which the robot rests.", show_default="0")
 ]
-Seconds = Annotated[
-    float | None, typer.Option(metavar="S", help="Duration used (s).", show_default="to the end")
-]
+Seconds = Annotated[float | None, option("S", "Duration used (s).", show_default="to the end")]
 
 #: longest time between predicted rows (s)
 FINELY = 0.0125
-Step = Annotated[float, typer.Option(metavar="S", help="Time step of the simulation (s).")]
+Step = Annotated[float, option("S", "Time step of the simulation (s).")]
 
 
 @app.command(
@@ -64,23 +57,22 @@ Step = Annotated[float, typer.Option(metavar="S", help="Time step of the simulat
 def identify(
     robot: Robot,
     recordings: Recordings,
-    out: Annotated[Path, typer.Option(metavar="FILE", help="Write the identified robot to this YAML file.")],
+    out: Annotated[Path, option("FILE", "Write the identified robot to this YAML file.")],
     config: Config = None,
     start: Start = None,
     seconds: Seconds = None,
     dt: Step = 0.0125,
     effects: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME",
+            "Physical effect to identify, such as friction; may be repeated.",
             "--effect",
-            metavar="NAME",
-            help="Physical effect to identify, such as friction; may be repeated.",
             show_default="selected by recordings left out",
         ),
     ] = None,
     checkpoint: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Keep finished searches here; an interrupted run resumes."),
+        Path | None, option("DIR", "Keep finished searches here; an interrupted run resumes.")
     ] = None,
     space: Space = "lobatto2",
     changes: Changes = None,
@@ -99,11 +91,11 @@ def identify(
 
     nominal = load_system(str(robot), changes)
     samples = [
-        each.sampled(dt, start, None if seconds is None else (start or 0.0) + seconds, mean=True)
-        for each in load_recordings(recordings, config)
+        recording.sampled(dt, start, None if seconds is None else (start or 0.0) + seconds, mean=True)
+        for recording in load_recordings(recordings, config)
     ]
     began = perf_counter()
-    report = _print_on_stderr if shows_progress(progress) else None
+    report = functools.partial(print, file=sys.stderr, flush=True) if shows_progress(progress) else None
     identified = find(nominal, samples, effects or None, space=space, progress=report, checkpoint=checkpoint)
     kc.save_robot(identified.robot, out)
     facts = identified.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
@@ -132,7 +124,3 @@ def evaluate_on_recordings(
         facts[str(path)] = evaluation.to_dict()
         lines.append(f"{path}: {evaluation}")
     write_output(as_json, {"recordings": facts}, lines)
-
-
-def _print_on_stderr(line: str) -> None:
-    print(line, file=sys.stderr, flush=True)

@@ -5,9 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
-
-from knode_cosserat.cli.arguments import Json, Picture, figures, load_recordings, require_writable
+from knode_cosserat.cli.arguments import (
+    Json,
+    Picture,
+    argument,
+    figures,
+    load_recordings,
+    option,
+    require_writable,
+)
 from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.recordings.formats import formats
@@ -27,16 +33,16 @@ if TYPE_CHECKING:
 def inspect(
     recording: Annotated[
         Path,
-        typer.Argument(
-            metavar="RECORDING",
-            help=f"File or folder of one of these formats: {', '.join(kind.name for kind in formats())}.",
+        argument(
+            "RECORDING",
+            f"File or folder of one of these formats: {', '.join(kind.name for kind in formats())}.",
         ),
     ],
     config: Annotated[
         Path | None,
-        typer.Option(
-            metavar="YAML",
-            help="Meaning of the recording's topics or columns.",
+        option(
+            "YAML",
+            "Meaning of the recording's topics or columns.",
             show_default="the paper's robot for bags; titles and comments for tables; or a proposal",
         ),
     ] = None,
@@ -95,7 +101,8 @@ def _loaded(path: Path, config: Path | None) -> tuple[Recording, str]:
 
 def _lines(report: Health) -> list[str]:
     simulated = {True: "yes", False: "no", None: "not stated"}[report.simulated]
-    lines = [report.source, f"simulated: {simulated}", _duration(report)]
+    rest = "never at rest" if report.rest is None else "at rest from {:.2f} to {:.2f} s".format(*report.rest)
+    lines = [report.source, f"simulated: {simulated}", f"{report.duration:.2f} s, {rest}"]
     if report.rod_length:
         lengths = ", ".join(f"{length:.4f}" for length in report.rod_length)
         lines.append(f"length of the rod, from each body: {lengths} m")
@@ -115,15 +122,6 @@ def _lines(report: Health) -> list[str]:
     return [*lines, "", *(findings or ["no defects found"])]
 
 
-def _duration(report: Health) -> str:
-    rest = (
-        "never at rest"
-        if report.rest is None
-        else f"at rest from {report.rest[0]:.2f} to {report.rest[1]:.2f} s"
-    )
-    return f"{report.duration:.2f} s, {rest}"
-
-
 _TITLES = [
     "topic", "what", "rows", "rate [Hz]", "jitter [ms]", "missing [%]", "gaps", "longest [ms]", "delay [ms]",
     "noise", "angle noise [mrad]",
@@ -131,9 +129,8 @@ _TITLES = [
 
 
 def _row(stream: StreamHealth) -> list[str]:
-    noise = _number_text(stream.noise, 1.0, ".3f") + " N" if stream.what == "measured tensions" else None
-    if noise is None:
-        noise = _number_text(stream.noise, 1e3, ".3f") + " mm"
+    factor, unit = (1.0, "N") if stream.what == "measured tensions" else (1e3, "mm")
+    noise = f"{_number_text(stream.noise, factor, '.3f')} {unit}"
     return [
         stream.topic,
         stream.what,

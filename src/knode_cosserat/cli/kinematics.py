@@ -7,7 +7,6 @@ from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
-import typer
 
 from knode_cosserat.cli.arguments import (
     Changes,
@@ -19,6 +18,7 @@ from knode_cosserat.cli.arguments import (
     Space,
     figures,
     load_system,
+    option,
     parse_limits,
     parse_numbers,
     require_writable,
@@ -30,22 +30,19 @@ from knode_cosserat.cli.summaries import stability_summary
 from knode_cosserat.rods.parameters import in_other_unit
 
 if TYPE_CHECKING:
-    from knode_cosserat.rods.system import System
-    from knode_cosserat.statics.reach import InverseKinematics
-    from knode_cosserat.statics.workspace import Workspace
+    pass
 
 Low = Annotated[
     str,
-    typer.Option(
-        metavar="LIMITS",
-        help="Lower limits of the controls in their units (tensions: N): one number, or one per control.",
+    option(
+        "LIMITS", "Lower limits of the controls in their units (tensions: N): one number, or one per control."
     ),
 ]
 High = Annotated[
     str,
-    typer.Option(
-        metavar="LIMITS",
-        help="Upper limits of the controls in their units (tensions: N): one number, or one per control, "
+    option(
+        "LIMITS",
+        "Upper limits of the controls in their units (tensions: N): one number, or one per control, "
         "such as 8,8,10,10.",
     ),
 ]
@@ -60,20 +57,15 @@ High = Annotated[
 def reach(
     robot: Robot,
     position: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z", help="Target position of the tip (m), such as 0.1,0.05,0.58."),
+        str | None, option("X,Y,Z", "Target position of the tip (m), such as 0.1,0.05,0.58.")
     ] = None,
     quaternion: Annotated[
-        str | None,
-        typer.Option(metavar="W,X,Y,Z", help="Target orientation of the tip: a quaternion, scalar first."),
+        str | None, option("W,X,Y,Z", "Target orientation of the tip: a quaternion, scalar first.")
     ] = None,
     low: Low = "0",
     high: High = "10",
     tolerance: Annotated[
-        float,
-        typer.Option(
-            metavar="X", help="Tolerance: position error as a fraction of the length, angle error in rad."
-        ),
+        float, option("X", "Tolerance: position error as a fraction of the length, angle error in rad.")
     ] = 1e-4,
     space: Space = "lobatto2",
     changes: Changes = None,
@@ -99,7 +91,11 @@ def reach(
         low=parse_limits("--low", low, size), high=parse_limits("--high", high, size),
         tolerance=tolerance, space=space,
     )  # fmt: skip
-    stability, warnings = _stability(found)
+    try:
+        decided = kc.statics.stability(found.equilibrium)
+        stability, warnings = stability_summary(decided.kind, decided.reason)
+    except ValueError:
+        stability, warnings = stability_summary(None)
     facts: dict[str, Any] = {
         "robot": robot,
         "result": found.result.name.lower(),
@@ -109,26 +105,32 @@ def reach(
         "units": named_controls.units(system.control_layout),
         "position": _plain(found.position),
         "quaternion": _plain(found.quaternion),
-        "position_error": _number(found.position_error),
-        "angle_error": _number(found.angle_error),
+        "position_error": float(found.position_error) if np.isfinite(found.position_error) else None,
+        "angle_error": float(found.angle_error) if np.isfinite(found.angle_error) else None,
         "at_low": found.at_low.tolist(),
         "at_high": found.at_high.tolist(),
         "from_rest": found.from_rest,
         **stability,
         "iterations": found.iterations,
     }
-    lines = [
-        f"{found.result.message}; {found.iterations} equilibria computed",
-        _control_text(system, facts["control"]),
-    ]
+    tensions_only = system.control_layout.names == ("tension",)
+    word = "tensions" if tensions_only else "controls"
+    names = [str(i + 1) for i in range(size)] if tensions_only else facts["names"]
+    if tensions_only:
+        text = f"{vector_text(facts['control'])} N"
+    else:
+        # the unit of a plain number is "1"
+        rows = zip(facts["names"], facts["control"], facts["units"], strict=True)
+        text = ", ".join(
+            f"{name}={value:.6g}{f' {unit}' if unit != '1' else ''}" for name, value, unit in rows
+        )
+    lines = [f"{found.result.message}; {found.iterations} equilibria computed", f"{word}: {text}"]
     if facts["position"]:
         lines.append(f"tip: {vector_text(facts['position'])} m")
     if position is not None:
         lines.append(f"position error: {found.position_error:.3g} m")
     if quaternion is not None:
         lines.append(f"angle error: {np.degrees(found.angle_error):.3g} degrees")
-    word = "tensions" if _tensions_only(system) else "controls"
-    names = [str(i + 1) for i in range(system.control_size)] if _tensions_only(system) else facts["names"]
     for name, active in (("lower", found.at_low), ("upper", found.at_high)):
         if np.any(active):
             indices = np.flatnonzero(active)
@@ -147,14 +149,11 @@ def reach(
 )
 def workspace(
     robot: Robot,
-    out: Annotated[
-        Path,
-        typer.Option(metavar="FILE", help="Write controls and tip poses to this .nc, .csv or .npz file."),
-    ],
-    count: Annotated[int, typer.Option(metavar="N", help="Number of equilibria to compute.")] = 10_000,
+    out: Annotated[Path, option("FILE", "Write controls and tip poses to this .nc, .csv or .npz file.")],
+    count: Annotated[int, option("N", "Number of equilibria to compute.")] = 10_000,
     low: Low = "0",
     high: High = "10",
-    seed: Annotated[int, typer.Option(metavar="N", min=0, help="Random seed of the samples.")] = 0,
+    seed: Annotated[int, option("N", "Random seed of the samples.", min=0)] = 0,
     space: Space = "lobatto2",
     changes: Changes = None,
     nodes: Nodes = None,
@@ -185,7 +184,9 @@ def workspace(
     seconds = perf_counter() - began
     found.save(out)
     if picture:
-        _figure(found).savefig(picture)
+        from knode_cosserat.evaluation.workspace_figures import workspace_seen
+
+        workspace_seen(found).savefig(picture)
     inside = found.position[found.valid]
     box = [inside.min(axis=0).tolist(), inside.max(axis=0).tolist()] if len(inside) else None
     facts = {
@@ -216,43 +217,5 @@ def _target(text: str, length: float) -> list[float]:
     return target
 
 
-def _tensions_only(system: System) -> bool:
-    return system.control_layout.names == ("tension",)
-
-
-def _control_text(system: System, control: list[float]) -> str:
-    """Return a control as text: tensions, or names with values and units."""
-    from knode_cosserat import named_controls
-
-    if _tensions_only(system):
-        return f"tensions: {vector_text(control)} N"
-    layout = system.control_layout
-    each = zip(named_controls.labels(layout), control, named_controls.units(layout), strict=True)
-    # the unit of a plain number is "1"
-    words = (f"{name}={value:.6g}" + (f" {unit}" if unit != "1" else "") for name, value, unit in each)
-    return "controls: " + ", ".join(words)
-
-
-def _stability(found: InverseKinematics) -> tuple[dict[str, Any], list[str]]:
-    """Return facts and lines on the stability of the equilibrium, if `kc.statics.stability` applies."""
-    import knode_cosserat as kc
-
-    try:
-        decided = kc.statics.stability(found.equilibrium)
-    except ValueError:
-        return stability_summary(None)
-    return stability_summary(decided.kind, decided.reason)
-
-
-def _number(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
-
-
 def _plain(values: Any) -> list[float] | None:
     return None if values is None or not np.all(np.isfinite(values)) else np.asarray(values).tolist()
-
-
-def _figure(found: Workspace) -> Any:
-    from knode_cosserat.evaluation.workspace_figures import workspace_seen
-
-    return workspace_seen(found)

@@ -17,11 +17,13 @@ from knode_cosserat.cli.arguments import (
     Picture,
     Progress,
     Robot,
+    argument,
     command_line,
     figures,
     is_recording,
     load_system,
     load_trajectory_file,
+    option,
     require_writable,
     shows_progress,
 )
@@ -31,8 +33,6 @@ from knode_cosserat.cli.summaries import residual_summary
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.config import FitConfig
-    from knode_cosserat.learning.knode import KNODE
-    from knode_cosserat.trajectory import Trajectory
 
 
 class Preset(enum.StrEnum):
@@ -52,15 +52,10 @@ class Preset(enum.StrEnum):
 def fit(
     robot: Robot,
     trajectories: Annotated[
-        list[Path],
-        typer.Argument(metavar="TRAJECTORY", help="Training trajectories (.nc) with full states."),
+        list[Path], argument("TRAJECTORY", "Training trajectories (.nc) with full states.")
     ],
     out: Annotated[
-        Path,
-        typer.Option(
-            metavar="PATH",
-            help="Write the model to this file; with --seeds, write an ensemble to this folder.",
-        ),
+        Path, option("PATH", "Write the model to this file; with --seeds, write an ensemble to this folder.")
     ],
     preset: Annotated[
         Preset,
@@ -69,32 +64,22 @@ def fit(
             "network: a network without the paper's constraints."
         ),
     ] = Preset.best,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Random seed.", show_default="0")] = None,
-    seeds: Annotated[
-        str | None, typer.Option(metavar="N,N,…", help="Several random seeds: train one model for each.")
-    ] = None,
+    seed: Annotated[int | None, option("N", "Random seed.", show_default="0")] = None,
+    seeds: Annotated[str | None, option("N,N,…", "Several random seeds: train one model for each.")] = None,
     epochs: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Training epochs of a network.", show_default="the preset's"),
+        int | None, option("N", "Training epochs of a network.", show_default="the preset's")
     ] = None,
     rows: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=1, help="Use the first N rows of each trajectory only; the paper uses 30."
-        ),
+        int | None, option("N", "Use the first N rows of each trajectory only; the paper uses 30.", min=1)
     ] = None,
     changes: Changes = None,
     held_out: Annotated[
-        list[Path] | None,
-        typer.Option(metavar="FILE", help="Validation trajectory for early stopping; may be repeated."),
+        list[Path] | None, option("FILE", "Validation trajectory for early stopping; may be repeated.")
     ] = None,
     checkpoint: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Save the training state in this folder, and resume from it."),
+        Path | None, option("DIR", "Save the training state in this folder, and resume from it.")
     ] = None,
-    log: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Write TensorBoard event files to this folder.")
-    ] = None,
+    log: Annotated[Path | None, option("DIR", "Write TensorBoard event files to this folder.")] = None,
     figure: Annotated[Path | None, Picture] = None,
     progress: Progress = None,
     as_json: Json = False,
@@ -105,8 +90,22 @@ def fit(
     states, from a simulation or from state estimation; use `identify` for recordings. The resulting model is
     accepted wherever a robot is.
     """
-    _refuse_recordings(robot, trajectories, out)
-    numbers = _seeds(seed, seeds)
+    recordings = [path for path in trajectories if is_recording(str(path))]
+    if recordings:
+        typed = command_line("identify", robot, *recordings, "--out", out.with_suffix(".yaml"))
+        raise ValueError(
+            f"{recordings[0]}: this is a recording or table; fit needs trajectories (.nc) with full states. "
+            f"To identify the robot from recordings, type: {typed} (with --config recording.yaml if the "
+            "file does not state the meaning of its columns)"
+        )
+    numbers: int | tuple[int, ...] = seed or 0
+    if seeds is not None:
+        if seed is not None:
+            raise ValueError("--seed is for one model and --seeds for several; give one of them")
+        values = numbers_in(seeds)
+        if values is None or not all(value.is_integer() for value in values):
+            raise ValueError(f"--seeds must be whole numbers, such as 0,1,2 (got {seeds!r})")
+        numbers = tuple(map(int, values))
     several = isinstance(numbers, tuple)
     if several and out.exists() and not out.is_dir():
         raise ValueError(f"{out}: this is a file; with several seeds --out must be a folder")
@@ -118,8 +117,9 @@ def fit(
 
     nominal = load_system(robot, changes)
     config = _config(preset, numbers, epochs)
-    training = [_loaded(path, rows) for path in trajectories]
-    validation = [_loaded(path, None) for path in held_out or ()]
+    training = [load_trajectory_file(path) for path in trajectories]
+    training = [states if states.y.ndim != 3 else states[:rows] for states in training]
+    validation = [load_trajectory_file(path) for path in held_out or ()]
     began = perf_counter()
     try:
         result = learn(
@@ -127,11 +127,16 @@ def fit(
             progress=shows_progress(progress),
         )  # fmt: skip
     except DataError as error:
-        raise ValueError(_with_file_names(str(error), trajectories)) from None
+        # files' names instead of the numbers of trajectories
+        names = dict(enumerate(map(str, trajectories)))
+        text = re.sub(r"\btrajectory (\d+)\b", lambda match: names.get(int(match[1]), match[0]), str(error))
+        raise ValueError(text) from None
     seconds = perf_counter() - began
     result.save(out)
     if figure:
-        _draw(next(iter(result)) if several else result, training[0], figure)
+        from knode_cosserat.evaluation.learning_figures import residual
+
+        residual(next(iter(result)) if several else result, training[0]).savefig(figure)
     count = sum(len(one.time) for one in training)
     files = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
@@ -155,24 +160,6 @@ def fit(
     )  # fmt: skip
 
 
-def _draw(model: KNODE, states: Trajectory, path: Path) -> None:
-    """Draw the residual at the states of a trajectory."""
-    from knode_cosserat.evaluation.learning_figures import residual
-
-    residual(model, states).savefig(path)
-
-
-def _seeds(seed: int | None, seeds: str | None) -> int | tuple[int, ...]:
-    if seeds is None:
-        return 0 if seed is None else seed
-    if seed is not None:
-        raise ValueError("--seed is for one model and --seeds for several; give one of them")
-    numbers = numbers_in(seeds)
-    if numbers is None or not all(number.is_integer() for number in numbers):
-        raise ValueError(f"--seeds must be whole numbers, such as 0,1,2 (got {seeds!r})")
-    return tuple(int(number) for number in numbers)
-
-
 def _config(preset: Preset, seed: int | tuple[int, ...], epochs: int | None) -> FitConfig:
     import dataclasses
 
@@ -188,30 +175,3 @@ def _config(preset: Preset, seed: int | tuple[int, ...], epochs: int | None) -> 
     if epochs is None or config.segments is None:
         return config
     return dataclasses.replace(config, segments=dataclasses.replace(config.segments, epochs=epochs))
-
-
-def _loaded(path: Path, rows: int | None) -> Trajectory:
-    states = load_trajectory_file(path)
-    return states if rows is None or states.y.ndim != 3 else states[:rows]
-
-
-def _refuse_recordings(robot: str, paths: list[Path], out: Path) -> None:
-    """Raise `ValueError` with the command for recordings, if a file is one."""
-    recordings = [path for path in paths if is_recording(str(path))]
-    if recordings:
-        typed = command_line("identify", robot, *recordings, "--out", out.with_suffix(".yaml"))
-        raise ValueError(
-            f"{recordings[0]}: this is a recording or table; fit needs trajectories (.nc) with full states. "
-            f"To identify the robot from recordings, type: {typed} (with --config recording.yaml if the "
-            "file does not state the meaning of its columns)"
-        )
-
-
-def _with_file_names(message: str, paths: list[Path]) -> str:
-    """Return a message with the files' names instead of the numbers of trajectories."""
-
-    def path(found: re.Match[str]) -> str:
-        number = int(found[1])
-        return str(paths[number]) if number < len(paths) else found[0]
-
-    return re.sub(r"\btrajectory (\d+)\b", path, message)

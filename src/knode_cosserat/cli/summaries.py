@@ -26,9 +26,9 @@ def motion_summary(trajectory: Trajectory) -> dict[str, Any]:
         row = int(np.argmin(valid))
         message = Result(int(codes[row])).message
         failure = {"step": row, "time": float(trajectory.time[row]), "message": message}
-    found, counts = np.unique(codes[1:], return_counts=True)
+    kinds, counts = np.unique(codes[1:], return_counts=True)
     return {
-        "results": {Result(int(code)).name.lower(): int(n) for code, n in zip(found, counts, strict=True)},
+        "results": {Result(int(code)).name.lower(): int(n) for code, n in zip(kinds, counts, strict=True)},
         "all_solved": bool(valid.all()),
         "first_failure": failure,
         "largest_residual": float(np.asarray(trajectory.residual)[valid].max()),
@@ -130,8 +130,8 @@ def control_summary(system: System) -> dict[str, dict[str, str]]:
 
     layout = system.control_layout
     meanings = [field.meaning for field in layout.fields for _ in range(field.size)]
-    each = zip(named_controls.labels(layout), named_controls.units(layout), meanings, strict=True)
-    return {name: {"unit": unit, "meaning": meaning} for name, unit, meaning in each}
+    rows = zip(named_controls.labels(layout), named_controls.units(layout), meanings, strict=True)
+    return {name: {"unit": unit, "meaning": meaning} for name, unit, meaning in rows}
 
 
 def more_lines(system: System) -> list[str]:

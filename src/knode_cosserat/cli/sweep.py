@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat.cli.arguments import Json, Progress, require_writable, shows_progress
+from knode_cosserat.cli.arguments import Json, Progress, argument, option, require_writable, shows_progress
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
-    from knode_cosserat.sweeps.description import Sweep
-    from knode_cosserat.sweeps.executors import Executor
-    from knode_cosserat.sweeps.plan import Plan
+    from knode_cosserat.sweeps import Sweep
 
 
 @app.command(
@@ -33,63 +31,54 @@ if TYPE_CHECKING:
     )
 )
 def sweep(
-    description: Annotated[
-        str, typer.Argument(metavar="DESCRIPTION", help="Description of the sweep (YAML), or a robot.")
-    ],
-    out: Annotated[Path, typer.Option(metavar="DIR", help="Output folder; created if it does not exist.")],
+    description: Annotated[str, argument("DESCRIPTION", "Description of the sweep (YAML), or a robot.")],
+    out: Annotated[Path, option("DIR", "Output folder; created if it does not exist.")],
     controls: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="CONTROLS",
-            help="Controls as for `simulate`; a name in braces is a varied number: sine:{period}, "
+        option(
+            "CONTROLS",
+            "Controls as for `simulate`; a name in braces is a varied number: sine:{period}, "
             "random:{seed}. May be repeated.",
         ),
     ] = None,
     vary: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUES",
-            help="Vary a parameter, or a name in braces: LOW:HIGH, LOW:HIGH:log, LOW:HIGH:COUNT on a grid, "
+        option(
+            "NAME=VALUES",
+            "Vary a parameter, or a name in braces: LOW:HIGH, LOW:HIGH:log, LOW:HIGH:COUNT on a grid, "
             "or values A,B,C. May be repeated.",
         ),
     ] = None,
     sampler: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME", help="grid, sobol, halton, latin-hypercube or random.", show_default="grid"
-        ),
+        str | None, option("NAME", "grid, sobol, halton, latin-hypercube or random.", show_default="grid")
     ] = None,
-    samples: Annotated[int | None, typer.Option(metavar="N", help="Samples, except on a grid.")] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed.", show_default="0")] = None,
-    steps: Annotated[int | None, typer.Option(metavar="N", help="Number of time steps.")] = None,
-    dt: Annotated[float | None, typer.Option(metavar="S", help="Time step (s).")] = None,
+    samples: Annotated[int | None, option("N", "Samples, except on a grid.")] = None,
+    seed: Annotated[int | None, option("N", "Seed.", show_default="0")] = None,
+    steps: Annotated[int | None, option("N", "Number of time steps.")] = None,
+    dt: Annotated[float | None, option("S", "Time step (s).")] = None,
     store: Annotated[
         str | None,
-        typer.Option(
-            metavar="A,B,…",
-            help="Stored quantities: tip_position, tip_quaternion, position, y, z, controls.",
+        option(
+            "A,B,…",
+            "Stored quantities: tip_position, tip_quaternion, position, y, z, controls.",
             show_default="tip_position",
         ),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(
-            metavar="N", min=1, help="Processes of this machine, or jobs of --cluster.",
-            show_default="one per core; 1 job",
+        option(
+            "N", "Processes of this machine, or jobs of --cluster.", min=1, show_default="one per core; 1 job"
         ),
     ] = None,
-    dask: Annotated[
-        str | None, typer.Option(metavar="ADDRESS", help="Run on the Dask cluster of this scheduler.")
-    ] = None,
+    dask: Annotated[str | None, option("ADDRESS", "Run on the Dask cluster of this scheduler.")] = None,
     cluster: Annotated[
-        str | None,
-        typer.Option(metavar="KIND", help="Run as jobs: slurm; local or debug to try it on this machine."),
+        str | None, option("KIND", "Run as jobs: slurm; local or debug to try it on this machine.")
     ] = None,
     slurm: Annotated[
         list[str] | None,
-        typer.Option(
-            metavar="NAME=VALUE",
-            help="Parameter of the jobs: timeout_min, cpus_per_task, mem_gb, slurm_partition, … of submitit. "
+        option(
+            "NAME=VALUE",
+            "Parameter of the jobs: timeout_min, cpus_per_task, mem_gb, slurm_partition, … of submitit. "
             "May be repeated.",
         ),
     ] = None,
@@ -98,64 +87,66 @@ def sweep(
     ] = False,
     progress: Progress = None,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Simulate many cases: a grid or a sampler over robots, parameters, controls and seeds.
 
     Writes Parquet files with parameters, results, tips and reasons of failed cases, and a manifest with the
     versions of all packages. The same command continues a sweep that was stopped or killed. Needs the extra
     `sweep`.
     """
-    executor = _executor(workers, dask, cluster, slurm)
-    given = {
-        "controls": controls,
-        "steps": steps,
-        "dt": dt,
-        "sampler": sampler,
-        "samples": samples,
-        "seed": seed,
-    }
-    described = _described(description, given, vary, store)
-    require_writable(folders=[] if dry_run else [out])
-    from knode_cosserat.sweeps.plan import Plan
+    from knode_cosserat.sweeps import Dask, Local, Plan, Slurm, run_sweep
 
+    if dask and (workers or cluster):
+        raise ValueError("--dask is for a running cluster; allowed is --dask without --workers and --cluster")
+    if slurm and not cluster:
+        raise ValueError("--slurm has parameters of jobs; required is --cluster slurm")
+    parameters: dict[str, Any] = {}
+    for text in slurm or ():
+        name, _, value = (part.strip() for part in text.partition("="))
+        if not (name and value):
+            raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {text!r})")
+        parameters[name] = int(value) if value.isdecimal() else value
+    options = {
+        "controls": controls, "steps": steps, "dt": dt, "sampler": sampler, "samples": samples, "seed": seed,
+        "store": None if store is None else [name.strip() for name in store.split(",")],
+    }  # fmt: skip
+    described = _described(description, options, vary or [])
+    require_writable(folders=[] if dry_run else [out])
     plan = Plan.of(described)
     facts = {
         "cases": described.case_count, "robots": len(plan.systems), "shards": plan.shard_count,
         "shard_cases": plan.shard_cases, "megabytes": round(plan.total_bytes / 1e6, 3),
     }  # fmt: skip
     if dry_run:
-        write_output(as_json, facts, [*str(described).splitlines(), _size(plan)])
+        size = (
+            f"{plan.shard_count} files of up to {plan.shard_cases} cases; "
+            f"{plan.total_bytes / 1e6:.3g} MB of numbers before compression"
+        )
+        write_output(as_json, facts, [*str(described).splitlines(), size])
         return
-    from knode_cosserat.sweeps.run import run_sweep
-
+    local = Slurm(workers or 1, cluster, parameters) if cluster else Local(workers)
     began = perf_counter()
-    data = run_sweep(described, out, executor=executor, progress=shows_progress(progress))
+    data = run_sweep(
+        described, out, executor=Dask(dask) if dask else local, progress=shows_progress(progress)
+    )
     seconds = perf_counter() - began
     facts |= {"failed": data.failed_count, "computing_time": round(seconds, 2)}
     write_output(as_json, facts, [*str(data).splitlines(), f"computed in {seconds:.1f} s"], out=out)
 
 
-def _size(plan: Plan) -> str:
-    return (
-        f"{plan.shard_count} files of up to {plan.shard_cases} cases; "
-        f"{plan.total_bytes / 1e6:.3g} MB of numbers before compression"
-    )
-
-
-def _described(name: str, given: dict[str, Any], vary: list[str] | None, store: str | None) -> Sweep:
+def _described(name: str, options: dict[str, Any], vary: list[str]) -> Sweep:
     """Return the sweep of a description, or of a robot, with the options' values."""
-    from knode_cosserat.sweeps.description import Sweep, read_mapping
+    from knode_cosserat.sweeps import Sweep
+    from knode_cosserat.sweeps._description import read_mapping
 
-    options = {key: value for key, value in given.items() if value not in (None, [])}
-    if store is not None:
-        options["store"] = [each.strip() for each in store.split(",")]
     mapping: dict[Any, Any] = {"robots": name}
     if os.path.isfile(name) and name.endswith((".yaml", ".yml")):
         content = read_mapping(name)
         mapping = mapping if "kind" in content else content
-    varied = dict(_variation(each) for each in vary or ())
-    if len(varied) < len(vary or ()):
+    varied = dict(map(_variation, vary))
+    if len(varied) < len(vary):
         raise ValueError("--vary: a name is given twice; allowed is each name once")
+    options = {key: value for key, value in options.items() if value not in (None, [])}
     if varied:
         options["vary"] = {**(mapping.get("vary") or {}), **varied}
     return Sweep.of({**mapping, **options}, name)
@@ -163,43 +154,21 @@ def _described(name: str, given: dict[str, Any], vary: list[str] | None, store: 
 
 def _variation(text: str) -> tuple[str, Any]:
     """Return the name and the values of an option NAME=VALUES."""
-    name, equals, rest = (part.strip() for part in text.partition("="))
+    name, _, rest = (part.strip() for part in text.partition("="))
     low, *more = rest.split(":")
-    ends = [numbers_in(each) for each in (low, *more[:1])]
-    if name and equals and not more and ends[0]:
-        return name, ends[0]
-    if name and equals and len(more) in (1, 2) and all(each and len(each) == 1 for each in ends):
-        found: dict[str, Any] = {"low": ends[0][0], "high": ends[1][0]}  # type: ignore[index]
+    values = numbers_in(low)
+    high = numbers_in(more[0]) if more else None
+    if name and values and not more:
+        return name, values
+    if name and values and high and len(values) == len(high) == 1 and len(more) < 3:
+        ends: dict[str, Any] = {"low": values[0], "high": high[0]}
         if len(more) == 1:
-            return name, found
+            return name, ends
         if more[1] == "log":
-            return name, found | {"scale": "log"}
+            return name, ends | {"scale": "log"}
         if more[1].isdecimal():
-            return name, found | {"count": int(more[1])}
+            return name, ends | {"count": int(more[1])}
     raise ValueError(
         f"--vary must be NAME=LOW:HIGH, NAME=LOW:HIGH:log, NAME=LOW:HIGH:COUNT or NAME=A,B,C, such as "
         f"length=0.4:0.8 (got {text!r})"
     )
-
-
-def _executor(
-    workers: int | None, dask: str | None, cluster: str | None, slurm: list[str] | None
-) -> Executor:
-    """Return the executor that the options choose."""
-    if dask and (workers or cluster):
-        raise ValueError("--dask is for a running cluster; allowed is --dask without --workers and --cluster")
-    if slurm and not cluster:
-        raise ValueError("--slurm has parameters of jobs; required is --cluster slurm")
-    from knode_cosserat.sweeps import Dask, Local, Slurm
-
-    if dask:
-        return Dask(dask)
-    if not cluster:
-        return Local(workers)
-    parameters: dict[str, Any] = {}
-    for each in slurm or ():
-        name, equals, value = (part.strip() for part in each.partition("="))
-        if not (name and equals and value):
-            raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {each!r})")
-        parameters[name] = int(value) if value.isdecimal() else value
-    return Slurm(workers or 1, cluster, parameters)

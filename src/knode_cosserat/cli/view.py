@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import webbrowser
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,11 +14,13 @@ from knode_cosserat.cli.arguments import (
     Json,
     Nodes,
     Space,
+    argument,
     command_line,
     is_recording,
     is_trajectory,
     load_system,
     load_trajectory_file,
+    option,
     require_writable,
 )
 from knode_cosserat.cli.output import write_output
@@ -41,31 +44,24 @@ EXAMPLE = "delrin-tendon-robot"
 def view(
     files: Annotated[
         list[str] | None,
-        typer.Argument(
-            metavar="[FILE]…", help="Trajectory files; with --live, one robot or model.", show_default=False
-        ),
+        argument("[FILE]…", "Trajectory files; with --live, one robot or model.", show_default=False),
     ] = None,
     live: Annotated[
         bool, typer.Option("--live", help="Simulate a robot or model in real time, controlled by sliders.")
     ] = False,
-    export: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write one self-contained HTML file and exit."),
-    ] = None,
+    export: Annotated[Path | None, option("FILE", "Write one self-contained HTML file and exit.")] = None,
     port: Annotated[
         int,
-        typer.Option(
-            metavar="N",
-            help="Port of the local web server, reachable from this machine only.",
+        option(
+            "N",
+            "Port of the local web server, reachable from this machine only.",
             show_default="any free port",
         ),
     ] = 0,
     no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")] = False,
     dt: Annotated[
         float | None,
-        typer.Option(
-            metavar="S", help="With --live: time step (s).", show_default="the model's training step, or 0.05"
-        ),
+        option("S", "With --live: time step (s).", show_default="the model's training step, or 0.05"),
     ] = None,
     space: Space = "lobatto2",
     changes: Changes = None,
@@ -83,7 +79,7 @@ def view(
     def announce(address: str) -> None:
         write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
         if not no_open:
-            viewer.serve.open_page(address)
+            webbrowser.open(address)
 
     if live:
         if export:

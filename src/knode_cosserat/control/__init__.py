@@ -1,18 +1,23 @@
-"""Closed-loop control: predictive control of any System, baselines, and the loop."""
+"""Closed-loop control: predictive control of any System, other controllers by name, and the loop."""
 
-from knode_cosserat.control.baselines.iterative import ILQR
-from knode_cosserat.control.baselines.koopman import KoopmanController
-from knode_cosserat.control.baselines.lqr import LQR
-from knode_cosserat.control.baselines.sampling import MPPI
-from knode_cosserat.control.baselines.tip_feedback import PID, KinematicController
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.lag import identified_lag
-from knode_cosserat.control.loop import LoopLog, run_loop
-from knode_cosserat.control.named import controller_named
+from knode_cosserat.control.commands import (
+    CONTROLLERS,
+    Command,
+    Controller,
+    ControlLimits,
+    Status,
+    controller_named,
+    identified_lag,
+    register_controller,
+)
+from knode_cosserat.control.ilqr import ILQR
+from knode_cosserat.control.koopman import KoopmanController
+from knode_cosserat.control.loop import LoopLog, distance_out_of_reach, run_loop
+from knode_cosserat.control.lqr import LQR
+from knode_cosserat.control.mppi import MPPI
+from knode_cosserat.control.planning import Weights
 from knode_cosserat.control.plants import Plant, Sensor, SimulatedPlant
 from knode_cosserat.control.predictive import PredictiveController, SoftLimit
-from knode_cosserat.control.program import Weights
-from knode_cosserat.control.qp import DAQP, QPError, QPSolver
 from knode_cosserat.control.references import (
     Reference,
     ReferenceFormatError,
@@ -23,9 +28,10 @@ from knode_cosserat.control.references import (
     steps,
     table,
 )
+from knode_cosserat.control.tip_feedback import PID, KinematicController
 
 __all__ = [
-    "DAQP",
+    "CONTROLLERS",
     "ILQR",
     "LQR",
     "MPPI",
@@ -38,8 +44,6 @@ __all__ = [
     "LoopLog",
     "Plant",
     "PredictiveController",
-    "QPError",
-    "QPSolver",
     "Reference",
     "ReferenceFormatError",
     "Sensor",
@@ -50,9 +54,11 @@ __all__ = [
     "circle",
     "constant",
     "controller_named",
+    "distance_out_of_reach",
     "figure_eight",
     "identified_lag",
     "parse_reference",
+    "register_controller",
     "run_loop",
     "steps",
     "table",

@@ -1,4 +1,4 @@
-"""Interface of controllers: commands with their status."""
+"""Interface of controllers: commands with their status, limits, lag of motors, and controllers by name."""
 
 from __future__ import annotations
 
@@ -6,13 +6,19 @@ import abc
 import copy
 import dataclasses
 import enum
-from typing import Any, NamedTuple, Self
+import inspect
+from collections.abc import Callable, Sequence
+from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
+
+#: longest time constant of motors that is looked for (s)
+LONGEST_LAG = 2.0
 
 
 class Status(enum.Enum):
@@ -71,12 +77,12 @@ class ControlLimits:
         count = robot.control_size
         arrays = {}
         for name in ("low", "high", "rate", "safe"):
-            given = getattr(self, name)
-            given = self.low if given is None else given
+            value = getattr(self, name)
+            value = self.low if value is None else value
             try:
-                arrays[name] = np.array(np.broadcast_to(np.asarray(given, dtype=float), (count,)))
+                arrays[name] = np.array(np.broadcast_to(np.asarray(value, dtype=float), (count,)))
             except (TypeError, ValueError):
-                raise ValueError(f"{name} is {given!r}; allowed is a number or {count} numbers") from None
+                raise ValueError(f"{name} is {value!r}; allowed is a number or {count} numbers") from None
         if not np.all(np.isfinite(arrays["low"]) & np.isfinite(arrays["high"])):
             raise ValueError("low and high must be finite")
         if not np.all(arrays["low"] < arrays["high"]):
@@ -99,10 +105,22 @@ class ControlLimits:
 
 
 class Controller(abc.ABC):
-    """A controller of a robot: a command in each period, from measurements and a reference."""
+    """A controller of a robot: a command in each period, from measurements and a reference.
 
+    `register_controller` gives a subclass a name for `controller_named` and the command line.
+    """
+
+    #: True if `for_tip` takes `adapt` and `measured`, the adapted parameters and the output of an observer
+    has_observer: ClassVar[bool] = False
     #: period (s)
     dt: float
+    #: control that acts now
+    _control: Any
+
+    @classmethod
+    def for_tip(cls, robot: System, dt: float, limits: ControlLimits, **options: Any) -> Self:
+        """Return a controller of the tip's position; by default the constructor with these arguments."""
+        return cls(robot, dt, limits, **options)  # type: ignore[call-arg]
 
     @abc.abstractmethod
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
@@ -125,6 +143,157 @@ class Controller(abc.ABC):
     def prepare(self, time: float, reference: Reference) -> None:  # noqa: B027
         """Compute what the period from `time` on needs before its measurement; by default nothing."""
 
-    @abc.abstractmethod
     def fallback(self, reason: str) -> Command:
-        """Return a command for a period without a solution, such as a missed deadline."""
+        """Return a command for a period without a solution: by default the control that acts now."""
+        return Command(self._control, Status.HELD, reason)
+
+
+# controllers by name
+
+
+class RegisteredController(NamedTuple):
+    """Class of a controller of the tip's position, a line of help, and its options with their defaults."""
+
+    cls: type[Controller]
+    help: str
+    options: dict[str, int | float]
+
+
+#: controllers by name, for `controller_named`, the command line and the documentation
+CONTROLLERS: dict[str, RegisteredController] = {}
+
+AnyController = TypeVar("AnyController", bound=type[Controller])
+
+
+def register_controller(name: str, help: str) -> Callable[[AnyController], AnyController]:
+    """Return a decorator that registers a controller class under a name.
+
+    Its options are the keyword arguments of its constructor that have numbers as defaults:
+
+        @register_controller("slow", "integral of the tip's error")
+        class Slow(Controller):
+            def __init__(self, robot, dt, limits, *, gain: float = 0.5): ...
+
+        controller_named("slow:gain=0.2", robot, 0.05, limits)
+
+    Raises:
+        ValueError: the name belongs to another class.
+    """
+
+    def register(cls: AnyController) -> AnyController:
+        if name in CONTROLLERS and CONTROLLERS[name].cls.__qualname__ != cls.__qualname__:
+            raise ValueError(f"the controller {name!r} is registered already; allowed is another name")
+        parameters = inspect.signature(cls).parameters.values()
+        options = {
+            parameter.name: parameter.default
+            for parameter in parameters
+            if parameter.kind is inspect.Parameter.KEYWORD_ONLY and type(parameter.default) in (int, float)
+        }
+        CONTROLLERS[name] = RegisteredController(cls, help, options)
+        return cls
+
+    return register
+
+
+def controller_named(
+    name: str, robot: System, dt: float, limits: ControlLimits, adapt: Sequence[Any] = (),
+    measured: Any = None,
+) -> Controller:  # fmt: skip
+    """Return a controller of the tip's position by its name.
+
+    Args:
+        name: one of `CONTROLLERS`, perhaps with options: "predictive:horizon=10,knots=5".
+        robot: the model.
+        dt: period (s).
+        limits: limits of the controls.
+        adapt: names of parameters, or `Adapted` ones, that a controller with an observer adapts.
+        measured: the measurement of an observer, with its noise; None: the tip's position. The noise of an
+            identified model's measurement includes the error of its predictions.
+
+    Raises:
+        ValueError: an unknown name or option, or parameters for a controller that adapts none.
+        SimulationError: the model has no equilibrium that the controller needs.
+    """
+    name, _, text = name.partition(":")
+    if name not in CONTROLLERS:
+        raise ValueError(
+            f"there is no controller {name!r}; there are {', '.join(CONTROLLERS)}"
+            f"{did_you_mean(name, CONTROLLERS)}"
+        )
+    cls, _, defaults = CONTROLLERS[name]
+    if adapt and not cls.has_observer:
+        observing = ", ".join(key for key, entry in CONTROLLERS.items() if entry.cls.has_observer)
+        raise ValueError(
+            f"the controller {name!r} adapts no parameters; those with an observer do: {observing}"
+        )
+    options: dict[str, Any] = {"adapt": adapt, "measured": measured} if cls.has_observer else {}
+    for word in filter(None, text.split(",")):
+        key, _, number = (part.strip() for part in word.partition("="))
+        if key not in defaults:
+            raise ValueError(
+                f"the controller {name!r} has no option {key!r}; there are {', '.join(defaults) or 'none'}"
+                f"{did_you_mean(key, defaults)}"
+            )
+        kind = type(defaults[key])
+        try:
+            options[key] = kind(number)
+        except ValueError:
+            words = "a whole number" if kind is int else "a number"
+            raise ValueError(f"{name}: {key} is {number!r}; allowed is {words}") from None
+    return cls.for_tip(robot, dt, limits, **options)
+
+
+# lag of motors
+
+
+def remaining_part(lag: float, dt: float) -> float:
+    """Return the remaining part of the distance from a command after a time `dt` (s)."""
+    return float(np.exp(-dt / lag)) if lag > 0.0 else 0.0
+
+
+def mean_part(lag: float, dt: float) -> float:
+    """Return the mean remaining part of the distance from a command over a time `dt` (s).
+
+    A step of a motion holds its controls: those of motors that lag count by their mean.
+    """
+    return lag / dt * (1.0 - remaining_part(lag, dt)) if lag > 0.0 else 0.0
+
+
+def lagged(
+    commanded: Float[np.ndarray, "T c"], dt: float, lag: float, initial: Float[np.ndarray, " c"]
+) -> Float[np.ndarray, "T c"]:
+    """Return the controls at the end of each row of commands, after a first-order lag.
+
+    Args:
+        commanded: held from row to row.
+        dt: time from row to row (s).
+        lag: time constant (s); 0: none.
+        initial: controls before the first row.
+    """
+    rows, acting, remaining = [], np.asarray(initial, dtype=float), remaining_part(lag, dt)
+    for command in commanded:
+        acting = command + (acting - command) * remaining
+        rows.append(acting)
+    return np.array(rows)
+
+
+def identified_lag(
+    commanded: Float[np.ndarray, "T c"], measured: Float[np.ndarray, "T c"], dt: float,
+    initial: Float[np.ndarray, " c"],
+) -> float:  # fmt: skip
+    """Return the time constant (s) of the motors, by least squares of the measured tensions.
+
+    Args:
+        commanded: tensions, held from row to row.
+        measured: tensions at the end of each row; NaN: not measured.
+        dt: time from row to row (s).
+        initial: tensions before the first row.
+    """
+    from scipy.optimize import minimize_scalar
+
+    def cost(lag: float) -> float:
+        return float(np.nansum((lagged(commanded, dt, lag, initial) - measured) ** 2))
+
+    return float(
+        minimize_scalar(cost, bounds=(0.0, LONGEST_LAG), method="bounded", options={"xatol": 1e-5}).x
+    )

@@ -1,9 +1,10 @@
-"""Closed loops: a controller, a plant and a reference, period after period."""
+"""Closed loops: checks of a reference, and a controller, a plant and a reference, period after period."""
 
 from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import gc
 import time as clock
 from collections import deque
@@ -16,14 +17,114 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.writing import replacing
-from knode_cosserat.control.checks import check_reference
-from knode_cosserat.control.commands import Command, Controller
+from knode_cosserat.control.commands import Command, Controller, ControlLimits
 from knode_cosserat.control.plants import Plant
-from knode_cosserat.control.references import Reference
-from knode_cosserat.control.states import estimated, joined
+from knode_cosserat.control.references import Reference, ReferenceFormatError
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.system import System
+from knode_cosserat.statics.reach import inverse_kinematics
 from knode_cosserat.trajectory import Trajectory
+
+#: seconds of a reference that are checked, and the time between two of them (s)
+CHECKED, SAMPLING = 60.0, 0.02
+#: distance from the base, in lengths of the rod, which a rod that stretches or a moving base may reach
+STRETCH = 1.5
+#: points of a reference whose nearest tips are searched, initial controls of each search, and the part of the
+#: length within which a point is reached
+POINTS, STARTS, REACHED = 12, 2, 1e-4
+
+
+# checks of a reference
+
+
+def check_reference(controller: Any, reference: Reference, seconds: float = CHECKED) -> None:
+    """Raise a `ReferenceFormatError` if a controller of positions cannot reach a reference at all.
+
+    Controllers of other outputs, such as curvatures, are not checked.
+    """
+    robot, target = getattr(controller, "robot", None), getattr(controller, "target", None)
+    if robot is not None and (target is None or isinstance(target, BodyPositions | BodyPoses)):
+        check_within_length(robot, reference, seconds)
+
+
+def check_within_length(robot: System, reference: Reference, seconds: float = CHECKED) -> None:
+    """Raise an error if a reference of tip positions is much further from the base than the rod is long.
+
+    Args:
+        robot: the model; the check does not apply to robots of several rods.
+        reference: positions (m), perhaps followed by other numbers.
+        seconds: checked duration (s).
+
+    Raises:
+        ReferenceFormatError: a position that no rod of this length reaches, even if it stretches or its base
+            moves.
+    """
+    length = getattr(robot.nominal, "length", None)
+    if length is None or robot.strands > 1 or reference.size < 3:
+        return
+    y, _ = robot.rest(0.0)
+    base = np.asarray(robot.drawing.positions(np.asarray(y)[None]))[0]
+    length, times = float(length), np.arange(0.0, seconds, SAMPLING)
+    apart = np.sqrt(np.nansum((reference.at(times)[:, :3] - base) ** 2, axis=1))
+    k = int(np.argmax(apart))
+    if apart[k] > STRETCH * length:
+        raise ReferenceFormatError(
+            f"the {reference.name} is {apart[k]:.4g} m from the base at t = {times[k]:.4g} s, and the robot "
+            f"is {length:.4g} m long; are the positions in metres, in the robot's frame?"
+        )
+
+
+def distance_out_of_reach(
+    robot: System, limits: ControlLimits, reference: Reference, seconds: float = CHECKED
+) -> tuple[float, float]:
+    """Return the largest distance (m) from a reference to the nearest tip at rest, and its time (s).
+
+    Inverse kinematics within the limits gives the nearest tip of some points spread over the reference, so
+    the distance is a lower bound of the largest one. A moving robot may swing further.
+
+    Args:
+        robot: the model.
+        limits: of its controls.
+        reference: positions (m); coordinates that are free (NaN) in the first row do not count.
+        seconds: checked duration (s).
+    """
+    check_within_length(robot, reference, seconds)
+    bounds = limits.of(robot)
+    times = np.arange(0.0, seconds, SAMPLING)
+    wanted = reference.at(times)[:, :3]
+    known = tuple(np.flatnonzero(np.isfinite(wanted[0])).tolist())
+    if not known:
+        return 0.0, 0.0
+    wanted = wanted[:, known]
+    # rows that are far from each other
+    chosen = [int(np.nanargmax(np.linalg.norm(wanted - np.nanmean(wanted, axis=0), axis=1)))]
+    apart = np.linalg.norm(wanted - wanted[chosen[0]], axis=1)
+    while len(chosen) < POINTS and np.nanmax(apart) > 0.0:
+        chosen.append(int(np.nanargmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(wanted - wanted[chosen[-1]], axis=1))
+    chosen.sort()
+    found = inverse_kinematics(
+        robot, wanted[chosen], low=bounds.low, high=bounds.high, tolerance=REACHED, starts=STARTS,
+        pose=_coordinates(known),
+    )  # fmt: skip
+    apart = np.where(found.converged, 0.0, np.nan_to_num(found.position_error))
+    k = int(np.argmax(apart))
+    return float(apart[k]), float(times[chosen[k]])
+
+
+@functools.cache
+def _coordinates(known: tuple[int, ...]) -> Any:
+    """Return the pose function of some of the tip's coordinates; the same one each time, for compilation."""
+
+    def pose(system: System, y: Any) -> tuple[Any, None]:
+        return system.drawing.positions(y)[np.array(known)], None
+
+    return pose
+
+
+# the log
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,6 +255,43 @@ class LoopLog:
         )
 
 
+# states as trajectories
+
+
+def estimated(controller: Any) -> Trajectory | None:
+    """Return the state that a controller's observer estimates, a trajectory of one row, or None."""
+    observer = getattr(controller, "observer", None)
+    if observer is None:
+        return None
+    estimate = observer.estimate
+    one = np.zeros(1)
+    return Trajectory(
+        observer.robot, None, np.array([estimate.time]), np.asarray(estimate.y)[None],
+        np.asarray(estimate.z)[None], np.asarray(observer.control, dtype=float)[None],
+        np.zeros(1, dtype=int), one, one,
+    )  # fmt: skip
+
+
+def joined(states: Sequence[Trajectory], times: Sequence[float]) -> Trajectory:
+    """Return a trajectory of rows of one robot, at these times (s)."""
+    y, z, control, result = (
+        np.concatenate([np.asarray(getattr(state, name)) for state in states])
+        for name in ("y", "z", "control", "result")
+    )
+    errors = [
+        np.full(1, np.nan) if state.position_error is None else np.asarray(state.position_error)
+        for state in states
+    ]
+    none = np.zeros(len(times))
+    return Trajectory(
+        states[0].system, states[0].settings, np.array(times), y, z, control, result, none,
+        none.astype(int), position_error=np.concatenate(errors),
+    )  # fmt: skip
+
+
+# periods
+
+
 class _Compilations:
     """Counts the programs that JAX compiles or loads in this process."""
 
@@ -255,14 +393,14 @@ class Loop:
         plant.apply(command.control)
         if applied is not None:
             applied()
-        state = estimated(controller)
+        state, observer = estimated(controller), getattr(controller, "observer", None)
         moved = clock.perf_counter()
         controller.advance(command.control)
         controller.prepare(time + controller.dt, reference)
         done = clock.perf_counter()
         row = Period(
             time, reference.at(time)[0], measured, tip, command, sent - began, done - moved,
-            _parameters_of(controller), state,
+            {} if observer is None else dict(observer.estimate.parameters), state,
         )  # fmt: skip
         self._rows.append(row)
         self._overrun += row.feedback + row.preparation > controller.dt
@@ -331,23 +469,19 @@ def run_loop(
     loop = Loop(controller, plant, reference)
     try:
         with _no_garbage_collection():
-            _periods(loop, steps, paced)
+            due = clock.perf_counter()
+            for k in range(steps):
+                if paced:
+                    loop.missed += k > 0 and clock.perf_counter() > due
+                    while (rest := due - clock.perf_counter()) > 0.0:
+                        clock.sleep(max(0.0, rest - 5e-4))
+                    due = max(due, clock.perf_counter() - loop.controller.dt) + loop.controller.dt
+                loop.period()
     except (KnodeCosseratError, KeyboardInterrupt) as error:
         # measurements of a robot are not lost
         error.log = loop.log() if loop.time > 0.0 else None  # type: ignore[union-attr]
         raise
     return loop.log()
-
-
-def _periods(loop: Loop, steps: int, paced: bool) -> None:
-    dt, due = loop.controller.dt, clock.perf_counter()
-    for k in range(steps):
-        if paced:
-            loop.missed += k > 0 and clock.perf_counter() > due
-            while (rest := due - clock.perf_counter()) > 0.0:
-                clock.sleep(max(0.0, rest - 5e-4))
-            due = max(due, clock.perf_counter() - dt) + dt
-        loop.period()
 
 
 def warm_up(controller: Controller, plant: Plant, reference: Reference, periods: int = 2) -> None:
@@ -360,8 +494,3 @@ def warm_up(controller: Controller, plant: Plant, reference: Reference, periods:
         plant.apply(command.control)
         controller.advance(command.control)
         controller.prepare((k + 1) * controller.dt, reference)
-
-
-def _parameters_of(controller: Controller) -> dict[str, float]:
-    observer = getattr(controller, "observer", None)
-    return {} if observer is None else dict(observer.estimate.parameters)

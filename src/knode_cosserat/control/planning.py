@@ -1,32 +1,299 @@
-"""Base of controllers that plan controls over a horizon, from an observer's estimate of the state."""
+"""Controllers that plan: knots of a horizon, predictions of a model, and their quadratic program."""
 
 from __future__ import annotations
 
 import copy
-from typing import Any, Self
+import dataclasses
+import functools
+import os
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from knode_cosserat.control.checks import check_memory
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status
-from knode_cosserat.control.lag import lag_weights, mean_part, remaining_part
-from knode_cosserat.control.plans import Knots
-from knode_cosserat.control.program import Tracking, Weights
+from knode_cosserat.control.commands import (
+    Command,
+    Controller,
+    ControlLimits,
+    Status,
+    lagged,
+    mean_part,
+    remaining_part,
+)
+from knode_cosserat.control.qp import QuadraticProgram
 from knode_cosserat.control.references import Reference
+from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
-from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.online import Belief, OnlineModel, errors_along, split_record
+from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
 
 #: periods in which an old plan goes on, and then the last control is held, before the robot goes safe
 SHIFTS, HOLDS = 5, 5
+#: part of the memory that predictions may take
+SHARE = 0.5
+
+
+# plans
+
+
+@dataclasses.dataclass(frozen=True)
+class Knots:
+    """Knots of a plan: the samples at which controls are chosen; in between they change linearly.
+
+    Attributes:
+        samples: indices of the knots, from 0 to horizon - 1.
+        horizon: number of samples of a plan.
+    """
+
+    samples: tuple[int, ...]
+    horizon: int
+
+    @classmethod
+    def spaced(cls, horizon: int, count: int) -> Knots:
+        """Return knots that are dense at the beginning and sparse at the end.
+
+        Raises:
+            ValueError: more knots than samples, or fewer than two.
+        """
+        if not 2 <= count <= horizon:
+            raise ValueError(f"knots is {count}; allowed are 2 to the horizon, {horizon}")
+        power = 1.0 if count == horizon else 1.6
+        wanted = np.round((horizon - 1) * (np.arange(count) / (count - 1)) ** power).astype(int)
+        for k in range(1, count):  # no two at one sample
+            wanted[k] = max(wanted[k], wanted[k - 1] + 1)
+        return cls(tuple(np.minimum(wanted, horizon - count + np.arange(count)).tolist()), horizon)
+
+    @property
+    def count(self) -> int:
+        """Number of knots."""
+        return len(self.samples)
+
+    @property
+    def basis(self) -> Float[np.ndarray, "T knots"]:
+        """Weights of the knots' values in every sample's control."""
+        rows = np.arange(self.horizon)
+        return np.stack([np.interp(rows, self.samples, one) for one in np.eye(self.count)], axis=1)
+
+    @property
+    def changes(self) -> Float[np.ndarray, "knots knots"]:
+        """Weights of the knots' values in the change of the control per sample.
+
+        Row 0 is the first control itself: its change is from the one before the plan. Row k is the change in
+        every sample from knot k - 1 to knot k.
+        """
+        spans = np.diff(self.samples)
+        rows = np.diff(np.eye(self.count), axis=0) / spans[:, None]
+        return np.concatenate([np.eye(self.count)[:1], rows])
+
+    def shifted(self, plan: Float[np.ndarray, "knots c"]) -> Float[np.ndarray, "knots c"]:
+        """Return the plan one sample later, with its last control held."""
+        later: Int[np.ndarray, " knots"] = np.minimum(np.array(self.samples) + 1, self.horizon - 1)
+        return self.controls(plan)[later]
+
+    def controls(self, plan: Any) -> Float[np.ndarray, "T c"]:
+        """Return the controls of all samples."""
+        return self.basis @ np.asarray(plan)
+
+
+def lag_weights(basis: Float[np.ndarray, "T knots"], lag: float, dt: float) -> Float[np.ndarray, "T more"]:
+    """Return the weights of a plan's knots, and of the controls before it, in the mean controls of periods.
+
+    Args:
+        basis: weights of the knots in the commands of the horizon.
+        lag: time constant of the motors (s).
+        dt: period (s).
+    """
+    before = np.zeros(basis.shape[1] + 1)
+    before[-1] = 1.0
+    commands = np.concatenate([basis, np.zeros((len(basis), 1))], axis=1)
+    starts = np.concatenate([before[None], lagged(commands, dt, lag, before)[:-1]])
+    return commands + (starts - commands) * mean_part(lag, dt)
+
+
+# cost
+
+
+@dataclasses.dataclass(frozen=True)
+class Weights:
+    """Weights of the cost, beside the tracked errors in units of their `noise`.
+
+    Attributes:
+        change: of the squared change of controls in one period, relative to the range of the controls.
+        effort: of the squared distance from the preferred controls, relative to the range.
+        preferred: preferred controls; None: the safe ones.
+    """
+
+    change: float = 10.0
+    effort: float = 1e-4
+    preferred: Any = None
+
+
+class SoftRows(NamedTuple):
+    """Linearised outputs (m,) with soft limits, and their derivatives by the plan (n, m)."""
+
+    value: Float[np.ndarray, " m"]
+    by_plan: Float[np.ndarray, "n m"]
+    low: Float[np.ndarray, " m"]
+    high: Float[np.ndarray, " m"]
+
+
+class Tracking(NamedTuple):
+    """Cost and limits of a plan, without the predicted errors.
+
+    The cost is the sum of squared errors, each divided by its acceptable size (`noise`), of the changes of
+    controls in one period, and of their distances from the preferred ones, both relative to their range.
+    """
+
+    knots: Knots
+    limits: ControlLimits
+    weights: Weights
+    noise: Float[np.ndarray, " e"]
+    dt: float
+
+    def _moves(self, plan: np.ndarray, control: np.ndarray) -> tuple[Any, Any, Any]:
+        """Return the range of controls, changes from knot to knot, and distances from preferred controls."""
+        limits, preferred = self.limits, self.weights.preferred
+        changes = self.knots.changes @ plan
+        changes[0] -= control
+        away = plan - np.asarray(limits.safe if preferred is None else preferred)
+        return np.asarray(limits.high) - np.asarray(limits.low), changes, away
+
+    def cost(self, error: Float[np.ndarray, "T e"], plan: np.ndarray, control: np.ndarray) -> float:
+        """Return the cost of a plan with these errors, after a control; free errors are NaN."""
+        spread, changes, away = self._moves(plan, control)
+        cost = np.nansum((error / self.noise) ** 2) + self.weights.change * np.sum((changes / spread) ** 2)
+        return float(cost + self.weights.effort * np.sum((away / spread) ** 2))
+
+    def program(
+        self, error: Float[np.ndarray, "T e"], by_plan: Float[np.ndarray, "n T e"], plan: np.ndarray,
+        control: np.ndarray, soft: SoftRows | None = None,
+    ) -> QuadraticProgram:  # fmt: skip
+        """Return the program whose unknowns are the changes (n,) of a plan.
+
+        Args:
+            error: predicted errors of the plan; NaN: free.
+            by_plan: their derivatives by the plan's numbers.
+            plan: (knots, c).
+            control: the control that acts before the plan (c,).
+            soft: limited outputs.
+        """
+        limits, w, c, count = self.limits, self.weights, len(control), self.knots.count
+        scale = np.where(np.isfinite(error), 1.0 / self.noise, 0.0)
+        e = np.where(scale > 0.0, error, 0.0) * scale
+        S = (np.where(scale > 0.0, by_plan, 0.0) * scale).reshape(len(by_plan), -1)
+        spread, changes, away = self._moves(plan, control)
+        A = np.kron(self.knots.changes, np.eye(c))
+        # a wanted error of one `noise` counts like a change over the whole range
+        D, effort = A / np.tile(spread, count)[:, None], np.tile(1.0 / spread, count)
+        H = S @ S.T + w.change * D.T @ D + w.effort * np.diag(effort**2)
+        g = S @ e.ravel() + w.change * D.T @ (changes / spread).ravel()
+        g = g + w.effort * effort * (away / spread).ravel()
+        most = np.tile(np.asarray(limits.rate) * self.dt, count)
+        below, above = -most - changes.ravel(), most - changes.ravel()
+        low, high = (np.tile(np.asarray(end), count) - plan.ravel() for end in (limits.low, limits.high))
+        if soft is None:
+            return QuadraticProgram(H, g, low, high, A, below, above)
+        A = np.concatenate([A, soft.by_plan.T])
+        below = np.concatenate([below, soft.low - soft.value])
+        above = np.concatenate([above, soft.high - soft.value])
+        return QuadraticProgram(H, g, low, high, A, below, above, len(soft.value))
+
+
+# predictions
+
+
+class Prediction(NamedTuple):
+    """Outputs of a predicted motion and their derivatives."""
+
+    #: error of the tracked output from the reference
+    error: Float[Any, "T e"]
+    by_plan: Float[Any, "n T e"]
+    by_state: Float[Any, "m T e"]
+    #: constrained outputs
+    limited: Float[Any, "T q"]
+    limited_by_plan: Float[Any, "n T q"]
+    limited_by_state: Float[Any, "m T q"]
+    #: positions of the tip (m)
+    path: Float[Any, "T 3"]
+    solved: Any
+
+
+def linearised_prediction(
+    model: OnlineModel, belief: Belief, plan: Float[Any, "knots c"], basis: Float[Any, "T knots"],
+    reference: Float[Any, "T p"], target: Output, limited: tuple[Output, ...],
+) -> Prediction:  # fmt: skip
+    """Return the prediction of a plan, whose controls are `basis` times `plan`, from an estimated state.
+
+    It is linearised by the plan's numbers and by the directions in which the state is uncertain.
+    """
+    (count, c), (steps, m) = plan.shape, (len(basis), len(belief.spread.records))
+    n = count * c
+    by_plan = np.einsum("tk,ij->kjti", basis, np.eye(c)).reshape(n, steps, c)
+    wide = jax.tree.map(lambda part: np.concatenate([np.zeros((n, *part.shape[1:])), part]), belief.spread)
+    d_controls = np.concatenate([by_plan, np.zeros((m, steps, c))])
+    system, rollout = model.rollout(belief._replace(spread=wide), basis @ plan, d_controls)
+    outputs = _outputs(system, rollout.records, rollout.d_records, reference, target, limited)
+    error, slopes, value, slope, path = map(np.asarray, outputs)
+    return Prediction(error, slopes[:n], slopes[n:], value, slope[:n], slope[n:], path, rollout.solved)
+
+
+@functools.partial(jax.jit, static_argnames=("target", "limited"))
+def _outputs(
+    system: System, records: Any, d_records: Any, reference: Any, target: Output, limited: tuple[Output, ...]
+) -> Any:
+    """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
+    steps, columns = len(records), d_records.shape[-1]
+    error, slopes = errors_along(system, target, records, d_records, reference)
+    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((columns, steps, 0))]
+    for output in limited:
+        zero = jnp.zeros((steps, output.size))
+        value, slope = errors_along(system, output, records, d_records, zero)
+        values.append(value)
+        moved.append(slope)
+    path = system.drawing.positions(split_record(system, records[:, -1])[0])
+    return error, slopes, jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1), path
+
+
+def check_memory(robot: System, horizon: int, columns: int) -> None:
+    """Raise an error if the derivatives of a prediction do not fit in memory.
+
+    Args:
+        robot: the model.
+        horizon: number of predicted periods.
+        columns: number of derivatives.
+
+    Raises:
+        ValueError: the horizon is too long; the message has the longest one.
+    """
+    try:
+        memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    except (AttributeError, OSError, ValueError):
+        return
+    # rows and their copies in the robot's grid
+    size = 3 * 8 * robot.nodes * (2 * robot.y_layout.size + robot.z_layout.size) * columns
+    most = int(SHARE * memory / size)
+    if horizon > most:
+        raise ValueError(
+            f"horizon is {horizon}; its derivatives need {1e-9 * size * horizon:.3g} GB; allowed are at most "
+            f"{most} periods on this machine"
+        )
+
+
+# the base of controllers that plan
 
 
 class PlanController(Controller):
     """Controller with a plan: controls at knots of the horizon, shifted by one period after each period.
 
-    A period without a new plan continues the old one, then holds the last control, then goes safe.
+    The state is an observer's estimate. A period without a new plan continues the old one, then holds the
+    last control, then goes safe.
     """
+
+    has_observer: ClassVar[bool] = True
 
     def __init__(
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, horizon: int, knots: int,
@@ -42,6 +309,16 @@ class PlanController(Controller):
             self._basis = lag_weights(self._basis, self.limits.lag, self.dt)
         self.reset(np.asarray(self.limits.safe))
 
+    @classmethod
+    def for_tip(
+        cls, robot: System, dt: float, limits: ControlLimits, *, adapt: Sequence[Adapted | str] = (),
+        measured: Output | None = None, **options: Any,
+    ) -> Self:  # fmt: skip
+        """Return a controller of the tip's position, with an observer of the model."""
+        target = TipPosition()
+        observer = KalmanObserver(robot, dt, target if measured is None else measured, adapt=adapt)
+        return cls(observer, target, limits, **options)
+
     @property
     def robot(self) -> System:
         """The model."""
@@ -49,17 +326,21 @@ class PlanController(Controller):
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Forget the plan; the control acts now. The observer keeps its state."""
-        self._plan = np.tile(np.asarray(control, dtype=float), (self.knots.count, 1))
         self._control = np.array(control, dtype=float)
+        self._hold()
         self._acting = self._control
         self._reason = "no prediction is prepared"
         self._failures = 0
 
+    def _hold(self) -> None:
+        """Plan to hold the control: a constant plan is the easiest to predict."""
+        self._plan = np.tile(self._control, (self.knots.count, 1))
+
     def copied(self) -> Self:
         """Return a copy, with a copy of the observer."""
-        found = super().copied()
-        found.observer = copy.copy(self.observer)
-        return found
+        other = super().copied()
+        other.observer = copy.copy(self.observer)
+        return other
 
     def take_acting(self, measured: Float[np.ndarray, " c"], age: float) -> None:
         """Take over measured controls (c,) of an age (s); since then they followed the last command."""
@@ -90,19 +371,35 @@ class PlanController(Controller):
         acting = np.broadcast_to(self._acting, (*plan.shape[:-2], 1, plan.shape[-1]))
         return np.concatenate([plan, acting], axis=-2)
 
+    def predicted(
+        self, plan: Float[np.ndarray, "knots c"], wanted: Float[np.ndarray, "T p"],
+        limited: tuple[Output, ...] = (),
+    ) -> Prediction | None:  # fmt: skip
+        """Return the linearised prediction of a plan from the estimated state; None if it is not solved."""
+        model, belief, n = self.observer.model, self.observer.belief, plan.size
+        prediction = linearised_prediction(
+            model, belief, self.with_acting(plan), self._basis, wanted, self.target, limited
+        )
+        if not prediction.solved:
+            return None
+        # without the derivatives by the acting controls
+        return prediction._replace(
+            by_plan=prediction.by_plan[:n], limited_by_plan=prediction.limited_by_plan[:n]
+        )
+
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:
         """Return the reference at the ends of the periods of the horizon that begins at `time` (s).
 
         Raises:
             ValueError: a reference of another size than the target.
         """
-        found = reference.expected(time, self.dt * (1.0 + np.arange(self.knots.horizon)))
-        if found.shape[1] != self.target.size:
+        rows = reference.expected(time, self.dt * (1.0 + np.arange(self.knots.horizon)))
+        if rows.shape[1] != self.target.size:
             raise ValueError(
-                f"the reference has {found.shape[1]} numbers; the target has {self.target.size}: "
+                f"the reference has {rows.shape[1]} numbers; the target has {self.target.size}: "
                 f"{', '.join(self.target.labels)}"
             )
-        return found
+        return rows
 
     def planned(
         self, plan: Float[np.ndarray, "knots c"], path: Any = None, violation: float = 0.0

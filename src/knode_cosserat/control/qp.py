@@ -1,16 +1,16 @@
-"""Quadratic programs of controllers, by interchangeable solvers."""
+"""Quadratic programs of controllers, solved by DAQP (Arnström, Bemporad & Axehill 2022)."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.errors import KnodeCosseratError
-
 #: DAQP's code of solved problems
 SOLVED = 1
+#: time limit of a program (s)
+TIME_LIMIT = 4e-3
 #: weight of the unknowns beside violations of soft rows; both are in units of the unknowns
 SMALL = 1e-6
 #: part of the largest violation by which soft rows yield more than they must, so that rounding errors of the
@@ -18,17 +18,8 @@ SMALL = 1e-6
 MORE = 1e-4
 
 
-class QPError(KnodeCosseratError, ValueError):
-    """A quadratic program cannot be set up; one line says why."""
-
-    code = "qp"
-
-
 class QuadraticProgram(NamedTuple):
-    """Minimise ½ xᵀH x + gᵀx for low ≤ x ≤ high and below ≤ A x ≤ above; the last `soft` rows of A yield.
-
-    A solver ignores `soft`; `solved_program` does not.
-    """
+    """Minimise ½ xᵀH x + gᵀx for low ≤ x ≤ high and below ≤ A x ≤ above; the last `soft` rows of A yield."""
 
     H: Float[np.ndarray, "n n"]
     g: Float[np.ndarray, " n"]
@@ -40,72 +31,53 @@ class QuadraticProgram(NamedTuple):
     soft: int = 0
 
 
-class QPSolution(NamedTuple):
-    """Solution of a quadratic program; not `solved` if it is infeasible or took too long."""
-
-    x: Float[np.ndarray, " n"]
-    solved: bool
-
-
-class QPSolver(Protocol):
-    """Solver of dense quadratic programs of some dozen variables."""
-
-    def solve(self, problem: QuadraticProgram) -> QPSolution:
-        """Return the solution; never raise for an infeasible problem."""
-        ...
+def require_daqp() -> None:
+    """Raise `ImportError` in one line if DAQP is not installed."""
+    try:
+        import daqp  # noqa: F401
+    except ImportError:
+        raise ImportError("DAQP is not installed: pip install 'knode-cosserat[control]'") from None
 
 
-class DAQP:
-    """Dual active-set solver (Arnström, Bemporad & Axehill 2022): 0.05 ms for 32 variables."""
-
-    def __init__(self, time_limit: float = 4e-3):
-        """Load the library; a problem that takes longer than `time_limit` (s) counts as not solved.
-
-        Raises:
-            QPError: the library is not installed.
-        """
-        try:
-            import daqp
-        except ImportError:
-            raise QPError("DAQP is not installed: pip install 'knode-cosserat[control]'") from None
-        self._solve, self._limit = daqp.solve, time_limit
-
-    def solve(self, problem: QuadraticProgram) -> QPSolution:
-        """Return the solution; never raise for an infeasible problem."""
-        p = problem
-        upper, lower = np.concatenate([p.high, p.above]), np.concatenate([p.low, p.below])
-        # H is positive definite only to rounding if some directions hardly matter
-        H, A = np.ascontiguousarray(p.H), np.ascontiguousarray(p.A)
-        x, _, flag, _ = self._solve(H, p.g, A, upper, lower, time_limit=self._limit)
-        return QPSolution(np.asarray(x), flag == SOLVED and bool(np.all(np.isfinite(x))))
-
-
-def solved_program(solver: QPSolver, problem: QuadraticProgram) -> QPSolution:
-    """Return the solution of a program with soft rows: hard limits first, then soft rows, then the cost.
+def solve(problem: QuadraticProgram) -> Float[np.ndarray, " n"] | None:
+    """Return the solution (n,): hard limits first, then soft rows, then the cost; None without a solution.
 
     If not all rows can hold, a first program finds the least sum of squared violations that the hard limits
     allow. A second one minimises the cost with as much violation, and no more. No weight has to be chosen
-    between violation and cost, and neither program is badly scaled.
+    between violation and cost, and neither program is badly scaled. (DAQP's own soft constraints need such a
+    weight; with a badly conditioned cost, squared violations were up to 6 times the least ones.)
     """
-    found = solver.solve(problem)
-    if found.solved or not problem.soft:
-        return found
-    first = solver.solve(_least_violation(problem))
-    n = len(problem.g)
-    x = first.x[:n]
-    if not first.solved:
-        return QPSolution(x, False)
-    low, high = soft_violations(problem, x)
+    x = _solved(problem)
+    if x is not None or not problem.soft:
+        return x
+    least = _solved(_least_violation(problem))
+    if least is None:
+        return None
+    least = least[: len(problem.g)]
+    low, high = soft_violations(problem, least)
     more = MORE * max(low.max(), high.max())
     below, above = problem.below.copy(), problem.above.copy()
     below[-problem.soft :] -= low + more
     above[-problem.soft :] += high + more
-    second = solver.solve(problem._replace(below=below, above=above))
-    return second if second.solved else QPSolution(x, True)
+    x = _solved(problem._replace(below=below, above=above))
+    return least if x is None else x
+
+
+def _solved(problem: QuadraticProgram) -> Float[np.ndarray, " n"] | None:
+    """Return the solution with all rows hard; None if it is infeasible or took longer than the limit."""
+    import daqp
+
+    upper = np.concatenate([problem.high, problem.above])
+    lower = np.concatenate([problem.low, problem.below])
+    # H is positive definite only to rounding if some directions hardly matter
+    H, A = np.ascontiguousarray(problem.H), np.ascontiguousarray(problem.A)
+    x, _, flag, _ = daqp.solve(H, problem.g, A, upper, lower, time_limit=TIME_LIMIT)
+    x = np.asarray(x)
+    return x if flag == SOLVED and np.all(np.isfinite(x)) else None
 
 
 def soft_violations(problem: QuadraticProgram, x: Float[np.ndarray, " n"]) -> tuple[Any, Any]:
-    """Return by how much each soft row is below its lower end and above its upper end, at least 0."""
+    """Return the distance of each soft row below its lower and above its upper end, at least 0."""
     soft = slice(len(problem.A) - problem.soft, None)
     value = problem.A[soft] @ x
     return np.maximum(0.0, problem.below[soft] - value), np.maximum(0.0, value - problem.above[soft])
@@ -124,12 +96,3 @@ def _least_violation(problem: QuadraticProgram) -> QuadraticProgram:
         np.diag(np.concatenate([np.full(n, SMALL), np.ones(p.soft)])), np.zeros(n + p.soft),
         np.concatenate([p.low, -free]), np.concatenate([p.high, free]), A, p.below * scale, p.above * scale,
     )  # fmt: skip
-
-
-def solver_named(name: Any) -> QPSolver:
-    """Return a solver by its name, or the given solver."""
-    if name == "daqp":
-        return DAQP()
-    if isinstance(name, str):
-        raise QPError(f"there is no solver {name!r} of quadratic programs; there is 'daqp'")
-    return name

@@ -3,36 +3,43 @@
 `SingleEnv` and `VectorEnv` need Gymnasium (extra `rl`); `StableBaselinesEnv` needs the extra `sb3`.
 """
 
-from __future__ import annotations
+from typing import TYPE_CHECKING
 
 from knode_cosserat._lazy import make_lazy
 
-make_lazy(
-    __name__,
-    {
-        "knode_cosserat.envs.environment": "Environment make",
-        "knode_cosserat.envs.errors": "TaskError",
-        "knode_cosserat.envs.randomisation": "Factor Randomisation Uniform",
-        "knode_cosserat.envs.spec": "Ending",
-        "knode_cosserat.envs.policy": "Policy",
-        "knode_cosserat.envs.pictures": "animate_episode",
-        "knode_cosserat.envs.plant": "EpisodePlant",
-        "knode_cosserat.envs.policy_controller": "PolicyController",
-        "knode_cosserat.envs.scores": "controller_scores policy_scores",
-        "knode_cosserat.envs.registration": "register",
-        "knode_cosserat.envs.single": "SingleEnv",
-        "knode_cosserat.envs.vector": "VectorEnv",
-        "knode_cosserat.envs.stable_baselines": "StableBaselinesEnv",
-        "knode_cosserat.envs.ppo": "PPOSettings Training",
-        "knode_cosserat.envs.dynamics": "EpisodeState Transition",
-        "knode_cosserat.envs.tasks": "TASKS",
-        "knode_cosserat.envs.tasks.base": "Outcome Task Tip",
-        "knode_cosserat.envs.tasks.survey": "Survey",
-        "knode_cosserat.envs.tasks.following": "Adaptation Follow Payload",
-        "knode_cosserat.envs.tasks.obstacles": "Gate Pillar",
-        "knode_cosserat.envs.tasks.reaching": "Reach",
-    },
-)
+if TYPE_CHECKING:
+    from knode_cosserat.envs.dynamics import Ending
+    from knode_cosserat.envs.environment import Environment, make
+    from knode_cosserat.envs.gymnasium_envs import SingleEnv as SingleEnv
+    from knode_cosserat.envs.gymnasium_envs import VectorEnv as VectorEnv
+    from knode_cosserat.envs.gymnasium_envs import register
+    from knode_cosserat.envs.pictures import animate_episode
+    from knode_cosserat.envs.policy import (
+        EpisodePlant,
+        Policy,
+        PolicyController,
+        controller_scores,
+        policy_scores,
+    )
+    from knode_cosserat.envs.ppo import PolicyTraining, PPOSettings
+    from knode_cosserat.envs.stable_baselines import StableBaselinesEnv as StableBaselinesEnv
+    from knode_cosserat.envs.tasks import (
+        TASKS,
+        Adaptation,
+        Factor,
+        Follow,
+        Gate,
+        Outcome,
+        Payload,
+        Pillar,
+        Randomisation,
+        Reach,
+        Survey,
+        Task,
+        TaskError,
+        Tip,
+        Uniform,
+    )
 
 __all__ = [
     "TASKS",
@@ -40,7 +47,6 @@ __all__ = [
     "Ending",
     "Environment",
     "EpisodePlant",
-    "EpisodeState",
     "Factor",
     "Follow",
     "Gate",
@@ -50,14 +56,13 @@ __all__ = [
     "Pillar",
     "Policy",
     "PolicyController",
+    "PolicyTraining",
     "Randomisation",
     "Reach",
     "Survey",
     "Task",
     "TaskError",
     "Tip",
-    "Training",
-    "Transition",
     "Uniform",
     "animate_episode",
     "controller_scores",
@@ -65,3 +70,18 @@ __all__ = [
     "policy_scores",
     "register",
 ]
+
+make_lazy(
+    __name__,
+    {
+        "knode_cosserat.envs.dynamics": "Ending",
+        "knode_cosserat.envs.environment": "Environment make",
+        "knode_cosserat.envs.gymnasium_envs": "SingleEnv VectorEnv register",
+        "knode_cosserat.envs.pictures": "animate_episode",
+        "knode_cosserat.envs.policy": "EpisodePlant Policy PolicyController controller_scores policy_scores",
+        "knode_cosserat.envs.ppo": "PPOSettings PolicyTraining",
+        "knode_cosserat.envs.stable_baselines": "StableBaselinesEnv",
+        "knode_cosserat.envs.tasks": "Adaptation Factor Follow Gate Outcome Payload Pillar Randomisation "
+        "Reach Survey TASKS Task TaskError Tip Uniform",
+    },
+)

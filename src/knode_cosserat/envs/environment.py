@@ -1,7 +1,8 @@
-"""Environments: a robot, a task and a randomisation, as pure functions and as Gymnasium's classes."""
+"""Environments: a robot, a task and a randomisation, as pure functions; and many episodes on all cores."""
 
 from __future__ import annotations
 
+import concurrent.futures
 from typing import Any
 
 import jax
@@ -11,17 +12,13 @@ from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
-from knode_cosserat.control.commands import ControlLimits
-from knode_cosserat.control.references import Reference
-from knode_cosserat.envs import dynamics, programs
-from knode_cosserat.envs.dynamics import EpisodeState, Transition
-from knode_cosserat.envs.errors import TaskError
-from knode_cosserat.envs.randomisation import Randomisation
-from knode_cosserat.envs.spec import Actions, specified
-from knode_cosserat.envs.tasks import TASKS
-from knode_cosserat.envs.tasks.base import Task
+from knode_cosserat.control import ControlLimits, Reference
+from knode_cosserat.envs import dynamics
+from knode_cosserat.envs.dynamics import Actions, EpisodeState, Transition, specified
+from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.run import usable_cores
 
 #: robot of an environment by default
 ROBOT = "delrin-tendon-robot"
@@ -105,8 +102,8 @@ class Environment:
 
     def reset_many(self, keys: Any) -> tuple[EpisodeState, Float[Any, "B o"]]:
         """Return the states and observations (B, o) at the starts of episodes, for keys (B, 2)."""
-        found: tuple[EpisodeState, Any] = programs.reset(self.spec, self.arrays, keys)
-        return found
+        start: tuple[EpisodeState, Any] = dynamics.reset_many(self.spec, self.arrays, keys)
+        return start
 
     def step(self, state: EpisodeState, action: Float[Any, " c"]) -> tuple[EpisodeState, Transition]:
         """Return the state after one period under an action (c,), and the transition.
@@ -114,13 +111,12 @@ class Environment:
         An unsolved step truncates the episode with its reason in `ending`; the state is then the one before.
         """
         many = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], (state, action))
-        found: tuple[EpisodeState, Transition] = jax.tree.map(lambda leaf: leaf[0], self.step_many(*many))
-        return found
+        after: tuple[EpisodeState, Transition] = jax.tree.map(lambda leaf: leaf[0], self.step_many(*many))
+        return after
 
     def step_many(self, states: EpisodeState, actions: Float[Any, "B c"]) -> tuple[EpisodeState, Transition]:
         """Return the states of many episodes after one period under actions (B, c), and the transitions."""
-        found: tuple[EpisodeState, Transition] = programs.step(self.spec, self.arrays, states, actions)
-        return found
+        return dynamics.step_many(self.spec, self.arrays, states, actions)
 
     def system(self, state: EpisodeState) -> System:
         """Return the robot of an episode, with its drawn parameters and parts."""
@@ -166,15 +162,99 @@ def make(task: str | Task, robot: str | System = ROBOT, **settings: Any) -> Envi
 def checked_action(action: Any, size: int) -> np.ndarray:
     """Return an action (c,) or (B, c) as numbers. Raises `TaskError` for a wrong shape or NaN."""
     try:
-        found = np.asarray(action, dtype=float)
+        numbers = np.asarray(action, dtype=float)
     except (TypeError, ValueError):
         raise TaskError(
             f"the action is {str(action)[:60]}; allowed are {size} numbers from -1 to 1"
         ) from None
-    finite = bool(np.all(np.isfinite(found)))
-    if found.shape[-1:] != (size,) or not finite:
+    finite = bool(np.all(np.isfinite(numbers)))
+    if numbers.shape[-1:] != (size,) or not finite:
+        problem = "" if finite else " and is not finite"
         raise TaskError(
-            f"the action has shape {found.shape}{'' if finite else ' and is not finite'}; allowed are {size} "
-            "finite numbers from -1 to 1"
+            f"the action has shape {numbers.shape}{problem}; allowed are {size} finite numbers from -1 to 1"
         )
-    return found
+    return numbers
+
+
+# many episodes
+
+#: number of episodes that one call resets: one program for any number
+RESET_AT_ONCE = 8
+
+
+class Episodes:
+    """States of many episodes, in one part for each core."""
+
+    def __init__(self, environment: Environment, count: int):
+        whole: Any = count
+        if not isinstance(whole, int) or isinstance(whole, bool) or count < 1:
+            raise TaskError(f"count is {count!r}; allowed is a whole number from 1")
+        self.environment, self.count = environment, count
+        parts = min(usable_cores(), count)
+        # equal parts, the last one filled up: one shape, one program
+        self._size = -(-count // parts)
+        self._parts: list[Any] = [None] * -(-count // self._size)
+        self._pool = concurrent.futures.ThreadPoolExecutor(len(self._parts))
+
+    def close(self) -> None:
+        """End the threads."""
+        self._pool.shutdown()
+
+    def start(self, keys: np.ndarray) -> np.ndarray:
+        """Start all episodes by keys (B, 2), and return their observations (B, o)."""
+        self._parts, observations = map(
+            list, zip(*(self.environment.reset_many(part) for part in self._filled(keys)), strict=True)
+        )
+        return self._joined([np.asarray(part) for part in observations])
+
+    def restart(self, where: np.ndarray, keys: np.ndarray) -> np.ndarray:
+        """Start new episodes at places (n,) by keys (n, 2), and return their observations (n, o)."""
+        environment = self.environment
+        observations = np.zeros((len(where), environment.observation_size), dtype=np.float32)
+        for part in range(len(self._parts)):
+            rows = np.flatnonzero(where // self._size == part)
+            for first in range(0, len(rows), RESET_AT_ONCE):
+                some = rows[first : first + RESET_AT_ONCE]
+                places, padded = _padded(where[some] - part * self._size, keys[some], self._size)
+                self._parts[part], seen = dynamics.restart(
+                    environment.spec, environment.arrays, self._parts[part], places, padded
+                )
+                observations[some] = np.asarray(seen)[: len(some)]
+        return observations
+
+    def step(self, actions: np.ndarray) -> dynamics.Transition:
+        """Move all episodes on by one period under actions (B, c); return arrays with a leading axis."""
+        filled = self._filled(actions)
+        spec, arrays = self.environment.spec, self.environment.arrays
+
+        def work(part: int) -> Any:
+            self._parts[part], transitions = dynamics.step_many(spec, arrays, self._parts[part], filled[part])
+            return jax.tree.map(np.asarray, transitions)
+
+        transitions = list(self._pool.map(work, range(len(self._parts))))
+        return jax.tree.map(lambda *parts: self._joined(parts), *transitions)
+
+    def warm_up(self) -> None:
+        """Compile the programs of steps and restarts, so that none is compiled later."""
+        environment = self.environment
+        states, _ = environment.reset_many(np.zeros((self._size, 2), dtype=np.uint32))
+        actions = np.zeros((self._size, environment.action_size))
+        states, _ = dynamics.step_many(environment.spec, environment.arrays, states, actions)
+        places, keys = _padded(np.zeros(0), np.zeros((0, 2)), self._size)
+        jax.block_until_ready(dynamics.restart(environment.spec, environment.arrays, states, places, keys))
+
+    def _filled(self, rows: np.ndarray) -> np.ndarray:
+        missing = len(self._parts) * self._size - self.count
+        rows = np.concatenate([rows, np.repeat(rows[-1:], missing, axis=0)]) if missing else rows
+        return rows.reshape(len(self._parts), self._size, *rows.shape[1:])
+
+    def _joined(self, parts: Any) -> np.ndarray:
+        return np.concatenate(parts)[: self.count]
+
+
+def _padded(places: np.ndarray, keys: np.ndarray, beyond: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return places (n,) and keys (n, 2) of restarts, filled up with places beyond the end."""
+    all_places = np.full(RESET_AT_ONCE, beyond)
+    all_keys = np.zeros((RESET_AT_ONCE, 2), dtype=np.uint32)
+    all_places[: len(places)], all_keys[: len(keys)] = places, keys
+    return all_places, all_keys

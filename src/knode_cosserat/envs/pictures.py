@@ -26,6 +26,7 @@ def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, 
     require_matplotlib()
     from matplotlib.figure import Figure
     from matplotlib.image import imread
+    from matplotlib.patches import Circle
 
     system = environment.system(state)
     points = np.asarray(system.drawing.positions(state.history.y[0]))
@@ -36,7 +37,9 @@ def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, 
     for axes, (a, b) in zip(figure.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
         axes.plot(points[:, a], points[:, b], color="C0", lw=2.5)
         for obstacle in getattr(system.nominal, "surroundings", ()):
-            _draw_ball(axes, obstacle, a, b)
+            if (centre := getattr(obstacle, "center", None)) is not None:
+                place = float(centre[a]), float(centre[b])
+                axes.add_patch(Circle(place, float(obstacle.radius), color="0.6"))
         axes.plot(target[a], target[b], "x", color="C3", ms=9, mew=2)
         axes.set(xlim=(-span, span), aspect="equal", xlabel=f"{'xyz'[a]} (m)", ylabel=f"{'xyz'[b]} (m)")
         axes.set_ylim((-span, span))
@@ -67,19 +70,10 @@ def animate_episode(environment: Environment, policy: Policy, key: Any, path: st
         state, observation = environment.reset(jnp.asarray(key))
         yield Image.fromarray(picture(environment, state))
         for _ in range(environment.steps):
-            state, found = environment.step(state, policy.action(observation))
+            state, after = environment.step(state, policy.action(observation))
             yield Image.fromarray(picture(environment, state))
-            if bool(found.terminated | found.truncated):
+            if bool(after.terminated | after.truncated):
                 return
-            observation = found.observation
+            observation = after.observation
 
     return write_frames(frames(), Path(path), environment.dt)
-
-
-def _draw_ball(axes: Any, obstacle: Any, a: int, b: int) -> None:
-    from matplotlib.patches import Circle
-
-    centre = getattr(obstacle, "center", None)
-    if centre is not None:
-        where = np.asarray(centre)
-        axes.add_patch(Circle((where[a], where[b]), float(obstacle.radius), color="0.6"))

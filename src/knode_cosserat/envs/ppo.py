@@ -17,10 +17,9 @@ import numpy as np
 import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
-from knode_cosserat.envs.environment import Environment
-from knode_cosserat.envs.episodes import Episodes
-from knode_cosserat.envs.errors import TaskError
+from knode_cosserat.envs.environment import Environment, Episodes
 from knode_cosserat.envs.policy import Layers, Policy, evaluated, network
+from knode_cosserat.envs.tasks import TaskError
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,11 +56,9 @@ class PPOSettings:
         for name in ("episodes", "rollout", "epochs", "batch"):
             if getattr(self, name) < 1:
                 raise TaskError(f"{name} is {getattr(self, name)!r}; allowed is a whole number from 1")
-        if self.episodes * self.rollout < self.batch:
-            raise TaskError(
-                f"batch is {self.batch}; allowed is at most episodes × rollout, "
-                f"{self.episodes * self.rollout}"
-            )
+        most = self.episodes * self.rollout
+        if most < self.batch:
+            raise TaskError(f"batch is {self.batch}; allowed is at most episodes × rollout, {most}")
 
 
 class Progress(NamedTuple):
@@ -74,12 +71,17 @@ class Progress(NamedTuple):
     reward: float
 
 
-class Weights(NamedTuple):
+class Networks(NamedTuple):
     """Optimised numbers: the networks, and the logarithm of the actions' deviation."""
 
     policy: Layers
     value: Layers
     log_deviation: Float[Any, " c"]
+
+    def log_probability(self, mean: Any, action: Any) -> Any:
+        """Return the logarithm of the probability density of an action, for its mean."""
+        away = (action - mean) / jnp.exp(self.log_deviation)
+        return jnp.sum(-0.5 * away**2 - self.log_deviation - 0.5 * np.log(2.0 * np.pi), axis=-1)
 
 
 class _Batch(NamedTuple):
@@ -92,46 +94,18 @@ class _Batch(NamedTuple):
     wanted: Any
 
 
-class _Statistics:
-    """Running mean and variance of the observations."""
-
-    def __init__(self, size: int):
-        self.count, self.mean, self.squares = 1e-4, np.zeros(size), np.zeros(size)
-
-    def add(self, rows: np.ndarray) -> None:
-        """Take rows (n, o) into account."""
-        count, mean = len(rows), rows.mean(axis=0)
-        apart, total = mean - self.mean, self.count + len(rows)
-        self.squares += rows.var(axis=0) * count + apart**2 * self.count * count / total
-        self.mean, self.count = self.mean + apart * count / total, total
-
-    def policy(self, layers: Layers) -> Policy:
-        """Return a policy with these statistics."""
-        deviation = np.sqrt(self.squares / self.count + 1e-8)
-        return Policy(layers, self.mean.astype(np.float32), deviation.astype(np.float32))
-
-
 @jax.jit
-def _acted(weights: Weights, policy: Policy, observation: Any, key: Any) -> Any:
+def _acted(networks: Networks, policy: Policy, observation: Any, key: Any) -> Any:
     """Return normalised observations, actions, their log-probabilities, and values."""
     seen = policy.normalised(observation)
-    mean, deviation = evaluated(weights.policy, seen), jnp.exp(weights.log_deviation)
+    mean, deviation = evaluated(networks.policy, seen), jnp.exp(networks.log_deviation)
     action = mean + deviation * jax.random.normal(key, mean.shape, dtype=jnp.float32)
-    return seen, action, _log_probability(mean, weights.log_deviation, action), _value(weights, seen)
-
-
-def _log_probability(mean: Any, log_deviation: Any, action: Any) -> Any:
-    apart = (action - mean) / jnp.exp(log_deviation)
-    return jnp.sum(-0.5 * apart**2 - log_deviation - 0.5 * np.log(2.0 * np.pi), axis=-1)
-
-
-def _value(weights: Weights, seen: Any) -> Any:
-    return evaluated(weights.value, seen)[..., 0]
+    return seen, action, networks.log_probability(mean, action), evaluated(networks.value, seen)[..., 0]
 
 
 @jax.jit
-def _values(weights: Weights, policy: Policy, observation: Any) -> Any:
-    return _value(weights, policy.normalised(observation))
+def _values(networks: Networks, policy: Policy, observation: Any) -> Any:
+    return evaluated(networks.value, policy.normalised(observation))[..., 0]
 
 
 def advantages(
@@ -149,51 +123,49 @@ def advantages(
         discount: of later rewards.
         trace: λ.
     """
-    found, later = np.zeros_like(reward), np.zeros(reward.shape[1])
+    rows, later = np.zeros_like(reward), np.zeros(reward.shape[1])
     for t in range(len(reward) - 1, -1, -1):
         error = reward[t] + discount * following[t] - value[t]
         later = error + discount * trace * np.where(ended[t], 0.0, later)
-        found[t] = later
-    return found
+        rows[t] = later
+    return rows
 
 
-def _loss(weights: Weights, batch: _Batch, clip: float, entropy: float) -> Any:
-    mean = evaluated(weights.policy, batch.seen)
-    ratio = jnp.exp(_log_probability(mean, weights.log_deviation, batch.action) - batch.log_probability)
+def _loss(networks: Networks, batch: _Batch, settings: PPOSettings) -> Any:
+    mean = evaluated(networks.policy, batch.seen)
+    ratio = jnp.exp(networks.log_probability(mean, batch.action) - batch.log_probability)
     advantage = (batch.advantage - jnp.mean(batch.advantage)) / (jnp.std(batch.advantage) + 1e-8)
-    bounded = jnp.clip(ratio, 1.0 - clip, 1.0 + clip)
+    bounded = jnp.clip(ratio, 1.0 - settings.clip, 1.0 + settings.clip)
     gain = jnp.mean(jnp.minimum(ratio * advantage, bounded * advantage))
-    wrong = jnp.mean((_value(weights, batch.seen) - batch.wanted) ** 2)
-    return -gain + 0.5 * wrong - entropy * jnp.sum(weights.log_deviation)
+    error = jnp.mean((evaluated(networks.value, batch.seen)[..., 0] - batch.wanted) ** 2)
+    return -gain + 0.5 * error - settings.entropy * jnp.sum(networks.log_deviation)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "optimiser"))
 def _updated(
-    weights: Weights, state: Any, batch: _Batch, key: Any, settings: PPOSettings,
+    networks: Networks, state: Any, batch: _Batch, key: Any, settings: PPOSettings,
     optimiser: optax.GradientTransformation,
 ) -> Any:  # fmt: skip
-    """Return the weights and the optimiser's state after all epochs over a rollout."""
+    """Return the networks and the optimiser's state after all epochs over a rollout."""
     size = batch.advantage.shape[0]
     count = size // settings.batch
 
-    def one(carry: Any, chosen: Any) -> Any:
-        weights, state = carry
-        some = jax.tree.map(lambda leaf: leaf[chosen], batch)
-        slopes = jax.grad(_loss)(weights, some, settings.clip, settings.entropy)
-        change, state = optimiser.update(slopes, state, weights)
-        return (optax.apply_updates(weights, change), state), None
+    def step(carry: Any, rows: Any) -> Any:
+        networks, state = carry
+        slopes = jax.grad(_loss)(networks, jax.tree.map(lambda leaf: leaf[rows], batch), settings)
+        change, state = optimiser.update(slopes, state, networks)
+        return (optax.apply_updates(networks, change), state), None
 
     keys = jax.random.split(key, settings.epochs)
-    order = jax.vmap(lambda each: jax.random.permutation(each, size)[: count * settings.batch])(keys)
+    order = jax.vmap(lambda key: jax.random.permutation(key, size)[: count * settings.batch])(keys)
     rows = order.reshape(settings.epochs * count, settings.batch)
-    (weights, state), _ = jax.lax.scan(one, (weights, state), rows)
-    return weights, state
+    return jax.lax.scan(step, (networks, state), rows)[0]
 
 
-class Training:
+class PolicyTraining:
     """Training of a policy by PPO; `policy` may be used at any time.
 
-    training = kc.envs.Training(environment)
+    training = kc.envs.PolicyTraining(environment)
     training.run(seconds=600.0)
     training.policy.save("follow.npz")
     """
@@ -218,32 +190,34 @@ class Training:
             raise TaskError(f"steps is {steps}; allowed is at least one rollout, {per_update}")
         self.environment, self.settings = environment, settings
         self._updates = steps // per_update
-        seen, moved = environment.observation_size, environment.action_size
+        size, actions = environment.observation_size, environment.action_size
         one, two, self._key = jax.random.split(jax.random.PRNGKey(seed), 3)
-        sizes = (seen, *settings.hidden)
-        self.weights = Weights(
-            network(one, (*sizes, moved), 0.01), network(two, (*sizes, 1), 1.0),
-            jnp.full(moved, np.log(settings.deviation), dtype=jnp.float32),
+        sizes = (size, *settings.hidden)
+        self.networks = Networks(
+            network(one, (*sizes, actions), 0.01), network(two, (*sizes, 1), 1.0),
+            jnp.full(actions, np.log(settings.deviation), dtype=jnp.float32),
         )  # fmt: skip
         steps_of_optimiser = self._updates * settings.epochs * (per_update // settings.batch)
         self._optimiser = optax.chain(
             optax.clip_by_global_norm(0.5),
             optax.adam(optax.linear_schedule(settings.rate, 0.0, steps_of_optimiser)),
         )
-        self._state = self._optimiser.init(self.weights)
-        self._statistics = _Statistics(seen)
+        self._state = self._optimiser.init(self.networks)
+        #: number, mean and sum of squared deviations of the observations
+        self._count, self._mean, self._squares = 1e-4, np.zeros(size), np.zeros(size)
         self._random = np.random.default_rng(seed)
         self._episodes = Episodes(environment, settings.episodes)
         self._episodes.warm_up()
         self._observation = self._episodes.start(self._keys(settings.episodes))
-        self._statistics.add(self._observation)
+        self._count_in(self._observation)
         #: progress after each update
         self.history: list[Progress] = []
 
     @property
     def policy(self) -> Policy:
         """The present policy, without exploration."""
-        return self._statistics.policy(self.weights.policy)
+        deviation = np.sqrt(self._squares / self._count + 1e-8)
+        return Policy(self.networks.policy, self._mean.astype(np.float32), deviation.astype(np.float32))
 
     @property
     def is_done(self) -> bool:
@@ -272,38 +246,42 @@ class Training:
         """Make one rollout and learn from it; return its mean reward."""
         settings, policy = self.settings, self.policy
         rows = [self._period(policy) for _ in range(settings.rollout)]
-        seen, action, log_probability, value, reward, following, ended, raw = (
-            np.stack(each) for each in zip(*rows, strict=True)
+        seen, action, log_probability, value, reward, following, ended, raw = map(
+            np.stack, zip(*rows, strict=True)
         )
         advantage = advantages(reward, value, following, ended, settings.discount, settings.trace)
-
-        def flat(array: np.ndarray) -> Any:
-            return jnp.asarray(array.reshape(-1, *array.shape[2:]), dtype=jnp.float32)
-
-        batch = _Batch(*map(flat, (seen, action, log_probability, advantage, advantage + value)))
+        parts = (seen, action, log_probability, advantage, advantage + value)
+        batch = _Batch(*(jnp.asarray(part.reshape(-1, *part.shape[2:]), dtype=jnp.float32) for part in parts))
         self._key, key = jax.random.split(self._key)
-        self.weights, self._state = _updated(self.weights, self._state, batch, key, settings, self._optimiser)
-        self._statistics.add(raw.reshape(-1, raw.shape[-1]))
+        self.networks, self._state = _updated(
+            self.networks, self._state, batch, key, settings, self._optimiser
+        )
+        self._count_in(raw.reshape(-1, raw.shape[-1]))
         return float(np.mean(reward))
 
     def _period(self, policy: Policy) -> tuple[Any, ...]:
         """Move all episodes on by one period, and return its numbers."""
         raw = self._observation
         self._key, key = jax.random.split(self._key)
-        seen, action, log_probability, value = (
-            np.asarray(each) for each in _acted(self.weights, policy, raw, key)
-        )
-        found = self._episodes.step(action.astype(float))
-        reward, observation = np.array(found.reward, dtype=float), np.array(found.observation)
-        ended = np.asarray(found.terminated | found.truncated)
+        acted = [np.asarray(part) for part in _acted(self.networks, policy, raw, key)]
+        after = self._episodes.step(acted[1].astype(float))
+        reward, observation = np.array(after.reward, dtype=float), np.array(after.observation)
+        ended = np.asarray(after.terminated | after.truncated)
         # an episode that ran out of time would have gone on: its last observation has a value
-        following = np.array(_values(self.weights, policy, observation), dtype=float)
-        following = np.where(np.asarray(found.terminated), 0.0, following)
-        where = np.flatnonzero(ended)
-        if len(where):
-            observation[where] = self._episodes.restart(where, self._keys(len(where)))
+        following = np.array(_values(self.networks, policy, observation), dtype=float)
+        following = np.where(np.asarray(after.terminated), 0.0, following)
+        places = np.flatnonzero(ended)
+        if len(places):
+            observation[places] = self._episodes.restart(places, self._keys(len(places)))
         self._observation = observation
-        return seen, action, log_probability, value, reward, following, ended, raw
+        return *acted, reward, following, ended, raw
+
+    def _count_in(self, rows: np.ndarray) -> None:
+        """Take observations (n, o) into account in the mean and the deviation."""
+        count, away = len(rows), rows.mean(axis=0) - self._mean
+        total = self._count + count
+        self._squares += rows.var(axis=0) * count + away**2 * self._count * count / total
+        self._mean, self._count = self._mean + away * count / total, total
 
     def _keys(self, count: int) -> np.ndarray:
         return self._random.integers(2**32, size=(count, 2), dtype=np.uint32)

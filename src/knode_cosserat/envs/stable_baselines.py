@@ -14,10 +14,9 @@ except ModuleNotFoundError as missing:
         "this needs stable_baselines3: pip install 'knode-cosserat[sb3]'", name=missing.name
     ) from None
 
+from knode_cosserat.envs.dynamics import Ending
 from knode_cosserat.envs.environment import Environment
-from knode_cosserat.envs.single import spaces
-from knode_cosserat.envs.spec import Ending
-from knode_cosserat.envs.vector import VectorEnv
+from knode_cosserat.envs.gymnasium_envs import VectorEnv, spaces
 
 
 class StableBaselinesEnv(VecEnv):  # type: ignore[misc,unused-ignore]
@@ -67,7 +66,7 @@ class StableBaselinesEnv(VecEnv):  # type: ignore[misc,unused-ignore]
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """Return an attribute, once for each episode."""
-        return [getattr(self, attr_name)] * len(self._chosen(indices))
+        return [getattr(self, attr_name)] * len(list(self._get_indices(indices)))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
         """Set an attribute of all episodes."""
@@ -75,12 +74,9 @@ class StableBaselinesEnv(VecEnv):  # type: ignore[misc,unused-ignore]
 
     def env_method(self, method_name: str, *args: Any, indices: Any = None, **kwargs: Any) -> list[Any]:
         """Call a method of the environment, and return its result once for each episode."""
-        found = getattr(self.environment, method_name)(*args, **kwargs)
-        return [found] * len(self._chosen(indices))
+        result = getattr(self.environment, method_name)(*args, **kwargs)
+        return [result] * len(list(self._get_indices(indices)))
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """Return False for each episode: there are no wrappers."""
-        return [False] * len(self._chosen(indices))
-
-    def _chosen(self, indices: Any) -> Sequence[int]:
-        return list(self._get_indices(indices))
+        return [False] * len(list(self._get_indices(indices)))

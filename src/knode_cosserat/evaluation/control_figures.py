@@ -13,7 +13,7 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from knode_cosserat.control.loop import LoopLog
+    from knode_cosserat.control import LoopLog
 
 
 def closed_loop(log: LoopLog) -> Figure:

@@ -8,21 +8,16 @@ from typing import TYPE_CHECKING
 from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
-    from knode_cosserat.sweeps.data import FailedCase, SweepData, load_sweep
-    from knode_cosserat.sweeps.description import Range, Robot, Sweep
-    from knode_cosserat.sweeps.errors import SweepError
-    from knode_cosserat.sweeps.executors import Dask, Executor, Local, Slurm
-    from knode_cosserat.sweeps.plan import Plan
-    from knode_cosserat.sweeps.run import run_sweep
+    from knode_cosserat.sweeps._data import SweepData, load_sweep
+    from knode_cosserat.sweeps._description import Range, Sweep, SweepError
+    from knode_cosserat.sweeps._plan import Plan
+    from knode_cosserat.sweeps._run import Dask, Local, Slurm, run_sweep
 
 __all__ = [
     "Dask",
-    "Executor",
-    "FailedCase",
     "Local",
     "Plan",
     "Range",
-    "Robot",
     "Slurm",
     "Sweep",
     "SweepData",
@@ -34,11 +29,9 @@ __all__ = [
 make_lazy(
     __name__,
     {
-        "knode_cosserat.sweeps.data": "FailedCase SweepData load_sweep",
-        "knode_cosserat.sweeps.description": "Range Robot Sweep",
-        "knode_cosserat.sweeps.errors": "SweepError",
-        "knode_cosserat.sweeps.executors": "Dask Executor Local Slurm",
-        "knode_cosserat.sweeps.plan": "Plan",
-        "knode_cosserat.sweeps.run": "run_sweep",
+        "knode_cosserat.sweeps._data": "SweepData load_sweep",
+        "knode_cosserat.sweeps._description": "Range Sweep SweepError",
+        "knode_cosserat.sweeps._plan": "Plan",
+        "knode_cosserat.sweeps._run": "Dask Local Slurm run_sweep",
     },
 )

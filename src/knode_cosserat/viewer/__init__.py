@@ -10,8 +10,7 @@ Trajectories need no further package. The live mode needs `websockets`, of the e
 """
 
 from knode_cosserat.viewer.closed_loop import control_live
-from knode_cosserat.viewer.document import export_scene
 from knode_cosserat.viewer.live import view_live
-from knode_cosserat.viewer.serve import view
+from knode_cosserat.viewer.pages import export_scene, view
 
 __all__ = ["control_live", "export_scene", "view", "view_live"]

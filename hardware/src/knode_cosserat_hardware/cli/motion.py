@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from knode_cosserat.cli.arguments import Json, load_system, parse_limits, require_writable
-from knode_cosserat.cli.control import CONTROLLERS, parsed_reference
+from knode_cosserat.cli.control import Method, parsed_reference
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import examples
 from knode_cosserat.recordings.formats import written_suffixes
@@ -196,9 +196,7 @@ def run(
     ],
     seconds: Annotated[float, typer.Option(metavar="S", help="Duration (s).")] = 10.0,
     dt: Annotated[float, typer.Option(metavar="S", help="Period of the control (s).")] = 0.05,
-    method: Annotated[
-        str, typer.Option(metavar="NAME", help=f"Controller: {', '.join(CONTROLLERS)}.")
-    ] = "predictive",
+    method: Method = "predictive",
     high: Annotated[
         str | None,
         typer.Option(
@@ -240,8 +238,6 @@ def run(
     """
     for path in (out, recording):
         require_writable(path)
-    if method not in CONTROLLERS:
-        raise ValueError(f"--method is {method!r}; allowed is {', '.join(CONTROLLERS)}")
     from knode_cosserat import control as kcc
 
     system = load_system(model)

@@ -1,0 +1,164 @@
+"""Shards as Parquet files: one row a case, with a version and a checksum in the file's metadata.
+
+Parquet, not Zarr: a shard is one file, so that it is there whole or not at all by one rename. A column with
+an array in each row, such as the tip's positions, is a list of fixed size; its shape is in the metadata.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from knode_cosserat._files.json_text import json_checksum, parse_json
+from knode_cosserat._files.parquet_file import expansion_limit, open_parquet, require_limited_expansion
+from knode_cosserat._files.reading import ReadError
+from knode_cosserat._files.writing import replacing
+from knode_cosserat.errors import first_line
+from knode_cosserat.sweeps._description import SweepError
+
+#: key of the metadata, version of the format, and key of the checksum of all other metadata
+KEY, VERSION, METADATA_CHECKSUM = b"knode-cosserat sweep", 1, "own_checksum"
+#: columns of text
+TEXTS = ("reason",)
+
+
+class Shard(NamedTuple):
+    """Columns of a shard by name, and its metadata."""
+
+    columns: dict[str, Any]
+    about: dict[str, Any]
+
+
+def shard_bytes(columns: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
+    """Return the content of a shard's file; equal columns and metadata give equal bytes."""
+    pyarrow = require_pyarrow()
+    arrays, shapes, split = {}, {}, []
+    for name, values in columns.items():
+        array = np.ascontiguousarray(values)
+        shapes[name] = list(array.shape[1:])
+        if name in TEXTS:
+            arrays[name] = pyarrow.array([str(text) for text in array], pyarrow.string())
+            continue
+        arrays[name] = pyarrow.array(array.reshape(-1))
+        if shapes[name]:
+            size = int(np.prod(shapes[name]))
+            arrays[name] = pyarrow.FixedSizeListArray.from_arrays(arrays[name], size)
+        if array.dtype.kind == "f":
+            split.append(f"{name}.list.element" if shapes[name] else name)
+    stated = {**about, "version": VERSION, "shapes": shapes, "checksum": checksum(columns)}
+    stated[METADATA_CHECKSUM] = json_checksum(stated)
+    table = pyarrow.table(arrays).replace_schema_metadata({KEY: json.dumps(stated, sort_keys=True).encode()})
+    sink = pyarrow.BufferOutputStream()
+    # level 1 of zstd with split bytes takes a tenth off doubles at 300 MB/s
+    pyarrow.parquet.write_table(
+        table, sink, compression="zstd", compression_level=1, use_byte_stream_split=split,
+        use_dictionary=list(TEXTS), write_statistics=[name for name in columns if not shapes[name]],
+        row_group_size=len(table) or 1, store_schema=True,
+    )  # fmt: skip
+    return bytes(sink.getvalue())
+
+
+def write_shard(path: Path, content: bytes) -> None:
+    """Write a shard whole or not at all. Raises `SweepError`."""
+    try:
+        with replacing(path) as temporary:
+            temporary.write_bytes(content)
+    except OSError as error:
+        raise SweepError(
+            f"{path}: cannot be written: {error.strerror or error}; complete shards are kept, and the same "
+            "command goes on where it stopped"
+        ) from None
+
+
+def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool = True) -> Shard:
+    """Return columns of a shard, all or some by name.
+
+    Args:
+        path: the file.
+        names: the columns; None: all.
+        verify: read all columns, and compare their checksum.
+
+    Raises:
+        SweepError: the file cannot be read, has another version, or was changed.
+    """
+    require_pyarrow()
+    if not path.exists():
+        raise SweepError(f"{path}: there is no such shard; the sweep is not complete")
+    try:
+        # a text that many rows have is stored once, and must not be written out for each
+        with open_parquet(path, read_dictionary=TEXTS) as file:
+            about = _metadata(file, path)
+            require_limited_expansion(file.metadata, path)
+            table = file.read(columns=None if verify or names is None else list(names))
+            columns = {
+                name: _numpy(table.column(name).combine_chunks(), about["shapes"][name], path)
+                for name in table.column_names
+            }
+    except ReadError as error:
+        raise SweepError(f"{path}: damaged: {error}") from None
+    except (TypeError, AttributeError) as error:
+        raise SweepError(f"{path}: damaged: {first_line(error)}") from None
+    if verify and checksum(columns) != about["checksum"]:
+        raise SweepError(f"{path}: damaged: the checksum of its columns is not the stated one")
+    if missing := set(names or ()) - set(columns):
+        raise SweepError(f"{path}: damaged: it has no column {min(missing)}")
+    return Shard(columns if names is None else {name: columns[name] for name in names}, about)
+
+
+def _metadata(file: Any, path: Path) -> dict[str, Any]:
+    try:
+        about = dict(parse_json(file.schema_arrow.metadata[KEY]))
+    except (KeyError, TypeError, ValueError):
+        raise SweepError(f"{path}: no shard of a sweep: its metadata are missing or damaged") from None
+    if about.get("version") != VERSION:
+        raise SweepError(
+            f"{path}: the shard has the version {about.get('version')!r}; allowed is {VERSION}, which this "
+            "version of the package reads and writes. Nothing was changed"
+        )
+    if about.pop(METADATA_CHECKSUM, None) != json_checksum(about):
+        raise SweepError(f"{path}: damaged: the checksum of its metadata is not the stated one")
+    return about
+
+
+def checksum(columns: Mapping[str, Any]) -> str:
+    """Return a checksum of the names, types, shapes and values of columns."""
+    digest = hashlib.sha256()
+    for name in sorted(columns):
+        values = np.asarray(columns[name])
+        if values.dtype.kind in "OU":
+            content, kind = "\0".join(map(str, values)).encode(), "text"
+        else:
+            content, kind = np.ascontiguousarray(values).tobytes(), values.dtype.str
+        digest.update(f"{name} {kind} {values.shape} {len(content)}\n".encode() + content)
+    return digest.hexdigest()
+
+
+def _numpy(column: Any, shape: Sequence[int], path: Path) -> Any:
+    """Return a column (rows, *shape) as an array."""
+    if hasattr(column, "chunks"):
+        column = column.chunk(0)
+    if hasattr(column, "dictionary"):
+        words = column.dictionary.to_numpy(zero_copy_only=False)
+        texts = words[column.indices.to_numpy(zero_copy_only=False)]
+        total, (most, limit) = sum(map(len, texts)), expansion_limit(path)
+        if total > most:
+            raise ReadError(f"its texts have {total} characters; {limit}")
+        return texts
+    flat = column.flatten() if shape else column
+    return flat.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
+
+
+def require_pyarrow() -> Any:
+    """Return pyarrow. Raises `ImportError` with the command that installs it."""
+    try:
+        import pyarrow  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.compute  # type: ignore[import-not-found, import-untyped, unused-ignore]
+        import pyarrow.parquet  # type: ignore[import-not-found, import-untyped, unused-ignore]
+    except ImportError:
+        raise ImportError("sweeps need pyarrow: pip install 'knode-cosserat[sweep]'") from None
+    return pyarrow

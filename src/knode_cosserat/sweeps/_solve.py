@@ -1,0 +1,201 @@
+"""Solution of the cases of a shard, in chunks of which only the stored quantities are kept.
+
+Results do not depend on the number of threads or processes: chunks have a fixed size. Recovery has no limit
+of time, for the same reason.
+"""
+
+from __future__ import annotations
+
+import concurrent.futures
+import dataclasses
+import functools
+import threading
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from knode_cosserat.rods.paths import parameter_at
+from knode_cosserat.rods.system import System
+from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.solvers.history import SolverState, rest_record
+from knode_cosserat.solvers.initial import initial_state
+from knode_cosserat.solvers.recovery import likely_cause
+from knode_cosserat.solvers.replay import at_one_state, history_settings
+from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.run import (
+    InitialState,
+    TimeIntegration,
+    carried_results,
+    run_one,
+    usable_cores,
+)
+from knode_cosserat.sweeps._plan import Cases, Plan
+
+#: robots that one call solves
+CHUNK = 16
+
+#: sweeps and robots whose programs this process has compiled
+_COMPILED: set[tuple[str, int]] = set()
+_COMPILING = threading.Lock()
+
+
+class Start(NamedTuple):
+    """Initial states of a chunk: y and z at the nodes, and the histories of the first step."""
+
+    record: Any
+    history: Any
+
+
+@functools.partial(jax.jit, static_argnames=("settings", "size"))
+def _started(robot, values, start, settings, size):  # type: ignore[no-untyped-def]
+    """Return the systems of a chunk, or one for all, and their initial states; None: at rest."""
+    systems = jax.vmap(lambda changes: robot.replace(**changes))(values) if values else robot
+    if start is None:
+        at = initial_state(systems, settings, size)
+        start = Start(at.record, at.state.history)
+    return systems, start
+
+
+@functools.partial(jax.jit, static_argnames="store")
+def _stored(systems, record, rows, store):  # type: ignore[no-untyped-def]
+    """Return results, position errors and stored quantities of all rows of a chunk."""
+    ny = systems.y_layout.size
+    size = ny + systems.z_layout.size
+    records = jnp.concatenate([record[:, None, :, :size], rows.records[..., :size]], axis=1)
+    zero = jnp.zeros((len(record), 1))
+    solved = jnp.concatenate([zero.astype(int), rows.result], axis=1)
+    errors = jnp.concatenate([zero, rows.position_error], axis=1)
+    records = jnp.where((solved < 0)[..., None, None], jnp.nan, records)
+    y = records[..., :ny]
+    functions = {
+        "tip_position": lambda system, y: system.drawing.positions(y[:, -1]),
+        "tip_quaternion": lambda system, y: system.drawing.quaternions(y[:, -1]),
+        "position": lambda system, y: system.drawing.positions(y),
+    }
+    axes = (0 if jnp.ndim(systems.length) else None, 0)
+    stored = {
+        name: jax.vmap(function, in_axes=axes)(systems, y)
+        for name, function in functions.items()
+        if name in store
+    }
+    stored |= {name: part for name, part in (("y", y), ("z", records[..., ny:])) if name in store}
+    return {"result": solved, "position_error": jnp.where(solved < 0, jnp.nan, errors)} | stored
+
+
+def solve_shard(plan: Plan, number: int, threads: int | None = None) -> dict[str, Any]:
+    """Return the columns of a shard, by name; by default with one thread for each usable core."""
+    robot, cases = plan.span(number)[0], plan.cases(number)
+    size, threads, compiled = len(cases.case), threads or usable_cores(), (plan.identity, robot)
+    firsts = list(range(0, size, CHUNK))
+    parts = []
+    # JAX may crash if one thread stores a program on disk while another compiles it
+    with _COMPILING:
+        if compiled not in _COMPILED:
+            parts = [_chunk(plan, robot, cases, firsts.pop(0))]
+            _COMPILED.add(compiled)
+    with concurrent.futures.ThreadPoolExecutor(threads) as pool:
+        chunks = map if threads == 1 else pool.map
+        parts += chunks(lambda first: _chunk(plan, robot, cases, first), firsts)
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    if "controls" in plan.sweep.store:
+        columns["controls"] = cases.controls
+    for name in plan.sweep.store:
+        kind = np.float32 if plan.sweep.precision == "single" else np.float64
+        columns[name] = columns[name].astype(kind, copy=False)
+    return {
+        "case": cases.case, "robot": np.full(size, robot, dtype=np.int32),
+        "word": cases.word.astype(np.int32), "seed": cases.seed, **cases.values, **columns,
+    }  # fmt: skip
+
+
+def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
+    """Return result, position error, reason and stored quantities of a chunk of cases."""
+    system, settings, steps = _solved_system(plan, robot), plan.settings, plan.sweep.steps
+    count = min(CHUNK, len(cases.case) - first)
+    # the last chunk is filled with its last case: one shape, one program
+    index = np.minimum(np.arange(first, first + CHUNK), len(cases.case) - 1)
+    nominal = plan.systems[robot].nominal
+    values = {name: array[index] for name, array in cases.values.items() if parameter_at(nominal, name)}
+    start, marks, reasons = _equilibria(plan, system, values)
+    task = TimeIntegration(settings, plan.sweep.dt, steps)
+    systems, start = _started(system, values, start, settings, CHUNK)
+    done, _, rows = task.solve_many(systems, cases.controls[index], start.history)
+    stored = _stored(systems, start.record, rows, plan.sweep.store)
+    columns: dict[str, Any] = jax.tree.map(lambda leaf: np.array(leaf[:count]), stored)
+    for k in range(count):
+        if cause := cases.refused.get(first + k) or reasons.get(k):
+            reasons[k] = cause
+            for name, column in columns.items():
+                column[k] = int(Result.NOT_REACHED) if name == "result" else np.nan
+        elif done[k] < steps:
+            case = system.replace(**{name: array[k] for name, array in values.items()}) if values else system
+            reasons[k] = _failed(plan, case, task, cases.controls[first + k], columns, k)
+    result = columns["result"]
+    carried = carried_results(result[:, 1:], marks[:count])
+    columns["result"] = np.concatenate([result[:, :1], carried], axis=1).astype(np.int8)
+    return columns | {"reason": np.array([reasons.get(k, "") for k in range(count)], dtype=object)}
+
+
+@functools.lru_cache(maxsize=64)
+def _solved_system(plan: Plan, robot: int) -> System:
+    """Return a robot without the range of its training data, as the solvers' programs expect."""
+    return without_range(plan.systems[robot])
+
+
+def _equilibria(
+    plan: Plan, system: System, values: dict[str, Any]
+) -> tuple[Start | None, Any, dict[int, str]]:
+    """Return the initial states of a chunk, their result codes, and by case the reasons of missing ones.
+
+    A robot such as a platform on bent legs starts from its equilibrium under zero control. All others start
+    from rest (None), which the chunk's program evaluates.
+    """
+    if not system.ends.rest_is_guess:
+        return None, np.full(CHUNK, int(Result.CONVERGED)), {}
+    states: list[InitialState | None] = []
+    reasons: dict[int, str] = {}
+    for k in range(CHUNK if values else 1):
+        case = system.replace(**{name: array[k] for name, array in values.items()}) if values else system
+        try:
+            budget = np.inf if plan.sweep.recovery else 0.0
+            states.append(initial_state(case, plan.settings, None, budget))
+        except SimulationError as error:
+            states.append(None)
+            reasons[k] = str(error)
+    solved = next((state for state in states if state is not None), None)
+    if solved is None:
+        # a failed case is marked as such: any state of the right shape serves
+        record, zero = rest_record(system), np.zeros(system.control_size)
+        history = at_one_state(system, history_settings(plan.settings), record, zero)
+        solved = InitialState(record, zero, SolverState(history), False)
+    usable = [state or solved for state in states]
+    if not values:
+        usable, reasons = usable * CHUNK, dict.fromkeys(range(CHUNK), reasons[0]) if reasons else {}
+    pairs = [Start(state.record, state.state.history) for state in usable]
+    start = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *pairs)
+    return start, np.array([int(state.result) for state in usable]), reasons
+
+
+def _failed(
+    plan: Plan, system: System, task: TimeIntegration, controls: Any, columns: dict[str, Any], k: int
+) -> str:
+    """Return the reason of a failed case, empty after recovery if that is wanted; write its rows.
+
+    Neither the recovery nor the pieces of the run depend on times.
+    """
+    cause = ""
+    if plan.sweep.recovery:
+        at = initial_state(system, task.settings, None, np.inf)
+        task = dataclasses.replace(task, recovery_budget=np.inf)
+        rows, _, cause = run_one(task, system, controls, at.state.history, at.control, response=np.inf)
+        record, rows = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (at.record, rows))
+        for name, column in _stored(system, record, rows, plan.sweep.store).items():
+            columns[name][k] = np.asarray(column[0])
+        if not cause:
+            return ""
+    step = int(np.argmax(columns["result"][k] < 0))
+    code = Result(int(columns["result"][k, step]))
+    cause = cause or likely_cause(code, system, plan.settings, controls[step - 1])
+    return f"step {step} (t = {step * plan.sweep.dt:g} s): {code.message}. {cause}".strip()
