@@ -181,8 +181,6 @@ class Training(Options):
     loss: Literal["paper", "standardised"] = _option("paper", _choice("paper", "standardised"))
     #: decoupled weight decay (AdamW), for weights but not for biases
     weight_decay: float = _option(0.0, _number(0.0, 10.0))
-    #: stabilising noise, drawn anew in every epoch, relative to the standard deviation of each number
-    noise: float = _option(0.0, _number(0.0, 10.0))
     #: noise added once, before training, to all numbers of y and z in their own units, as in the paper's
     #: training on recordings
     data_noise: float = _option(0.0, _number(0.0, 10.0))
@@ -287,14 +285,13 @@ class FitConfig:
         hidden: int = 128,
         epochs: int = 2000,
         history: bool = False,
-        noise: float = 0.0,
         weight_decay: float = 0.3,
     ) -> Self:
         """Return settings of an unconstrained network with standardised inputs and outputs, all nodes."""
         return cls(
             NetworkOptions(hidden=hidden, history=history, convex=False, standardised=True),
             Training(
-                epochs=epochs, learning_rate=3e-3, schedule="cosine", loss="standardised", noise=noise,
+                epochs=epochs, learning_rate=3e-3, schedule="cosine", loss="standardised",
                 weight_decay=weight_decay,
             ),
             seed=seed,

@@ -9,13 +9,18 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import Samples, samples, start_of
-from knode_cosserat.learning.structured.expansion import Expansion, Term
-from knode_cosserat.learning.structured.residual import Structured, ambient_layout, loaded, material_layout
+from knode_cosserat.learning.structured.residual import (
+    Expansion,
+    Structured,
+    Term,
+    ambient_layout,
+    loaded,
+    material_layout,
+)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
+from knode_cosserat.solvers.segments import Samples, samples, start_point
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -144,9 +149,4 @@ def added(model: KNODE, trajectory: Trajectory) -> Added:
 
 @jax.jit
 def _derivatives(system: System, data: Samples) -> Any:
-    def one(sample: Samples) -> Any:
-        history = unpacked_history(system, sample.c0, sample.history[0])
-        s = start_of(system, sample.place)
-        return semi_discrete.derivatives(system, Point(s, sample.t, sample.y, sample.control, history))
-
-    return jax.vmap(one)(data)
+    return jax.vmap(lambda sample: semi_discrete.derivatives(system, start_point(system, sample)))(data)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.law import InternalState, MaterialLaw
+from knode_cosserat.rods.law import InternalState, MaterialLaw, StressedLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import (
     ParameterError,
@@ -33,13 +34,6 @@ from knode_cosserat.rotation import dot, rotation_matrix
 
 #: smallest and largest number of nodes of a rod
 FEWEST_NODES, MOST_NODES = 2, 10_000
-
-
-class Correction(NamedTuple):
-    """A learned correction of y_s and z (`learning.residual.Residual`), and the system that it corrects."""
-
-    system: System
-    residual: Any
 
 
 class Scales(NamedTuple):
@@ -58,7 +52,7 @@ class System(Parametrised):
         ends             moving_base, end_poses, held, rest_is_guess, tip_layout
         discontinuities  cuts, jumps, jump
         several rods     strands, strand
-        learning         actuation, observables, velocities, unstressed, law_factors, correction, nominal
+        learning         actuation, observables, velocities, unstressed, law_factors, corrections, nominal
         drawing          positions, quaternions, curves
 
     Its numeric parameters are leaves of a JAX pytree: one compiled program serves all their values, batches,
@@ -108,7 +102,7 @@ class System(Parametrised):
 
     def constitutive(
         self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> tuple[Any, Any, Any] | MaterialLaw | InternalState | Float[Any, " z"]:
+    ) -> tuple[Any, Any, Any] | MaterialLaw | InternalState | StressedLaw | Float[Any, " z"]:
         """Return C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s).
 
         A law of another form is a `MaterialLaw`. If z depends on no rate of z, it may be returned itself.
@@ -126,9 +120,12 @@ class System(Parametrised):
         raise NotImplementedError(f"{type(self).__name__} gives no `balance`")
 
     @property
-    def correction(self) -> Correction | None:
-        """Learned correction of y_s and z; None without one."""
-        return None
+    def corrections(self) -> tuple[Callable[..., Float[Any, " y+z"]], ...]:
+        """Functions of (s, t, y, y_t, z, z_t, control) whose values add to [y_s; z] in turn; none by default.
+
+        z is that of `constitutive`, then with the corrections before.
+        """
+        return ()
 
     def jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any

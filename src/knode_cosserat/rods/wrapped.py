@@ -20,7 +20,7 @@ FACTS = (
 )  # fmt: skip
 #: members of `Wrapped.adapted`: equations and other members that depend on parameters
 EQUATIONS = (
-    "constitutive", "balance", "correction", "jump", "base", "moving_base", "scales", "unstressed",
+    "constitutive", "balance", "corrections", "jump", "base", "moving_base", "scales", "unstressed",
     "law_factors", "observables",
 )  # fmt: skip
 

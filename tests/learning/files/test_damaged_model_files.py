@@ -149,9 +149,9 @@ def test_an_array_in_the_place_of_a_constant_spoils_nothing():
     """JAX compares models with those that it has seen; an array there has no truth value."""
 
     def edit(header):
-        header["residual"]["fields"]["history"] = {"$array": 0}
+        header["residual"]["fields"]["convex"] = {"$array": 0}
 
-    with fails("residual.history is a ndarray; allowed is a constant"):
+    with fails("residual.convex is a ndarray; allowed is a constant"):
         model_file.decoded_model(forged(BYTES, edit), "model")
     assert type(model_file.decoded_model(BYTES, "model")) is KNODE
 
@@ -228,7 +228,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         {"input_mean": np.zeros((28, 28))},
         {"input_biases": "text"},
         {"output_scale": None},
-        {"history": True},
+        {"c0": np.zeros(())},
     ):
         with fails("model: residual and knowledge do not fit together: "):
             KNODE(ROBOT, dataclasses.replace(net, **change)).save(tmp_path / "model")

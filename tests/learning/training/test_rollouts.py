@@ -12,11 +12,9 @@ from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTra
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training import rollouts as module
-from knode_cosserat.learning.training.descent import split
-from knode_cosserat.learning.training.progress import ProgressMonitor
 from knode_cosserat.learning.training.rollouts import (
+    RolloutRun,
     RolloutTargets,
     held_out_batches,
     loss_and_slope,
@@ -24,8 +22,8 @@ from knode_cosserat.learning.training.rollouts import (
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError
-from knode_cosserat.learning.training.stages import RolloutRun
+from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, split
+from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled
 
 OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)

@@ -39,8 +39,7 @@ from knode_cosserat.learning.files.unpacking import Reader
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import Passive, Sizes
 from knode_cosserat.learning.residual import Network, Nothing, Residual
-from knode_cosserat.learning.structured.expansion import Expansion, Term
-from knode_cosserat.learning.structured.residual import Load, Structured
+from knode_cosserat.learning.structured.residual import Expansion, Load, Structured, Term
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange

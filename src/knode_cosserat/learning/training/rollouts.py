@@ -1,4 +1,4 @@
-"""Whole simulations compared with trajectories: the loss of fine-tuning, and the held-out error.
+"""Fine-tuning through whole simulations compared with trajectories, and the held-out error.
 
 Only the compared fields of a trajectory must be known. Every solved step is differentiable by the implicit
 function theorem (`solvers.sensitivity`), so that any residual can be trained in this way.
@@ -15,19 +15,25 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import DataError, samples, settings_of
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.learning.training.checkpoint import packed_tree, unpacked
+from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.segments import DataError, samples, settings_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
 #: fields compared by default, if the system has them
 POSE = ("p", "h")
+#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
+DIVERGED, NOTHING = 1e6, 1e-6
 
 
 class InitialRows(NamedTuple):
@@ -236,3 +242,142 @@ def _difference(name: str, found: Any, truth: Any) -> Any:
     found, truth = (h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True)) for h in (found, truth))
     same = jnp.sum(found * truth, axis=-1, keepdims=True) >= 0.0
     return found - jnp.where(same, truth, -truth)
+
+
+# fine-tuning
+
+
+@jax.jit
+def _proposal(weights: Any, rest: Any, adam: Any, slope: Any, rate: Any, clip: Any) -> Any:
+    slope, _ = optax.clip_by_global_norm(clip).update(slope, optax.EmptyState())
+    direction, adam = ADAM.update(slope, adam)
+    moved = jax.tree.map(lambda weight, change: weight - rate * change, weights, direction)
+    return split(eqx.combine(moved, rest).clamped())[0], adam
+
+
+class RolloutRun(Run):
+    """Fine-tuning of one seed's residual through whole simulations.
+
+    A step after which the simulation fails or the loss diverges is rejected: it is halved, and so are all
+    later steps.
+    """
+
+    stage = "rollouts"
+
+    def __init__(
+        self, knowledge: System, residual: Residual, courses: TrajectoryBatches, options: RolloutTraining,
+        seed: int, held_out: TrajectoryBatches | None,
+    ):  # fmt: skip
+        self.name = f"rollouts-{seed}"
+        self.seeds, self.steps = (seed,), options.updates
+        self._courses, self._options, self._held_out = courses, options, held_out
+        weights, self._rest = split(residual)
+        self._weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
+        measured = np.array(scales(courses, knowledge.y_layout))
+        self._aim = RolloutTargets(knowledge, self._rest, courses.parts, measured)
+        self._adam = ADAM.init(self._weights)
+        #: factor on the step after halvings
+        self._scale = 1.0
+        self._losses = np.zeros(0)
+        self._rates = np.zeros(0)
+        self._slope = jax.tree.map(jnp.zeros_like, self._weights)
+        self._lowest = self._weights
+        self._best = Best(self._one(self._weights), options.stop_after)
+
+    @staticmethod
+    def _one(weights: Any) -> Any:
+        return jax.tree.map(lambda leaf: leaf[None], weights)
+
+    @property
+    def finished(self) -> bool:
+        """True if all updates are done, or the held-out error has not improved for `stop_after` updates."""
+        return self.done >= self.steps or bool(self._best.stopped[0] >= 0)
+
+    def compile(self) -> None:
+        """Compile by one evaluation and one held-out rollout."""
+        self._evaluated(self._weights)
+        if self._held_out:
+            tip_error(self._model(), self._held_out)
+
+    def _evaluated(self, weights: Any) -> tuple[float, Any]:
+        courses = self._courses
+        loss, slope = loss_and_slope(weights, self._aim, courses.compared, courses.settings, courses.dt)
+        return float(loss), slope
+
+    def begin(self, watch: ProgressMonitor) -> None:
+        """Evaluate the loss before the first update. Raises `FitError` if the simulation fails."""
+        loss, self._slope = self._evaluated(self._weights)
+        if not np.isfinite(loss) or not is_finite(self._slope):
+            raise FitError(
+                f"the model of seed {self.seeds[0]} cannot be simulated over the trajectories and so not "
+                "be fine-tuned: train it longer on segments, or simulate fewer rows (RolloutTraining.horizon)"
+            )
+        self._losses = np.array([loss])
+        self._check(watch)
+
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+        """Run one update."""
+        if len(self._losses) == 0:
+            self.begin(watch)
+        options = self._options
+        rate = options.learning_rate
+        if options.schedule == "cosine":
+            rate *= 0.5 * (1.0 + np.cos(np.pi * self.done / options.updates))
+        for _ in range(options.rejections):
+            step = rate * self._scale
+            weights, adam = _proposal(self._weights, self._rest, self._adam, self._slope, step, options.clip)
+            loss, slope = self._evaluated(weights)
+            if loss <= DIVERGED * max(self._losses[0], NOTHING) and is_finite((weights, slope)):
+                break
+            self._scale /= 2.0
+        else:
+            raise FitError(
+                f"fine-tuning of seed {self.seeds[0]} stopped in update {self.done}: with the step halved "
+                f"{options.rejections} times, to {step:.3g}, the robot still cannot be simulated after it"
+            )
+        if loss < self._losses.min():
+            self._lowest = weights
+        self._weights, self._adam, self._slope = weights, adam, slope
+        watch.steps(self.stage, self.seeds, self.done, self._losses[-1:, None], np.array([[step]]))
+        self._losses, self._rates = np.append(self._losses, loss), np.append(self._rates, step)
+        self.done += 1
+        self._check(watch)
+
+    def _model(self) -> KNODE:
+        return KNODE(self._aim.knowledge, eqx.combine(self._weights, self._rest))
+
+    def _check(self, watch: ProgressMonitor) -> None:
+        if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
+            return
+        error = tip_error(self._model(), self._held_out)
+        self._best.offer(self.done, [error], self._one(self._weights))
+        watch.error(self.stage, self.seeds[0], self.done, error)
+
+    def residuals(self) -> list[Residual]:
+        """Return the weights with the lowest loss, or the lowest held-out error if it may stop early."""
+        return [eqx.combine(self._best.chosen(0, self._one(self._lowest)), self._rest)]
+
+    def history(self, seed: int) -> dict[str, Any]:
+        """Return the loss before every update and after the last, step size, and held-out errors."""
+        found = {"loss": self._losses, "learning_rate": self._rates}
+        return found | ({"held_out_error": self._best.history(0)} if self._held_out else {})
+
+    def _state(self) -> Any:
+        return self._weights, self._adam, self._slope, self._lowest, np.array(self._scale)
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return weights, optimiser state, gradient, histories and best weights."""
+        return {
+            "state": packed_tree(self._state()), "losses": self._losses, "rates": self._rates,
+            "best": self._best.snapshot(),
+        }  # fmt: skip
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot."""
+        state = unpacked(snapshot.get("state"), self._state())
+        self._weights, self._adam, self._slope, self._lowest, scale = state
+        self._scale = float(scale)
+        self._rates = np.asarray(snapshot.get("rates"), dtype=float).reshape(-1)
+        self.done = len(self._rates)
+        self._losses = np.asarray(unpacked([snapshot.get("losses")], [np.zeros(self.done + 1)])[0])
+        self._best.restore(snapshot["best"])

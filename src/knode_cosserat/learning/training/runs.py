@@ -1,4 +1,4 @@
-"""Execution of the parts of a fit: in parallel on all cores, each with its own checkpoint."""
+"""Execution of the parts of a fit: in parallel on all cores, each with its own checkpoint, with progress."""
 
 from __future__ import annotations
 
@@ -8,21 +8,118 @@ import concurrent.futures
 import os
 import threading
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax  # type: ignore[import-untyped]
+from tqdm import tqdm
 
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed_tree, unpacked
-from knode_cosserat.learning.training.progress import ProgressMonitor
+
+ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
 
 
 class FitError(KnodeCosseratError, ValueError):
     """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
 
     code = "fit"
+
+
+class WatchError(KnodeCosseratError, ValueError):
+    """Metrics cannot be written. The message is one line with the reason."""
+
+    code = "training-log"
+
+
+class ProgressMonitor:
+    """Receiver of progress from all parts of a fit, from any thread. Use as a context manager."""
+
+    def __init__(self, progress: bool, log_dir: str | Path | None):
+        self._lock = threading.Lock()
+        self._folder = None if log_dir is None else Path(log_dir)
+        self._writer_class = None if log_dir is None else _writer_class()
+        self._writers: dict[int, Any] = {}
+        self._bar: Any = None
+        self._progress = progress
+
+    def __enter__(self) -> ProgressMonitor:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for writer in self._writers.values():
+            writer.close()
+        if self._bar is not None:
+            self._bar.close()
+
+    def begin(self, what: str, total: int, done: int) -> None:
+        """Start a stage with a total number of steps; some may be done already."""
+        if self._bar is not None:
+            self._bar.close()
+        self._bar = tqdm(total=total, initial=done, desc=what, unit="step", disable=not self._progress)
+
+    def steps(
+        self, what: str, seeds: Sequence[int], first: int, losses: np.ndarray, rates: np.ndarray
+    ) -> None:
+        """Record the losses and rates (steps, seeds) of consecutive steps; the first has number `first`."""
+        with self._lock:
+            self._bar.set_postfix_str(f"loss {np.mean(losses[-1]):.3g}", refresh=False)
+            self._bar.update(losses.size)
+            for k, seed in enumerate(seeds):
+                self._write(seed, first, f"{what}/loss", losses[:, k])
+                self._write(seed, first, f"{what}/learning_rate", rates[:, k])
+
+    def error(self, what: str, seed: int, step: int, error: float) -> None:
+        """Record the held-out error (m) after a step."""
+        with self._lock:
+            self._write(seed, step, f"{what}/held_out_error", [error])
+
+    def _write(self, seed: int, first: int, name: str, values: Any) -> None:
+        if self._folder is None or self._writer_class is None:
+            return
+        if seed not in self._writers:
+            folder = self._folder / f"seed-{seed}"
+            try:
+                # purge metrics that an interrupted run wrote after its last checkpoint: they come again
+                self._writers[seed] = self._writer_class(str(folder), purge_step=first, flush_secs=5)
+            except OSError as error:
+                raise WatchError(f"{folder}: metrics cannot be written: {error.strerror}") from None
+        for i, value in enumerate(values):
+            self._writers[seed].add_scalar(name, float(value), first + i)
+
+
+def _writer_class() -> Any:
+    try:
+        from tensorboardX import SummaryWriter  # type: ignore[import-untyped]
+    except ImportError:
+        raise WatchError("log_dir needs tensorboardX: pip install knode-cosserat[tensorboard]") from None
+    return SummaryWriter
+
+
+def split(residual: Residual) -> tuple[Any, Any]:
+    """Split a residual into its weights and the rest; `equinox.combine` joins them."""
+    mask = jax.tree_util.tree_map_with_path(lambda path, leaf: _is_weight(residual, path, leaf), residual)
+    return eqx.partition(residual, mask)
+
+
+def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
+    for key in path:
+        name = getattr(key, "name", None)
+        if name in getattr(type(node), "fixed", ()):
+            return False
+        index = getattr(key, "idx", getattr(key, "key", None))
+        node = node[index] if name is None else getattr(node, name)
+    return bool(np.issubdtype(jnp.result_type(leaf), np.floating))
+
+
+def is_finite(tree: Any) -> bool:
+    """True if all numbers of a pytree are finite."""
+    return all(bool(np.all(np.isfinite(np.asarray(leaf)))) for leaf in jax.tree.leaves(tree))
 
 
 class Run(abc.ABC):
