@@ -7,6 +7,7 @@ import datetime
 import logging
 import sys
 import time
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,7 +18,6 @@ import numpy as np
 from knode_cosserat._files.writing import package_version
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
-from knode_cosserat.learning.gain import rollout_errors
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
@@ -35,6 +35,8 @@ from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, Run
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.segments import Dataset, samples, strand_samples
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -44,6 +46,10 @@ BEST = FitConfig()
 #: hidden units times samples of all seeds up to which the seeds share one vectorised program on a CPU; larger
 #: fits run in parallel on all cores (measured, five of the paper's networks: 1.9 s on two cores, not 4 s)
 SHARED = 20_000
+#: part of the nominal model's error below which a gain is reported as little
+LITTLE = 0.2
+#: errors below this are those of the solver
+SOLVED = 1e-8
 
 
 def fit(
@@ -81,7 +87,7 @@ def fit(
         step), "versions", "date" and "seconds". Each stage of gradient training, "segments" and "rollouts",
         has the "loss" before every step, the "learning_rate", and the "held_out_error" (step, m) at every
         check. The final "held_out_error" (m) is that of the model. "rollout_errors" are those of the nominal
-        model and of the model, if they were verified (`RolloutErrors`).
+        model and of the model, if they were verified (`rollout_errors`).
 
     Raises:
         DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
@@ -109,7 +115,7 @@ def fit(
             for run in runs:
                 learned |= dict(zip(run.seeds, run.residuals(), strict=True))
                 for seed in run.seeds:
-                    histories[seed][run.stage] = run.history(seed)
+                    histories[seed][run.stage] = run.report(seed)
     facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
     if verify is None:
         verify = not type(knowledge.nominal).__module__.startswith("knode_cosserat.")
@@ -119,8 +125,9 @@ def fit(
         if data.held_out is not None:
             own["held_out_error"] = tip_error(KNODE(knowledge, residual), data.held_out)
         if verify:
-            errors = rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
-            own["rollout_errors"] = list(errors)
+            own["rollout_errors"] = list(
+                rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
+            )
         own["seconds"] = time.perf_counter() - began
         models.append(KNODE(knowledge, residual, About(own), trained))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)
@@ -259,3 +266,42 @@ def _facts(
         },
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+# gain of a model over the nominal one
+
+
+def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> tuple[float, float]:
+    """Return the errors of both simulations of a trajectory; warn of failures and of a small gain.
+
+    They are the root mean squares of y's errors in natural units, of simulations from the trajectory's first
+    rows; infinite if a step of the simulation is not solved.
+    """
+    first = 1 if trajectory.time[0] == 0.0 else min(3, len(trajectory.time) - 1)
+    settings = trajectory.settings or Settings()
+    scale, errors = np.asarray(nominal.scales().y), []
+    for system in (nominal, model):
+        with warnings.catch_warnings():
+            # the grid is that of the training data
+            warnings.simplefilter("ignore")
+            found = simulate(
+                system, np.asarray(trajectory.control)[first:], trajectory.dt, time=settings.time or "bdf2",
+                space=settings.space, start=settings.start, initial=trajectory[:first], on_failure="return",
+            )  # fmt: skip
+        apart = (np.asarray(found.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
+        errors.append(float(np.sqrt(np.mean(apart**2))) if found.all_valid else float("inf"))
+    if np.isinf(errors[1]):
+        warnings.warn(
+            "the fitted model cannot be simulated over its first training trajectory: a step has no "
+            "solution. Use another residual, more trajectories, or less noise",
+            stacklevel=3,
+        )
+    elif errors[1] > (1.0 - LITTLE) * max(errors[0], SOLVED):
+        warnings.warn(
+            "the fit gained little: over its first training trajectory the model's error is "
+            f"{100.0 * errors[1] / max(errors[0], SOLVED):.3g} % of the nominal model's. Its residual may "
+            "not have the missing effect, or the error is in the length, the base or the tip, which it "
+            "leaves alone",
+            stacklevel=3,
+        )
+    return errors[0], errors[1]

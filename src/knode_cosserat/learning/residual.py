@@ -19,7 +19,7 @@ from knode_cosserat.rods.system import System
 
 
 class Residual(eqx.Module):
-    """Terms that a model adds to its nominal model; none by default.
+    """Terms that a model adds to its nominal model (paper eq. 6, true dynamics); none by default.
 
     A subclass overrides what it changes: parameters (`adapted`), the law of the strains (`constitutive`), the
     loads along the rod (`balance`) and at its tip (`tip`), or it defines a `correction`, whose value adds to
@@ -147,7 +147,7 @@ class Network(Residual):
             return jnp.concatenate([y, z, force])
         return jnp.concatenate([y, y_t - self.c0 * y, z, z_t - self.c0 * z, force])
 
-    def correction(  # type: ignore[override]
+    def correction(
         self, knowledge: System, s: Any, t: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any
     ) -> Float[Any, " outputs"]:
         """Return f_θ, the correction of [y_s; z], at the nominal model's z."""
@@ -205,7 +205,7 @@ def network(knowledge: System, options: NetworkOptions, key: Any, c0: Any = None
 
 def input_layout(knowledge: System, history: bool) -> Layout:
     """Return the layout of a `Network`'s inputs, for this nominal model."""
-    fields = []
+    fields: list[Field] = []
     for layout in (knowledge.y_layout, knowledge.z_layout):
         fields += layout.fields
         if history:

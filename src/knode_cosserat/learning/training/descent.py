@@ -23,7 +23,6 @@ from jaxtyping import Float, Int
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.training.checkpoint import packed_tree, unpacked
 from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
 from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
 from knode_cosserat.rods.layout import Layout
@@ -305,7 +304,7 @@ def _loss(weights: Any, recipe: Recipe, data: TrainingData) -> Any:
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
     model = KNODE(data.knowledge, residual)
-    return data.loss(*_predicted(model, recipe.space, data.samples))  # type: ignore[arg-type]
+    return data.loss(*_predicted(model, recipe.space, data.samples))
 
 
 def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
@@ -417,50 +416,40 @@ class SegmentRun(Run):
         self, knowledge: System, residuals: Sequence[Residual], dataset: Dataset, training: Training,
         seeds: tuple[int, ...], held_out: TrajectoryBatches | None,
     ):  # fmt: skip
-        self.name = "-".join(["segments", *map(str, seeds)])
-        self.seeds, self.steps = seeds, training.epochs
-        self._knowledge, self._training, self._held_out = knowledge, training, held_out
+        state = started(residuals, training)
+        super().__init__(seeds, training.epochs, state, Best(state.weights, training.stop_after))
+        self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
         self._inputs = prepared(knowledge.strand, residuals[0], dataset, training)
-        self._state = started(residuals, training)
-        self._losses = np.zeros((0, len(seeds)))
-        self._rates = np.zeros((0, len(seeds)))
-        self._best = Best(self._state.weights, training.stop_after)
-
-    @property
-    def finished(self) -> bool:
-        """True if all epochs are done, or all seeds have stopped."""
-        return self.done >= self.steps or bool(np.all(self._best.stopped >= 0))
 
     def compile(self) -> None:
         """Compile the epochs' program without running one, and run one held-out rollout."""
-        run_epochs(*self._inputs, self._state, self.done)
+        run_epochs(*self._inputs, self.state, self.done)
         if self._held_out:
-            tip_error(KNODE(self._knowledge, self._last()[0]), self._held_out)
+            tip_error(KNODE(self._knowledge, self._residual(0)), self._held_out)
 
     def advance(self, stop: int, watch: ProgressMonitor) -> None:
         """Run epochs up to the next check, at most `PIECE`."""
-        every = self._training.check_every
-        stop = min(stop, self.done + PIECE, self.steps)
+        first = self.done
+        stop = min(stop, first + PIECE, self.steps)
         if self._held_out:
-            stop = min(stop, self.done - self.done % every + every)
-        state, losses, rates = run_epochs(*self._inputs, self._state, stop)
-        losses, rates = (np.asarray(values)[: stop - self.done] for values in (losses, rates))
+            stop = min(stop, first - first % self._every + self._every)
+        state, losses, rates = run_epochs(*self._inputs, self.state, stop)
+        losses, rates = (np.asarray(values)[: stop - first] for values in (losses, rates))
         self._require_sane(losses, state.weights)
-        self._state = state
-        self._losses = np.concatenate([self._losses, losses])
-        self._rates = np.concatenate([self._rates, rates])
-        first, self.done = self.done, stop
+        self.state = state
+        self.losses = np.concatenate([self.losses, losses])
+        self.rates = np.concatenate([self.rates, rates])
         watch.steps(self.stage, self.seeds, first, losses, rates)
-        if self._held_out and (stop % every == 0 or stop == self.steps):
-            models = [KNODE(self._knowledge, residual) for residual in self._last()]
+        if self._held_out and (stop % self._every == 0 or stop == self.steps):
+            models = [KNODE(self._knowledge, self._residual(k)) for k in range(len(self.seeds))]
             errors = [tip_error(model, self._held_out) for model in models]
-            self._best.offer(stop, errors, state.weights)
+            self.best.offer(stop, errors, state.weights)
             for seed, error in zip(self.seeds, errors, strict=True):
                 watch.error(self.stage, seed, stop, error)
 
     def _require_sane(self, losses: np.ndarray, weights: Any) -> None:
-        start = np.concatenate([self._losses, losses])[0]
-        active = self._best.stopped < 0
+        start = np.concatenate([self.losses, losses])[0]
+        active = self.best.stopped < 0
         bad = ~(losses <= DIVERGED * np.maximum(start, NOTHING)) & active
         if bad.any():
             row, k = np.argwhere(bad)[0]
@@ -474,38 +463,11 @@ class SegmentRun(Run):
                 "a smaller learning rate may help"
             )
 
-    def _residual(self, weights: Any) -> Residual:
-        return eqx.combine(weights, self._inputs[2].rest)
-
-    def _last(self) -> list[Residual]:
-        weights = self._state.weights
-        return [self._residual(jax.tree.map(lambda x, k=k: x[k], weights)) for k in range(len(self.seeds))]
+    def _residual(self, k: int) -> Residual:
+        """Return the residual of seed k with its last weights."""
+        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._inputs[2].rest)
 
     def residuals(self) -> list[Residual]:
         """Return residuals with the last weights, or the best if training may stop early."""
-        weights = self._state.weights
-        return [self._residual(self._best.chosen(k, weights)) for k in range(len(self.seeds))]
-
-    def history(self, seed: int) -> dict[str, Any]:
-        """Return the loss before every update, the learning rate, and held-out errors."""
-        k = self.seeds.index(seed)
-        stopped = self._best.stopped[k]
-        rows = slice(0, stopped if stopped >= 0 else None)
-        history = {"loss": self._losses[rows, k], "learning_rate": self._rates[rows, k]}
-        return history | ({"held_out_error": self._best.history(k)} if self._held_out else {})
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return state, histories and best weights."""
-        return {
-            "state": packed_tree(self._state), "losses": self._losses, "rates": self._rates,
-            "best": self._best.snapshot(),
-        }  # fmt: skip
-
-    def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot."""
-        self._state = unpacked(snapshot.get("state"), self._state)
-        self.done = int(self._state.epoch)
-        like = [np.zeros((self.done, len(self.seeds)))] * 2
-        histories = unpacked([snapshot.get("losses"), snapshot.get("rates")], like)
-        self._losses, self._rates = map(np.asarray, histories)
-        self._best.restore(snapshot["best"])
+        chosen = [self.best.chosen(k, self.state.weights) for k in range(len(self.seeds))]
+        return [eqx.combine(weights, self._inputs[2].rest) for weights in chosen]

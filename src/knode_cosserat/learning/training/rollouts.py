@@ -21,7 +21,6 @@ from jaxtyping import Float
 from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.training.checkpoint import packed_tree, unpacked
 from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
@@ -36,19 +35,9 @@ POSE = ("p", "h")
 DIVERGED, NOTHING = 1e6, 1e-6
 
 
-class InitialRows(NamedTuple):
-    """Rows of trajectories (B) up to the initial row of the simulations."""
-
-    time: Float[Any, "B rows"]
-    y: Float[Any, "B rows nodes y"]
-    z: Float[Any, "B rows nodes z"]
-    control: Float[Any, "B rows c"]
-
-
 class TrajectoryBatch(NamedTuple):
     """Trajectories (B) of one length: controls and target states."""
 
-    past: InitialRows | None
     control: Float[Any, "B T c"]
     #: row 0 is the initial state of the simulations
     y: Float[Any, "B T+1 nodes y"]
@@ -74,43 +63,30 @@ def trajectory_batches(
             or is not finite where it is used.
     """
     compared = _checked_names(knowledge, options.compared)
-    first = options.first_row
     try:
-        samples(knowledge, [_relevant(knowledge, one, compared, first) for one in trajectories])
+        samples(knowledge, [_relevant(knowledge, one, compared) for one in trajectories])
     except DataError as error:
         raise DataError(f"{what}{error}") from None
     by_length: dict[int, list[TrajectoryBatch]] = {}
     for k, trajectory in enumerate(trajectories):
-        name = f"{what}trajectory {k}"
-        if first is None and float(trajectory.time[0]) != 0.0:
+        if float(trajectory.time[0]) != 0.0:
             raise DataError(
-                f"{name} begins at {float(trajectory.time[0]):g} s, in motion; simulations start at rest, at "
-                "time 0, unless RolloutTraining.first_row says where"
+                f"{what}trajectory {k} begins at {float(trajectory.time[0]):g} s, in motion; simulations "
+                "start at rest, at time 0"
             )
-        start, rows = first or 0, len(trajectory.time)
-        stop = min(rows, start + 1 + (options.horizon or rows))
-        if stop - start < 2:
-            raise DataError(f"{name} has {rows} rows; after row {start} there must be at least one more")
-        part = _course(trajectory, first, start, stop)
-        by_length.setdefault(stop, []).append(part)
+        rows = min(len(trajectory.time), 1 + (options.horizon or len(trajectory.time)))
+        y, control = (np.asarray(part, dtype=float)[:rows] for part in (trajectory.y, trajectory.control))
+        by_length.setdefault(rows, []).append(TrajectoryBatch(control[1:], y))
     joined = [jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in by_length.values()]
     settings = settings_of(trajectories[0])
     return TrajectoryBatches(tuple(joined), compared, settings, trajectories[0].dt)
 
 
-def _course(trajectory: Trajectory, first: int | None, start: int, stop: int) -> TrajectoryBatch:
-    arrays = (trajectory.time, trajectory.y, trajectory.z, trajectory.control)
-    time, y, z, control = (np.asarray(array, dtype=float) for array in arrays)
-    before = slice(0, start + 1)
-    past = None if first is None else InitialRows(time[before], y[before], z[before], control[before])
-    return TrajectoryBatch(past, control[start + 1 : stop], y[start:stop])
-
-
-def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[str, ...]:
+def _checked_names(knowledge: System, compared: tuple[str, ...] | None) -> tuple[str, ...]:
     known = knowledge.y_layout.names
     # a strand's number may follow
     pose = tuple(name for name in known if name.rstrip("0123456789") in POSE)
-    names = pose if given is None else given
+    names = pose if compared is None else compared
     for name in names:
         if name not in known:
             raise DataError(f"RolloutTraining.compared has {name!r}; y has {', '.join(known)}")
@@ -119,18 +95,15 @@ def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[st
     return names
 
 
-def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...], first: int | None) -> Any:
+def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...]) -> Any:
     """Return a trajectory with zeros in all unused values, which may be unknown."""
     if not isinstance(trajectory, Trajectory) or np.ndim(trajectory.y) != 3:
         return trajectory
-    y, z = np.array(trajectory.y, dtype=float), np.array(trajectory.z, dtype=float)
-    after = slice(0 if first is None else first + 1, None)
+    y = np.array(trajectory.y, dtype=float)
     if y.shape[-1] == knowledge.y_layout.size:
-        others = [name for name in knowledge.y_layout.names if name not in names]
-        if others:
-            y[after, :, knowledge.y_layout.indices(tuple(others))] = 0.0
-    z[after] = 0.0
-    return dataclasses.replace(trajectory, y=y, z=z)
+        unused = tuple(name for name in knowledge.y_layout.names if name not in names)
+        y[..., knowledge.y_layout.indices(unused)] = 0.0
+    return dataclasses.replace(trajectory, y=y, z=np.zeros(np.shape(trajectory.z)))
 
 
 # simulating
@@ -141,20 +114,13 @@ def simulated_batch(
 ) -> Float[Any, "B T+1 nodes y"]:
     """Return y of all trajectories simulated by the model, one after the other; NaN in unsolved steps."""
 
-    def one(given: Any) -> Any:
-        past, control = given
-        initial = None
-        if past is not None:
-            none, zero = jnp.zeros(past.time.shape[0], dtype=int), jnp.zeros(past.time.shape[0])
-            initial = Trajectory(
-                model, settings, past.time, past.y, past.z, past.control, none, zero, iterations=none
-            )
+    def one(control: Any) -> Any:
         return simulate(
             model, control, dt, space=settings.space, start=settings.start, newton=settings.newton,
-            between=settings.between, initial=initial, time=settings.time,  # type: ignore[arg-type]  # None is refused there
+            between=settings.between, time=settings.time,  # type: ignore[arg-type]  # None is refused there
         ).y  # fmt: skip
 
-    return jax.lax.map(one, (course.past, course.control))
+    return jax.lax.map(one, course.control)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "dt"))
@@ -255,6 +221,16 @@ def _proposal(weights: Any, rest: Any, adam: Any, slope: Any, rate: Any, clip: A
     return split(eqx.combine(moved, rest).clamped())[0], adam
 
 
+class RolloutState(NamedTuple):
+    """State of fine-tuning: weights, optimiser, gradient, weights of least loss, factor on the step."""
+
+    weights: Any
+    adam: Any
+    slope: Any
+    lowest: Any
+    scale: Any
+
+
 class RolloutRun(Run):
     """Fine-tuning of one seed's residual through whole simulations.
 
@@ -263,39 +239,24 @@ class RolloutRun(Run):
     """
 
     stage = "rollouts"
+    loss_after = True
 
     def __init__(
         self, knowledge: System, residual: Residual, courses: TrajectoryBatches, options: RolloutTraining,
         seed: int, held_out: TrajectoryBatches | None,
     ):  # fmt: skip
-        self.name = f"rollouts-{seed}"
-        self.seeds, self.steps = (seed,), options.updates
+        weights, rest = split(residual)
+        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
+        slope = jax.tree.map(jnp.zeros_like, weights)
+        state = RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
+        super().__init__((seed,), options.updates, state, Best(_one(weights), options.stop_after))
         self._courses, self._options, self._held_out = courses, options, held_out
-        weights, self._rest = split(residual)
-        self._weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
         measured = np.array(scales(courses, knowledge.y_layout))
-        self._aim = RolloutTargets(knowledge, self._rest, courses.parts, measured)
-        self._adam = ADAM.init(self._weights)
-        #: factor on the step after halvings
-        self._scale = 1.0
-        self._losses = np.zeros(0)
-        self._rates = np.zeros(0)
-        self._slope = jax.tree.map(jnp.zeros_like, self._weights)
-        self._lowest = self._weights
-        self._best = Best(self._one(self._weights), options.stop_after)
-
-    @staticmethod
-    def _one(weights: Any) -> Any:
-        return jax.tree.map(lambda leaf: leaf[None], weights)
-
-    @property
-    def finished(self) -> bool:
-        """True if all updates are done, or the held-out error has not improved for `stop_after` updates."""
-        return self.done >= self.steps or bool(self._best.stopped[0] >= 0)
+        self._aim = RolloutTargets(knowledge, rest, courses.parts, measured)
 
     def compile(self) -> None:
         """Compile by one evaluation and one held-out rollout."""
-        self._evaluated(self._weights)
+        self._evaluated(self.state.weights)
         if self._held_out:
             tip_error(self._model(), self._held_out)
 
@@ -304,80 +265,61 @@ class RolloutRun(Run):
         loss, slope = loss_and_slope(weights, self._aim, courses.compared, courses.settings, courses.dt)
         return float(loss), slope
 
-    def begin(self, watch: ProgressMonitor) -> None:
+    def _begin(self, watch: ProgressMonitor) -> None:
         """Evaluate the loss before the first update. Raises `FitError` if the simulation fails."""
-        loss, self._slope = self._evaluated(self._weights)
-        if not np.isfinite(loss) or not is_finite(self._slope):
+        loss, slope = self._evaluated(self.state.weights)
+        if not np.isfinite(loss) or not is_finite(slope):
             raise FitError(
                 f"the model of seed {self.seeds[0]} cannot be simulated over the trajectories and so not "
                 "be fine-tuned: train it longer on segments, or simulate fewer rows (RolloutTraining.horizon)"
             )
-        self._losses = np.array([loss])
+        self.state, self.losses = self.state._replace(slope=slope), np.array([[loss]])
         self._check(watch)
 
     def advance(self, stop: int, watch: ProgressMonitor) -> None:
         """Run one update."""
-        if len(self._losses) == 0:
-            self.begin(watch)
-        options = self._options
-        rate = options.learning_rate
+        if len(self.losses) == 0:
+            self._begin(watch)
+        options, state = self._options, self.state
+        rate, scale = options.learning_rate, float(state.scale)
         if options.schedule == "cosine":
             rate *= 0.5 * (1.0 + np.cos(np.pi * self.done / options.updates))
         for _ in range(options.rejections):
-            step = rate * self._scale
-            weights, adam = _proposal(self._weights, self._rest, self._adam, self._slope, step, options.clip)
+            step = rate * scale
+            weights, adam = _proposal(
+                state.weights, self._aim.rest, state.adam, state.slope, step, options.clip
+            )
             loss, slope = self._evaluated(weights)
-            if loss <= DIVERGED * max(self._losses[0], NOTHING) and is_finite((weights, slope)):
+            if loss <= DIVERGED * max(self.losses[0, 0], NOTHING) and is_finite((weights, slope)):
                 break
-            self._scale /= 2.0
+            scale /= 2.0
         else:
             raise FitError(
                 f"fine-tuning of seed {self.seeds[0]} stopped in update {self.done}: with the step halved "
                 f"{options.rejections} times, to {step:.3g}, the robot still cannot be simulated after it"
             )
-        if loss < self._losses.min():
-            self._lowest = weights
-        self._weights, self._adam, self._slope = weights, adam, slope
-        watch.steps(self.stage, self.seeds, self.done, self._losses[-1:, None], np.array([[step]]))
-        self._losses, self._rates = np.append(self._losses, loss), np.append(self._rates, step)
-        self.done += 1
+        lowest = weights if loss < self.losses.min() else state.lowest
+        self.state = RolloutState(weights, adam, slope, lowest, np.array(scale))
+        watch.steps(self.stage, self.seeds, self.done, self.losses[-1:], np.array([[step]]))
+        self.losses = np.append(self.losses, [[loss]], axis=0)
+        self.rates = np.append(self.rates, [[step]], axis=0)
         self._check(watch)
 
     def _model(self) -> KNODE:
-        return KNODE(self._aim.knowledge, eqx.combine(self._weights, self._rest))
+        return KNODE(self._aim.knowledge, eqx.combine(self.state.weights, self._aim.rest))
 
     def _check(self, watch: ProgressMonitor) -> None:
         if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
             return
         error = tip_error(self._model(), self._held_out)
-        self._best.offer(self.done, [error], self._one(self._weights))
+        self.best.offer(self.done, [error], _one(self.state.weights))
         watch.error(self.stage, self.seeds[0], self.done, error)
 
     def residuals(self) -> list[Residual]:
         """Return the weights with the lowest loss, or the lowest held-out error if it may stop early."""
-        return [eqx.combine(self._best.chosen(0, self._one(self._lowest)), self._rest)]
+        return [eqx.combine(self.best.chosen(0, _one(self.state.lowest)), self._aim.rest)]
 
-    def history(self, seed: int) -> dict[str, Any]:
-        """Return the loss before every update and after the last, step size, and held-out errors."""
-        found = {"loss": self._losses, "learning_rate": self._rates}
-        return found | ({"held_out_error": self._best.history(0)} if self._held_out else {})
 
-    def _state(self) -> Any:
-        return self._weights, self._adam, self._slope, self._lowest, np.array(self._scale)
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return weights, optimiser state, gradient, histories and best weights."""
-        return {
-            "state": packed_tree(self._state()), "losses": self._losses, "rates": self._rates,
-            "best": self._best.snapshot(),
-        }  # fmt: skip
-
-    def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot."""
-        state = unpacked(snapshot.get("state"), self._state())
-        self._weights, self._adam, self._slope, self._lowest, scale = state
-        self._scale = float(scale)
-        self._rates = np.asarray(snapshot.get("rates"), dtype=float).reshape(-1)
-        self.done = len(self._rates)
-        self._losses = np.asarray(unpacked([snapshot.get("losses")], [np.zeros(self.done + 1)])[0])
-        self._best.restore(snapshot["best"])
+def _one(weights: Any) -> Any:
+    """Return the weights of one seed, with the seeds' axis."""
+    return jax.tree.map(lambda leaf: leaf[None], weights)

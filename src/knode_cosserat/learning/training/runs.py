@@ -9,7 +9,7 @@ import os
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -122,53 +122,6 @@ def is_finite(tree: Any) -> bool:
     return all(bool(np.all(np.isfinite(np.asarray(leaf)))) for leaf in jax.tree.leaves(tree))
 
 
-class Run(abc.ABC):
-    """Independent part of a fit: some seeds, for a number of steps.
-
-    Attributes:
-        name: name of its checkpoint.
-        stage: kind of its steps, for progress and metrics.
-        seeds: seeds that it trains.
-        steps: total number of steps.
-        done: number of steps done.
-    """
-
-    name: str
-    stage: str
-    seeds: tuple[int, ...]
-    steps: int
-    done: int = 0
-
-    @property
-    @abc.abstractmethod
-    def finished(self) -> bool:
-        """True if no steps are left."""
-
-    @abc.abstractmethod
-    def compile(self) -> None:
-        """Compile the program of `advance` before threads would each compile it."""
-
-    @abc.abstractmethod
-    def advance(self, stop: int, watch: ProgressMonitor) -> None:
-        """Run some steps, up to number `stop` at most. Raises `FitError`."""
-
-    @abc.abstractmethod
-    def snapshot(self) -> dict[str, Any]:
-        """Return the state as plain values, arrays, and lists of arrays."""
-
-    @abc.abstractmethod
-    def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
-
-    @abc.abstractmethod
-    def residuals(self) -> list[Residual]:
-        """Return the trained residuals, one for every seed."""
-
-    @abc.abstractmethod
-    def history(self, seed: int) -> dict[str, Any]:
-        """Return loss, rate and held-out errors of one seed over the steps."""
-
-
 class Best:
     """Best weights of each seed by held-out error, and early stopping."""
 
@@ -199,7 +152,7 @@ class Best:
         kept = self.stop_after is not None and np.isfinite(self.errors[k])
         return jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[k]), self.weights if kept else last)
 
-    def history(self, k: int) -> np.ndarray:
+    def report(self, k: int) -> np.ndarray:
         """Return steps and errors (checks, 2) of a seed, until it stopped."""
         seen = np.array(self.seen).reshape(len(self.seen), 1 + len(self.errors))[:, [0, 1 + k]]
         return seen if self.stopped[k] < 0 else seen[seen[:, 0] <= self.stopped[k]]
@@ -220,6 +173,73 @@ class Best:
         self.seen = [list(row) for row in np.asarray(snapshot.get("seen")).tolist()]
 
 
+class Run(abc.ABC):
+    """Independent part of a fit: some seeds, for a number of steps.
+
+    Attributes:
+        stage: kind of its steps, for progress, metrics and the name of its checkpoint.
+        seeds: seeds that it trains.
+        steps: total number of steps.
+        state: pytree from which it continues.
+        best: best weights by held-out error, and early stopping.
+        losses: (steps, seeds), before every step; with `loss_after` also after the last one.
+        rates: (steps, seeds), learning rates.
+    """
+
+    stage: ClassVar[str]
+    loss_after: ClassVar[bool] = False
+
+    def __init__(self, seeds: tuple[int, ...], steps: int, state: Any, best: Best):
+        self.seeds, self.steps, self.state, self.best = seeds, steps, state, best
+        self.name = "-".join([self.stage, *map(str, seeds)])
+        self.losses = self.rates = np.zeros((0, len(seeds)))
+
+    @property
+    def done(self) -> int:
+        """Number of steps done."""
+        return len(self.rates)
+
+    @property
+    def finished(self) -> bool:
+        """True if all steps are done, or all seeds have stopped early."""
+        return self.done >= self.steps or bool(np.all(self.best.stopped >= 0))
+
+    @abc.abstractmethod
+    def compile(self) -> None:
+        """Compile the program of `advance` before threads would each compile it."""
+
+    @abc.abstractmethod
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+        """Run some steps, up to number `stop` at most. Raises `FitError`."""
+
+    @abc.abstractmethod
+    def residuals(self) -> list[Residual]:
+        """Return the trained residuals, one for every seed."""
+
+    def report(self, seed: int) -> dict[str, Any]:
+        """Return loss, rate and held-out errors of one seed over the steps."""
+        k = self.seeds.index(seed)
+        rows = slice(0, self.best.stopped[k] if self.best.stopped[k] >= 0 and not self.loss_after else None)
+        found = {"loss": self.losses[rows, k], "learning_rate": self.rates[rows, k]}
+        return found | ({"held_out_error": self.best.report(k)} if self.best.seen else {})
+
+    def snapshot(self) -> dict[str, Any]:
+        """Return the state as plain values, arrays, and lists of arrays."""
+        return {
+            "state": packed_tree(self.state), "losses": self.losses, "rates": self.rates,
+            "best": self.best.snapshot(),
+        }  # fmt: skip
+
+    def restore(self, snapshot: dict[str, Any]) -> None:
+        """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
+        self.state = unpacked(snapshot.get("state"), self.state)
+        arrays = [snapshot.get("losses"), snapshot.get("rates")]
+        done, count = len(snapshot["rates"]), len(self.seeds)
+        like = [np.zeros((done + self.loss_after, count)), np.zeros((done, count))]
+        self.losses, self.rates = map(np.asarray, unpacked(arrays, like))
+        self.best.restore(snapshot["best"])
+
+
 def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, watch: ProgressMonitor) -> None:
     """Complete all runs, from their checkpoints if there are any, with a checkpoint every `every` steps.
 
@@ -228,7 +248,15 @@ def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, wa
         CheckpointError: a checkpoint cannot be used, or not be written.
     """
     for run in runs if checkpoints else ():
-        _restore(run, checkpoints)
+        snapshot = checkpoints.load(run.name)  # type: ignore[union-attr]
+        try:
+            if snapshot is not None:
+                run.restore(snapshot)
+        except (CheckpointError, TypeError, ValueError, AttributeError, KeyError) as error:
+            known = isinstance(error, CheckpointError)
+            reason = str(error) if known else "it has something else in it than states"
+            path = checkpoints.path(run.name)  # type: ignore[union-attr]
+            raise CheckpointError(f"{path}: {reason}; delete it to start again") from None
     stages = {run.stage for run in runs}
     total = sum(run.steps * len(run.seeds) for run in runs)
     watch.begin(" and ".join(sorted(stages)), total, sum(run.done * len(run.seeds) for run in runs))
@@ -237,32 +265,16 @@ def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, wa
         try:
             run.advance(run.done - run.done % every + every, watch)
         except FitError as error:
-            kept = _kept(checkpoints, run)
+            kept = "nothing was kept: no checkpoint was asked for"
+            if checkpoints is not None:
+                path = checkpoints.path(run.name)
+                kept = f"the last good state is kept in {path}"
+                kept = kept if path.exists() else "it was too early for a checkpoint"
             raise FitError(f"{error}; {kept}") from None
         if checkpoints and (run.finished or run.done % every == 0):
             checkpoints.save(run.name, run.snapshot())
 
     _side_by_side([run for run in runs if not run.finished], work)
-
-
-def _restore(run: Run, checkpoints: Any) -> None:
-    snapshot = checkpoints.load(run.name)
-    if snapshot is None:
-        return
-    try:
-        run.restore(snapshot)
-    except (CheckpointError, TypeError, ValueError, AttributeError, KeyError) as error:
-        reason = (
-            str(error) if isinstance(error, CheckpointError) else "it has something else in it than states"
-        )
-        raise CheckpointError(f"{checkpoints.path(run.name)}: {reason}; delete it to start again") from None
-
-
-def _kept(checkpoints: Checkpoints | None, run: Run) -> str:
-    if checkpoints is None:
-        return "nothing was kept: no checkpoint was asked for"
-    path = checkpoints.path(run.name)
-    return f"the last good state is kept in {path}" if path.exists() else "it was too early for a checkpoint"
 
 
 def _side_by_side(runs: Sequence[Run], work: Callable[[Run], None]) -> None:
@@ -283,7 +295,8 @@ def _side_by_side(runs: Sequence[Run], work: Callable[[Run], None]) -> None:
             if not run.finished:
                 waiting.append(run)
 
-    count = min(len(runs), _cores())
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    count = min(len(runs), cores if jax.default_backend() == "cpu" else 1)
     if count <= 1:
         worker()
         return
@@ -296,9 +309,3 @@ def _side_by_side(runs: Sequence[Run], work: Callable[[Run], None]) -> None:
                 future.result()
         finally:
             stop.set()
-
-
-def _cores() -> int:
-    if jax.default_backend() != "cpu":
-        return 1
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
