@@ -20,7 +20,6 @@ from knode_cosserat.learning.calibration.calibrate import CalibrationError, cali
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.estimation.estimate import estimate_states
@@ -32,6 +31,7 @@ from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 from studies.runner import Job, Product, StudyError

@@ -14,8 +14,7 @@ import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, Residual, network
-from knode_cosserat.learning.structured.expansion import CURVED, LINEAR, expansion
-from knode_cosserat.learning.structured.residual import Structured
+from knode_cosserat.learning.structured.residual import CURVED, LINEAR, Structured, expansion
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
@@ -295,13 +294,12 @@ def test_what_is_missing_is_named():
 
 
 class Pull(Residual):
-    """A residual of a user, with nothing but what it must define: the load on n, and a strain."""
+    """A residual of a user: the load on n, and a strain."""
 
     size: Any
 
-    def derivatives(self, knowledge, point):
-        y_s, z = semi_discrete.derivatives(knowledge, point)
-        return y_s.at[7].add(self.size), z.at[4].add(self.size * point.y[10])
+    def correction(self, knowledge, s, t, y, y_t, z, z_t, control):
+        return jnp.zeros(len(y) + len(z)).at[7].set(self.size).at[len(y) + 4].set(self.size * y[10])
 
 
 @functools.cache
@@ -349,8 +347,9 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
         point = Point(0.1, 0.0, y, control, history)
         y_s, z = semi_discrete.derivatives(model, point)
         strains, rates = semi_discrete.strains(model, point), semi_discrete.rates(model, point, z)
-        law = semi_discrete.law(model, point)
-        return y_s, z, strains, rates, law.matrix(z), *(law.residual(there) for there in (z, z + step))
+        matrix = semi_discrete.law(model, point).matrix(z)
+        residuals = [semi_discrete.law_residual(model, point, there) for there in (z, z + step)]
+        return y_s, z, strains, rates, matrix, *residuals
 
     y_s, z, strains, rates, matrix, law, moved = parts(y, control, history)
     np.testing.assert_allclose(strains, z, rtol=1e-10, atol=1e-12)

@@ -10,7 +10,6 @@ import numpy as np
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual, network
-from knode_cosserat.solvers import semi_discrete
 
 PAPER = kc.load_robot("delrin-tendon-robot")
 
@@ -29,18 +28,14 @@ class Committee(Residual):
     layers: list[tuple[jax.Array, jax.Array]]
     scale: jax.Array
 
-    def derivatives(self, knowledge, point):
-        y_s, z = semi_discrete.derivatives(knowledge, point)
-
+    def correction(self, knowledge, s, t, y, y_t, z, z_t, control):
         def outputs(layers):
             (first, a), (second, b), (third, c) = layers
-            hidden = jax.nn.silu(first @ jnp.append(point.y, point.s) + a)
+            hidden = jax.nn.silu(first @ jnp.append(y, s) + a)
             return jnp.tanh(third @ jax.nn.softplus(second @ hidden + b) + c)
 
-        return y_s + self.scale * jnp.mean(jax.vmap(outputs)(self.layers), axis=0), z
-
-    def strains(self, knowledge, point):
-        return semi_discrete.strains(knowledge, point)
+        added = self.scale * jnp.mean(jax.vmap(outputs)(self.layers), axis=0)
+        return jnp.concatenate([added, jnp.zeros_like(z)])
 
 
 def with_committee():

@@ -17,8 +17,7 @@ from examples.hanging_string import HangingString
 from knode_cosserat.engine.program import FOLDED, EngineError, Program
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import passive
-from knode_cosserat.learning.structured.expansion import CURVED, expansion
-from knode_cosserat.learning.structured.residual import Structured
+from knode_cosserat.learning.structured.residual import CURVED, Structured, expansion
 from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.system import unknown_count
 from knode_cosserat.solvers.problem import StepProblem

@@ -8,7 +8,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.evaluation.learning_figures import residual
-from knode_cosserat.learning.samples import DataError
+from knode_cosserat.solvers.segments import DataError
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw
 pytestmark = pytest.mark.filterwarnings("error")

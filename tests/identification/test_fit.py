@@ -13,8 +13,8 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.trials import failed_trial
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.rods.routing import Polynomial
+from knode_cosserat.solvers.segments import DataError
 from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(

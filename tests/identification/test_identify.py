@@ -10,12 +10,12 @@ from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.misfit import data_of
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.section import Sleeve, Stretch
 from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.solvers.segments import DataError
 from tests.identification.recorded import DT, measured, tensions
 
 #: as ruler, scale and data sheet have it: lying along z, with gravity across

@@ -18,7 +18,7 @@ CONFIGS = [
     FitConfig(),
     FitConfig.paper(seed=3, history=True),
     FitConfig.paper(seed=(0, 1, 2)),
-    FitConfig.network(hidden=7, noise=0.1),
+    FitConfig.network(hidden=7),
     FitConfig(
         StructuredOptions(), Training(nodes=(1, 2), stop_after=10), RolloutTraining(compared=("p",)), (4,)
     ),
@@ -38,7 +38,7 @@ def test_presets():
     training = paper.segments
     assert (training.epochs, training.learning_rate, training.nodes) == (1000, 0.01, (3, 5, 7, 9))
     assert (training.schedule, training.patience, training.factor) == ("plateau", 80, 0.5)
-    assert (training.loss, training.noise, training.weight_decay) == ("paper", 0.0, 0.0)
+    assert (training.loss, training.data_noise, training.weight_decay) == ("paper", 0.0, 0.0)
     assert paper.rollouts is None and paper.seeds == (0,)
     assert FitConfig.paper(seed=(1, 2)).seeds == (1, 2)
     assert FitConfig() == FitConfig(StructuredOptions())
@@ -77,7 +77,7 @@ WRONG = [
     (lambda: Training(nodes=(3, 3)), "Training.nodes is"),
     (lambda: Training(nodes=(0,)), "Training.nodes is"),
     (lambda: Training(nodes=5), "or None: all nodes"),
-    (lambda: Training(noise=-1.0), "Training.noise is -1.0"),
+    (lambda: Training(data_noise=-1.0), "Training.data_noise is -1.0"),
     (lambda: Training(stop_after=0), "or None: never"),
     (lambda: RolloutTraining(compared="p"), "RolloutTraining.compared is 'p'"),
     (lambda: RolloutTraining(clip=0), "RolloutTraining.clip is 0"),

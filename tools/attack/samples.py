@@ -100,7 +100,7 @@ def _of_recordings() -> dict[str, Sample]:
 def _of_learning() -> dict[str, Sample]:
     from knode_cosserat.envs.policy import Policy, network
     from knode_cosserat.learning.config import FitConfig
-    from knode_cosserat.learning.residual import Network, input_size
+    from knode_cosserat.learning.residual import Network, input_layout
     from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity
 
     robot = kc.load_robot(ROBOT)
@@ -109,7 +109,7 @@ def _of_learning() -> dict[str, Sample]:
 
     def model(version: int) -> kc.KNODE:
         generator = np.random.default_rng(version)
-        inputs, outputs = input_size(robot, False), robot.y_layout.size + robot.z_layout.size
+        inputs, outputs = input_layout(robot, False).size, robot.y_layout.size + robot.z_layout.size
         shapes = ((3, inputs), (3,), (outputs, 3), (outputs,), (inputs,))
         arrays = [1e-2 * generator.normal(size=shape) for shape in shapes]
         return kc.KNODE(robot, network_of(*arrays, np.ones(inputs), np.full(outputs, 1e-2)))

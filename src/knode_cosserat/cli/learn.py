@@ -113,7 +113,7 @@ def fit(
     if figure:
         figures()
     from knode_cosserat.learning.fit import fit as learn
-    from knode_cosserat.learning.samples import DataError
+    from knode_cosserat.solvers.segments import DataError
 
     nominal = load_system(robot, changes)
     config = _config(preset, numbers, epochs)

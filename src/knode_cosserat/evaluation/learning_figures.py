@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
-from knode_cosserat.learning.explain import added
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.layout import Field
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.segments import Samples, samples, start_point
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -27,7 +30,13 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
     Raises:
         DataError: the trajectory does not fit the model.
     """
-    found = added(model, trajectory)
+    data = samples(model.knowledge, [trajectory]).segments
+    used = np.unique(data.origin[:, 1])
+    time = np.asarray(trajectory.time)[used]
+    nominal, corrected = (
+        [np.asarray(part).reshape(len(used), -1, part.shape[-1]) for part in _derivatives(system, data)]
+        for system in (model.knowledge, model)
+    )
     y_layout, z_layout = model.y_layout, model.z_layout
     stated = [field for field in y_layout.fields if field.load] or list(y_layout.fields)
     rows: list[tuple[Field, int, str]] = [
@@ -39,10 +48,10 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
         axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (field, part, label) in zip(axes, rows, strict=True):
             layout = (y_layout, z_layout)[part]
-            own, whole = (layout.get(each[part], field.name) for each in (found.knowledge, found.model))
+            own, whole = (layout.get(parts[part], field.name) for parts in (nominal, corrected))
             for values, colour, name in ((own, "0.6", "knowledge"), (whole - own, PALETTE[0], "added")):
                 size = np.linalg.norm(values, axis=-1).max(axis=1)
-                axis.plot(found.time, size, color=colour, label=name)
+                axis.plot(time, size, color=colour, label=name)
             axis.set_ylabel(label)
             # the axis begins below zero, so that a zero residual is visible
             axis.set_ylim(bottom=-0.04 * axis.get_ylim()[1])
@@ -50,3 +59,9 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
         axes[0].legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2)
         axes[0].set_title("Largest along the rod", loc="left")
     return figure
+
+
+@jax.jit
+def _derivatives(system: System, data: Samples) -> Any:
+    """Return y_s and z at every segment's start."""
+    return jax.vmap(lambda sample: semi_discrete.derivatives(system, start_point(system, sample)))(data)

@@ -25,11 +25,11 @@ from knode_cosserat.learning.fit import fit as fit_states
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import PARTS, Passive, passive
 from knode_cosserat.learning.residual import Nothing
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 

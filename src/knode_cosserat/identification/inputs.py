@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.identification.misfit import RecordingData
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.trajectory import Trajectory
 
 #: time from row to row of recordings (s)

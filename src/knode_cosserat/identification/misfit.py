@@ -14,7 +14,6 @@ from jaxtyping import Float
 
 from knode_cosserat.identification.model import Model, ParametrisedRobot
 from knode_cosserat.identification.steps import stepped, steps_per_row, time_scheme
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rotation import conjugate, quaternion_product, since_first
@@ -23,6 +22,7 @@ from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.places import Places, places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
+from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.sensitivity import (
     SystemMoves,
     TangentState,

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from knode_cosserat.learning.explain import explain
     from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
     from knode_cosserat.learning.residual import Residual
-    from knode_cosserat.learning.samples import DataError
     from knode_cosserat.learning.training.checkpoint import CheckpointError
     from knode_cosserat.learning.training.runs import FitError
+    from knode_cosserat.solvers.segments import DataError
 
 __all__ = [
     "KNODE",
@@ -57,7 +57,7 @@ make_lazy(
         "knode_cosserat.learning.explain": "explain",
         "knode_cosserat.learning.knode": "KNODE ModelFileError load_model",
         "knode_cosserat.learning.residual": "Residual",
-        "knode_cosserat.learning.samples": "DataError",
+        "knode_cosserat.solvers.segments": "DataError",
         "knode_cosserat.learning.training.checkpoint": "CheckpointError",
         "knode_cosserat.learning.training.runs": "FitError",
     },

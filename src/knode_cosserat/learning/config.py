@@ -19,32 +19,18 @@ class ConfigError(KnodeCosseratError, ValueError):
     code = "fit-config"
 
 
-# accepted values
+# accepted values: their description, and a test that returns the value, or None if it is not accepted
+
+_Allowed = tuple[str, Callable[[Any], Any]]
 
 
-@dataclasses.dataclass(frozen=True)
-class _Allowed:
-    """Accepted values of an option: a description, and a test that returns the value, or None if invalid."""
-
-    words: str
-    test: Callable[[Any], Any]
-
-    def __call__(self, name: str, value: Any) -> Any:
-        accepted = self.test(value)
-        if accepted is None:
-            raise ConfigError(f"{name} is {reprlib.repr(value)}; allowed is {self.words}")
-        return accepted
+def _whole(low: int, high: int = 10_000_000) -> _Allowed:
+    return f"a whole number from {low} to {high}", lambda x: int(x) if _is_whole(x, low, high) else None
 
 
 def _is_whole(value: Any, low: int, high: float) -> bool:
     whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
     return whole and low <= int(value) <= high
-
-
-def _whole(low: int, high: int = 10_000_000) -> _Allowed:
-    return _Allowed(
-        f"a whole number from {low} to {high}", lambda x: int(x) if _is_whole(x, low, high) else None
-    )
 
 
 def _number(low: float, high: float, *, above: bool = False) -> _Allowed:
@@ -53,16 +39,12 @@ def _number(low: float, high: float, *, above: bool = False) -> _Allowed:
             return None
         return float(value) if (low < value if above else low <= value) and value <= high else None
 
-    return _Allowed(f"a number {'above' if above else 'from'} {low:g} up to {high:g}", test)
+    return f"a number {'above' if above else 'from'} {low:g} up to {high:g}", test
 
 
 def _choice(*names: str) -> _Allowed:
     words = ", ".join(f'"{name}"' for name in names)
-    return _Allowed(words, lambda x: x if isinstance(x, str) and x in names else None)
-
-
-def _flag() -> _Allowed:
-    return _Allowed("true or false", lambda x: x if isinstance(x, bool) else None)
+    return words, lambda x: x if isinstance(x, str) and x in names else None
 
 
 def _several(words: str, test: Callable[[Any], bool]) -> _Allowed:
@@ -71,12 +53,16 @@ def _several(words: str, test: Callable[[Any], bool]) -> _Allowed:
         good = parts and len(set(map(str, parts))) == len(parts) and all(test(part) for part in parts)
         return tuple(part if isinstance(part, str) else int(part) for part in parts) if good else None
 
-    return _Allowed(words, tested)
+    return words, tested
 
 
 def _option(default: Any, allowed: _Allowed, *, none: str = "") -> Any:
     """Return a dataclass field with its accepted values; `none` is the meaning of None, if accepted."""
     return dataclasses.field(default=default, metadata={"allowed": allowed, "none": none})
+
+
+def _flag(default: bool) -> Any:
+    return _option(default, ("true or false", lambda x: x if isinstance(x, bool) else None))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,17 +71,20 @@ class Options:
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            allowed, none = field.metadata.get("allowed"), field.metadata.get("none")
+            (words, test), none = field.metadata["allowed"], field.metadata["none"]
             value = getattr(self, field.name)
-            if allowed is None or (none and value is None):
+            if none and value is None:
                 continue
-            if none:
-                allowed = dataclasses.replace(allowed, words=f"{allowed.words}, or None: {none}")
-            object.__setattr__(self, field.name, allowed(f"{type(self).__name__}.{field.name}", value))
+            accepted = test(value)
+            if accepted is None:
+                words = f"{words}, or None: {none}" if none else words
+                name = f"{type(self).__name__}.{field.name}"
+                raise ConfigError(f"{name} is {reprlib.repr(value)}; allowed is {words}")
+            object.__setattr__(self, field.name, accepted)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
-        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        values = dataclasses.asdict(self)
         return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
     @classmethod
@@ -126,9 +115,9 @@ class StructuredOptions(Options):
     kind: ClassVar[str] = "structured"
 
     #: if true, nonlinear functions (powers, saturating) are tried where the linear ones leave a remainder
-    curved: bool = _option(True, _flag())
+    curved: bool = _flag(True)
     #: if true, the seed draws random row weights (Bayesian bootstrap), so that seeds vary as new data would
-    resample: bool = _option(False, _flag())
+    resample: bool = _flag(False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -139,13 +128,13 @@ class NetworkOptions(Options):
 
     hidden: int = _option(512, _whole(1, 100_000))
     #: if true, ʰy and ʰz are inputs too
-    history: bool = _option(False, _flag())
+    history: bool = _flag(False)
     #: if true, the weights are kept nonnegative
-    convex: bool = _option(True, _flag())
+    convex: bool = _flag(True)
     #: if true, inputs and outputs are standardised by the statistics of the data
-    standardised: bool = _option(False, _flag())
+    standardised: bool = _flag(False)
     #: if true, the correction of an orientation's quaternion turns it and leaves its length as it is
-    unit_quaternions: bool = _option(False, _flag())
+    unit_quaternions: bool = _flag(False)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -181,8 +170,6 @@ class Training(Options):
     loss: Literal["paper", "standardised"] = _option("paper", _choice("paper", "standardised"))
     #: decoupled weight decay (AdamW), for weights but not for biases
     weight_decay: float = _option(0.0, _number(0.0, 10.0))
-    #: stabilising noise, drawn anew in every epoch, relative to the standard deviation of each number
-    noise: float = _option(0.0, _number(0.0, 10.0))
     #: noise added once, before training, to all numbers of y and z in their own units, as in the paper's
     #: training on recordings
     data_noise: float = _option(0.0, _number(0.0, 10.0))
@@ -213,8 +200,6 @@ class RolloutTraining(Options):
     )
     #: number of simulated rows
     horizon: int | None = _option(None, _whole(1), none="all rows")
-    #: row to start from, with its full state
-    first_row: int | None = _option(None, _whole(0), none="the model at rest, at time 0")
     #: gradient clipping: largest norm of the gradient
     clip: float = _option(1.0, _number(0.0, 1e12, above=True))
     #: largest number of consecutive halvings of a step after which the simulation fails
@@ -287,14 +272,13 @@ class FitConfig:
         hidden: int = 128,
         epochs: int = 2000,
         history: bool = False,
-        noise: float = 0.0,
         weight_decay: float = 0.3,
     ) -> Self:
         """Return settings of an unconstrained network with standardised inputs and outputs, all nodes."""
         return cls(
             NetworkOptions(hidden=hidden, history=history, convex=False, standardised=True),
             Training(
-                epochs=epochs, learning_rate=3e-3, schedule="cosine", loss="standardised", noise=noise,
+                epochs=epochs, learning_rate=3e-3, schedule="cosine", loss="standardised",
                 weight_decay=weight_decay,
             ),
             seed=seed,
@@ -324,29 +308,26 @@ class FitConfig:
         """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
         parts = _checked_keys("FitConfig", values, [field.name for field in dataclasses.fields(cls)])
         if "residual" in parts:
-            parts["residual"] = _residual(parts["residual"])
-        for name, kind in (("segments", Training), ("rollouts", RolloutTraining)):
+            kinds = {kind.kind: kind for kind in _PARTS["residual"]}
+            options = dict(parts["residual"]) if isinstance(parts["residual"], dict) else {}
+            kind = options.pop("kind", None)
+            if kind not in kinds:
+                raise ConfigError(
+                    f"FitConfig.residual has the kind {reprlib.repr(kind)}; allowed is {', '.join(kinds)}"
+                )
+            parts["residual"] = kinds[kind].from_dict(options)
+        for name in ("segments", "rollouts"):
             if parts.get(name) is not None:
-                parts[name] = kind.from_dict(parts[name])
+                parts[name] = _PARTS[name][0].from_dict(parts[name])
         return cls(**parts)
 
 
 #: accepted types of the parts of a `FitConfig`
-_PARTS: dict[str, tuple[type, ...]] = {
+_PARTS: dict[str, tuple[Any, ...]] = {
     "residual": (StructuredOptions, NetworkOptions, PassiveOptions),
     "segments": (Training,),
     "rollouts": (RolloutTraining,),
 }
-
-
-def _residual(values: Any) -> Any:
-    kinds = {kind.kind: kind for kind in (StructuredOptions, NetworkOptions, PassiveOptions)}
-    kind = values.get("kind") if isinstance(values, dict) else None
-    if kind not in kinds:
-        raise ConfigError(
-            f"FitConfig.residual has the kind {reprlib.repr(kind)}; allowed is {', '.join(kinds)}"
-        )
-    return kinds[kind].from_dict({key: value for key, value in values.items() if key != "kind"})
 
 
 def _checked_seed(seed: Any) -> int | tuple[int, ...]:

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
-from jaxtyping import Float
 
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import Samples, samples, start_of
-from knode_cosserat.learning.structured.expansion import Expansion, Term
-from knode_cosserat.learning.structured.residual import Structured, ambient_layout, loaded, material_layout
+from knode_cosserat.learning.structured.residual import (
+    Expansion,
+    Structured,
+    Term,
+    ambient_layout,
+    loaded,
+    material_layout,
+)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
-from knode_cosserat.trajectory import Trajectory
 
 
 class ExplainedTerm(NamedTuple):
@@ -101,52 +101,12 @@ def _axis(size: int, i: int) -> str:
 
 
 def _function(term: Term, axis: int, expansion: Expansion) -> str:
-    x = f"{term.name}{_axis(term.size, axis)}"
-    if term.form == "linear":
-        return x
-    if term.form == "square":
-        return f"|{x}| {x}"
-    if term.form == "cube":
-        return f"{x}³"
-    if term.form == "square_norm":
-        return f"|{term.name}| {x}"
-    if term.form == "cube_norm":
-        return f"|{term.name}|² {x}"
-    reach = float(expansion.scales[term.scale] / expansion.slopes[term.slope])
-    if term.form == "saturating":
-        return f"{reach:.4g} tanh({x} / {reach:.4g})"
-    return f"{x} / √(1 + |{term.name}|² / {reach:.4g}²)"
-
-
-class Added(NamedTuple):
-    """Derivatives without and with a residual at the states of a trajectory, at every segment's start."""
-
-    time: Float[np.ndarray, " T"]
-    #: y_s and z of the nominal model alone, and of the whole model
-    knowledge: tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]
-    model: tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]
-
-
-def added(model: KNODE, trajectory: Trajectory) -> Added:
-    """Return y_s and z at a trajectory's states, without the residual (of any kind) and with it.
-
-    Raises:
-        DataError: the trajectory does not fit the model.
-    """
-    data = samples(model.knowledge, [trajectory]).segments
-    rows = np.unique(data.origin[:, 1])
-    both = [
-        tuple(np.asarray(part).reshape(len(rows), -1, part.shape[-1]) for part in _derivatives(system, data))
-        for system in (model.knowledge, model)
-    ]
-    return Added(np.asarray(trajectory.time)[rows], both[0], both[1])  # type: ignore[arg-type]
-
-
-@jax.jit
-def _derivatives(system: System, data: Samples) -> Any:
-    def one(sample: Samples) -> Any:
-        history = unpacked_history(system, sample.c0, sample.history[0])
-        s = start_of(system, sample.place)
-        return semi_discrete.derivatives(system, Point(s, sample.t, sample.y, sample.control, history))
-
-    return jax.vmap(one)(data)
+    x, norm = f"{term.name}{_axis(term.size, axis)}", f"|{term.name}|"
+    scale = 0.0
+    if term.slope >= 0:
+        scale = float(expansion.scales[term.scale] / expansion.slopes[term.slope])
+    return {
+        "linear": x, "square": f"|{x}| {x}", "cube": f"{x}³", "square_norm": f"{norm} {x}",
+        "cube_norm": f"{norm}² {x}", "saturating": f"{scale:.4g} tanh({x} / {scale:.4g})",
+        "saturating_norm": f"{x} / √(1 + {norm}² / {scale:.4g}²)",
+    }[term.form]  # fmt: skip

@@ -7,6 +7,7 @@ import datetime
 import logging
 import sys
 import time
+import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -17,26 +18,25 @@ import numpy as np
 from knode_cosserat._files.writing import package_version
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
-from knode_cosserat.learning.gain import rollout_errors
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
-from knode_cosserat.learning.samples import Dataset, samples, settings_of, strand_samples
-from knode_cosserat.learning.structured.closed_form import residuals_of
+from knode_cosserat.learning.structured.fit import residuals_of
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
-from knode_cosserat.learning.training.descent import standardised
-from knode_cosserat.learning.training.progress import ProgressMonitor
+from knode_cosserat.learning.training.descent import SegmentRun, standardised
 from knode_cosserat.learning.training.rollouts import (
+    RolloutRun,
     TrajectoryBatches,
     held_out_batches,
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError, Run, run_all
-from knode_cosserat.learning.training.stages import RolloutRun, SegmentRun
+from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, Run, run_all
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
-from knode_cosserat.solvers.history import coefficient_table
+from knode_cosserat.solvers.segments import Dataset, samples, strand_samples
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
@@ -46,6 +46,10 @@ BEST = FitConfig()
 #: hidden units times samples of all seeds up to which the seeds share one vectorised program on a CPU; larger
 #: fits run in parallel on all cores (measured, five of the paper's networks: 1.9 s on two cores, not 4 s)
 SHARED = 20_000
+#: part of the nominal model's error below which a gain is reported as little
+LITTLE = 0.2
+#: errors below this are those of the solver
+SOLVED = 1e-8
 
 
 def fit(
@@ -83,7 +87,7 @@ def fit(
         step), "versions", "date" and "seconds". Each stage of gradient training, "segments" and "rollouts",
         has the "loss" before every step, the "learning_rate", and the "held_out_error" (step, m) at every
         check. The final "held_out_error" (m) is that of the model. "rollout_errors" are those of the nominal
-        model and of the model, if they were verified (`RolloutErrors`).
+        model and of the model, if they were verified (`rollout_errors`).
 
     Raises:
         DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
@@ -94,34 +98,36 @@ def fit(
     began = time.perf_counter()
     _check(knowledge, config, held_out, checkpoint_every)
     trajectories, held_out = _listed("trajectories", trajectories), _listed("held_out", held_out)
-    first = _first(knowledge, trajectories, config)
-    given = _Given(knowledge, trajectories, config, first.dataset, held_out_batches(knowledge, held_out))
+    dataset = _samples(knowledge, trajectories, config)
+    initial = _initial(knowledge, trajectories, config, dataset)
+    data = _Data(knowledge, trajectories, config, dataset, held_out_batches(knowledge, held_out))
     kept = None
     if checkpoint is not None:
         kept = Checkpoints(checkpoint, Identity.of(knowledge, trajectories, held_out, config))
-    learned = dict(zip(config.seeds, first.residuals, strict=True))
+    learned = dict(zip(config.seeds, initial, strict=True))
     histories: dict[int, dict[str, Any]] = {seed: {} for seed in config.seeds}
     with ProgressMonitor(progress, log_dir) as watch:
         for stage in (_segment_runs, _rollout_runs):
-            runs = stage(given, learned)
+            runs = stage(data, learned)
             if not runs:
                 continue
             run_all(runs, kept, checkpoint_every, watch)
             for run in runs:
                 learned |= dict(zip(run.seeds, run.residuals(), strict=True))
                 for seed in run.seeds:
-                    histories[seed][run.stage] = run.history(seed)
+                    histories[seed][run.stage] = run.report(seed)
     facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
     if verify is None:
         verify = not type(knowledge.nominal).__module__.startswith("knode_cosserat.")
     models = []
     for seed, residual in learned.items():
         own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
-        if given.held_out is not None:
-            own["held_out_error"] = tip_error(KNODE(knowledge, residual), given.held_out)
+        if data.held_out is not None:
+            own["held_out_error"] = tip_error(KNODE(knowledge, residual), data.held_out)
         if verify:
-            errors = rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
-            own["rollout_errors"] = list(errors)
+            own["rollout_errors"] = list(
+                rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
+            )
         own["seconds"] = time.perf_counter() - began
         models.append(KNODE(knowledge, residual, About(own), trained))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)
@@ -159,14 +165,7 @@ def _listed(name: str, given: Any) -> list[Trajectory]:
     return list(given)
 
 
-class _First(NamedTuple):
-    """Initial data of training: the samples, if they are needed, and a residual for each seed."""
-
-    dataset: Dataset | None
-    residuals: list[Residual]
-
-
-class _Given(NamedTuple):
+class _Data(NamedTuple):
     """Data shared by the stages of training."""
 
     knowledge: System
@@ -176,32 +175,38 @@ class _Given(NamedTuple):
     held_out: TrajectoryBatches | None
 
 
-def _first(knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig) -> _First:
-    options, dataset = config.residual, None
-    if config.segments is not None or (isinstance(options, NetworkOptions) and options.standardised):
-        nodes = None if config.segments is None else config.segments.nodes
-        noise = 0.0 if config.segments is None else config.segments.data_noise
-        noisy = [_noisy(each, noise, k) for k, each in enumerate(trajectories)]
-        dataset = strand_samples(knowledge, samples(knowledge, noisy, nodes))
+def _samples(knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig) -> Dataset | None:
+    """Return the samples of training, if it needs them."""
+    options, training = config.residual, config.segments
+    if training is None and not (
+        isinstance(options, NetworkOptions) and (options.standardised or options.history)
+    ):
+        return None
+    if training is not None and training.data_noise:
+        trajectories = [_noisy(one, training.data_noise, k) for k, one in enumerate(trajectories)]
+    nodes = None if training is None else training.nodes
+    return strand_samples(knowledge, samples(knowledge, trajectories, nodes))
+
+
+def _initial(
+    knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig, dataset: Any
+) -> list[Residual]:
+    """Return the residual of each seed before gradient training."""
+    options, strand = config.residual, knowledge.strand
     if isinstance(options, NetworkOptions):
-        c0 = None
-        if options.history and trajectories:
-            first = trajectories[0]
-            c0 = coefficient_table(settings_of(first), first.dt)[-1].flat[0]
-        keys = map(jax.random.key, config.seeds)
-        networks = [network(knowledge.strand, options, key, c0) for key in keys]
-        if options.standardised and dataset is not None:
-            networks = [standardised(net, knowledge.strand, dataset) for net in networks]
-        return _First(dataset, list(networks))
+        # of a row in the midst of a motion
+        c0 = dataset.tips.c0[-1] if options.history else None
+        networks = [network(strand, options, jax.random.key(seed), c0) for seed in config.seeds]
+        return [standardised(net, strand, dataset) if options.standardised else net for net in networks]
     if isinstance(options, PassiveOptions):
-        controls = np.concatenate([np.asarray(each.control) for each in trajectories])
-        return _First(dataset, [passive(knowledge, controls, seed, options.hidden) for seed in config.seeds])
-    return _First(dataset, list(residuals_of(knowledge, trajectories, options, config.seeds)))
+        controls = np.concatenate([np.asarray(one.control) for one in trajectories])
+        return [passive(knowledge, controls, seed, options.hidden) for seed in config.seeds]
+    return list(residuals_of(knowledge, trajectories, options, config.seeds))
 
 
 def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
     """Return a trajectory with noise, the same for all seeds, which differ in initial weights."""
-    if size == 0.0 or not isinstance(trajectory, Trajectory):
+    if not isinstance(trajectory, Trajectory):
         return trajectory
     rng = np.random.default_rng(number)
     y, z = (
@@ -210,7 +215,7 @@ def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
     return dataclasses.replace(trajectory, y=y, z=z)
 
 
-def _segment_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:
+def _segment_runs(given: _Data, learned: dict[int, Residual]) -> list[Run]:
     training = given.config.segments
     if training is None:
         return []
@@ -231,7 +236,7 @@ def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
     return [(seed,) for seed in config.seeds]
 
 
-def _rollout_runs(given: _Given, learned: dict[int, Residual]) -> list[Run]:
+def _rollout_runs(given: _Data, learned: dict[int, Residual]) -> list[Run]:
     options = given.config.rollouts
     if options is None:
         return []
@@ -261,3 +266,42 @@ def _facts(
         },
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
     }
+
+
+# gain of a model over the nominal one
+
+
+def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> tuple[float, float]:
+    """Return the errors of both simulations of a trajectory; warn of failures and of a small gain.
+
+    They are the root mean squares of y's errors in natural units, of simulations from the trajectory's first
+    rows; infinite if a step of the simulation is not solved.
+    """
+    first = 1 if trajectory.time[0] == 0.0 else min(3, len(trajectory.time) - 1)
+    settings = trajectory.settings or Settings()
+    scale, errors = np.asarray(nominal.scales().y), []
+    for system in (nominal, model):
+        with warnings.catch_warnings():
+            # the grid is that of the training data
+            warnings.simplefilter("ignore")
+            found = simulate(
+                system, np.asarray(trajectory.control)[first:], trajectory.dt, time=settings.time or "bdf2",
+                space=settings.space, start=settings.start, initial=trajectory[:first], on_failure="return",
+            )  # fmt: skip
+        apart = (np.asarray(found.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
+        errors.append(float(np.sqrt(np.mean(apart**2))) if found.all_valid else float("inf"))
+    if np.isinf(errors[1]):
+        warnings.warn(
+            "the fitted model cannot be simulated over its first training trajectory: a step has no "
+            "solution. Use another residual, more trajectories, or less noise",
+            stacklevel=3,
+        )
+    elif errors[1] > (1.0 - LITTLE) * max(errors[0], SOLVED):
+        warnings.warn(
+            "the fit gained little: over its first training trajectory the model's error is "
+            f"{100.0 * errors[1] / max(errors[0], SOLVED):.3g} % of the nominal model's. Its residual may "
+            "not have the missing effect, or the error is in the length, the base or the tip, which it "
+            "leaves alone",
+            stacklevel=3,
+        )
+    return errors[0], errors[1]

@@ -10,6 +10,7 @@ text, None, other modules and dataclasses, and lists, tuples and dictionaries of
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Iterable
 from pathlib import Path
@@ -27,10 +28,9 @@ from knode_cosserat.io import container
 from knode_cosserat.io.container import ContainerError
 from knode_cosserat.learning.passive import Passive, Sizes
 from knode_cosserat.learning.residual import Network, Nothing, Residual
-from knode_cosserat.learning.structured.expansion import Expansion, Term
-from knode_cosserat.learning.structured.residual import Load, Structured
+from knode_cosserat.learning.structured.residual import Expansion, Load, Structured, Term
 from knode_cosserat.rods import robot_file
-from knode_cosserat.rods.system import Correction, System, is_traced, unknown_count
+from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import Wrapped
 from knode_cosserat.solvers import semi_discrete, space, time
@@ -95,18 +95,24 @@ class KNODE(Wrapped):
         """Nominal model with the residual's parameter changes."""
         return self.residual.adapted(self.knowledge)
 
-    @property
-    def correction(self) -> Correction:
-        """The adapted nominal model and its residual (paper eq. 7, KNODE model); several strands share it."""
-        return Correction(self.adapted, self.residual)
+    def constitutive(self, s: Any, t: Any, y: Float[Any, " y"], y_t: Any, control: Any) -> Any:
+        """Return the nominal model's law of z with the residual's terms."""
+        return self.residual.constitutive(self.adapted, s, t, y, y_t, control)
 
-    # a residual is not of the general form
-    constitutive = System.constitutive
-    balance = System.balance
+    def balance(self, s: Any, t: Any, y: Float[Any, " y"], y_t: Any, z: Any, z_t: Any, control: Any) -> Any:
+        """Return the nominal model's balance along the rod with the residual's loads."""
+        return self.residual.balance(self.adapted, s, t, y, y_t, z, z_t, control)
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, with the learned residual."""
         return self.residual.tip(self.adapted, t, control, y, y_t)
+
+    @property
+    def corrections(self) -> tuple[Any, ...]:
+        """Corrections of [y_s; z]: the nominal model's, then the residual's (paper eq. 7, KNODE model)."""
+        knowledge, correction = self.adapted, self.residual.correction
+        own = () if correction is None else (functools.partial(correction, knowledge),)
+        return (*knowledge.corrections, *own)
 
     def coefficients(self) -> dict[str, Any]:
         """Return the numbers in which the residual is linear; `replace` knows them as "residual.NAME"."""

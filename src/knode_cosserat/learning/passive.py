@@ -24,8 +24,8 @@ control, and x̄ the mean of x,
 
 M is symmetric, with eigenvalues within ±`LOGARITHM`; d and g are nonnegative. w and v are drawn once and kept
 fixed. Few numbers are learned, and the residual is linear in them near zero. W is quadratic in u, so that no
-additional equation has to be solved: the nominal model receives another stiffness and damping at each point,
-and a reduced moment.
+additional equation has to be solved: the law of u has another stiffness, damping and stress. A Maxwell branch
+keeps its ratio to the stiffness.
 """
 
 from __future__ import annotations
@@ -39,10 +39,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
+from knode_cosserat.rods.law import InternalState, MaterialLaw, StressedLaw
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import Point
 
 #: moment of one tendon at its typical tension, for learned numbers of 1, in units of κ/L
 LEVER = 0.1
@@ -88,46 +87,53 @@ class Passive(Residual):
     energy_weights: Float[Any, "units inputs"]
     damping_weights: Float[Any, "units inputs"] | None
 
-    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z of the nominal model with stiffness of W, damping D and a reduced moment."""
-        return semi_discrete.derivatives(*self._reduced(knowledge, point))
+    def constitutive(self, knowledge: System, s: Any, t: Any, y: Any, y_t: Any, control: Any) -> Any:
+        """Return the law with the stiffness and the moment of W, and the damping D.
 
-    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
-        """Return z of the nominal model with stiffness of W, damping D and a reduced moment."""
-        return semi_discrete.strains(*self._reduced(knowledge, point))
+        Raises:
+            TypeError: the nominal law is no `MaterialLaw`.
+        """
+        rest = knowledge.z_layout.get(knowledge.observed.unstressed(s, control), "u")
+        stiffness, damping, moment = self.terms(knowledge, s, y, control)
 
-    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
-        """Return y_s of that nominal model at strains z."""
-        return semi_discrete.rates(*self._reduced(knowledge, point), z)
+        def changed(law: Any) -> Any:
+            if isinstance(law, StressedLaw):
+                return law._replace(law=changed(law.law))
+            if isinstance(law, InternalState):
+                return InternalState(law.evolutions, lambda internal: changed(law.law(internal)))
+            if not isinstance(law, MaterialLaw):
+                raise TypeError(
+                    f"{type(knowledge.nominal).__name__} states its law as a {type(law).__name__}; a passive "
+                    "residual is a term of a MaterialLaw"
+                )
+            u = law.strains["u"]
+            stress = u.stress + dot(stiffness, rest) - moment
+            branch = u.branch
+            if branch is not None:
+                ratio = branch.stiffness[0, 0] / u.stiffness[0, 0]
+                branch = branch._replace(stiffness=branch.stiffness + ratio * stiffness)
+            u = u._replace(
+                stiffness=u.stiffness + stiffness, damping=u.damping + damping, stress=stress, branch=branch
+            )
+            return law._replace(strains={**law.strains, "u": u})
 
-    def law_residual(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
-        """Return the residual of the law of that nominal model at z."""
-        return semi_discrete.law_residual(*self._reduced(knowledge, point), z)
+        return changed(knowledge.constitutive(s, t, y, y_t, control))
 
-    def _reduced(self, knowledge: System, point: Point) -> tuple[System, Point]:
-        """Return the changed nominal model, and the point with the moment that it carries."""
-        s, _, y, control, _ = point
-        changed, moment = self.changed(knowledge, s, y, control)
-        layout = knowledge.y_layout
-        carried = dot(rotation_matrix(layout.get(y, "h")), moment)
-        where = layout.slice("m")
-        y = jnp.concatenate([y[: where.start], y[where] - carried, y[where.stop :]])
-        return changed, point._replace(y=y)
-
-    def changed(
+    def terms(
         self, knowledge: System, s: Any, y: Float[Any, " y"], control: Any
-    ) -> tuple[System, Float[Any, "3"]]:
-        """Return the nominal model with the stiffness and damping at a point, and κ b/L (N m)."""
-        rod: Any = knowledge.nominal
-        L, kappa = knowledge.length, _least(rod.Kbt)
+    ) -> tuple[Float[Any, "3 3"], Float[Any, "3 3"], Float[Any, "3"]]:
+        """Return the stiffness κ S (N m²), the damping D (N m² s) and the moment κ b/L (N m) at a point."""
+        L, kappa = knowledge.length, _least(knowledge.nominal.Kbt)  # type: ignore[attr-defined]
         sigma, x = 2.0 * s / L - 1.0, jnp.asarray(control) / self.sizes.control
         S, b = self.spring(sigma, x)
-        added = self.damped(self._seen(knowledge, y), sigma, x)
-        changed = knowledge.replace(
-            bending_stiffness=rod.Kbt + kappa * jnp.zeros((3, 3)).at[:2, :2].set(S),
-            bending_damping=rod.bending_damping + added * np.diag([1.0, 1.0, 0.0]),
-        )
-        return changed, kappa / L * jnp.concatenate([b, jnp.zeros(1)])
+        stiffness = kappa * jnp.zeros((3, 3)).at[:2, :2].set(S)
+        damping = self.damped(self._seen(knowledge, y), sigma, x) * np.diag([1.0, 1.0, 0.0])
+        factors = knowledge.observed.law_factors(s, control)
+        if factors is not None:
+            # the section's, as for the rod itself
+            first, second = (knowledge.z_layout.get(factor, "u") for factor in factors)
+            stiffness, damping = stiffness * first, damping * second
+        return stiffness, damping, kappa / L * jnp.concatenate([b, jnp.zeros(1)])
 
     def spring(self, sigma: Any, x: Float[Any, " c"]) -> tuple[Float[Any, "2 2"], Float[Any, "2"]]:
         """Return S = exp M - 1 and b of W L²/κ = ½ e·S e + b·e."""

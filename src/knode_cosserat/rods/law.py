@@ -1,9 +1,10 @@
 """Constitutive laws at one point of a rod, stated in time: they contain rates, and no time scheme.
 
-A system states its law in one of three forms (`System.constitutive`):
+A system states its law in one of these forms (`System.constitutive`):
 
     LinearLaw     C z + D z_t = f2, the general class
     MaterialLaw   K ε + B ε_t + … = σ for each strain ε of z, and laws of evolution for internal variables
+    StressedLaw   one of these, with another stress of all of z and z_t
     an array      z itself, if it depends on no rate of z
 """
 
@@ -127,3 +128,13 @@ class InternalState(NamedTuple):
 
     evolutions: dict[str, Evolution]
     law: Callable[[Fields], MaterialLaw]
+
+
+class StressedLaw(NamedTuple):
+    """A law with another stress: (residual of the law) + stress(z, z_t) = 0."""
+
+    law: Any
+    #: stress (z,) of z and z_t, in the units of the law's rows
+    stress: Callable[[Any, Any], Float[Any, " z"]]
+    #: True if the stress is linear
+    linear: bool = False

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
-from knode_cosserat.rods.law import InternalState, MaterialLaw
+from knode_cosserat.rods.law import InternalState, MaterialLaw, StressedLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import (
     ParameterError,
@@ -34,13 +35,6 @@ from knode_cosserat.rods.paths import with_value
 FEWEST_NODES, MOST_NODES = 2, 10_000
 
 
-class Correction(NamedTuple):
-    """A learned correction of y_s and z (`learning.residual.Residual`), and the system that it corrects."""
-
-    system: System
-    residual: Any
-
-
 class Scales(NamedTuple):
     """Natural sizes of the numbers in y (y,) and of the tip's residuals (k,), for scaled tolerances."""
 
@@ -53,8 +47,8 @@ class System(Parametrised):
 
     A subclass defines its layouts and `base_unknowns`, its `length`, `constitutive` and `balance`, `rest` and
     `tip`; most define `base` and `scales` too, and `mixed` where B is zero. All other members have defaults:
-    `cuts` and `jump` for discontinuities, `strand` and `strands` for several rods, `correction` and `nominal`
-    for learned residuals, and the aspects `ends`, `drawing` and `observed`.
+    `cuts` and `jump` for discontinuities, `strand` and `strands` for several rods, `corrections` and
+    `nominal` for learned residuals, and the aspects `ends`, `drawing` and `observed`.
 
     Its numeric parameters are leaves of a JAX pytree: one compiled program serves all their values, batches,
     and derivatives.
@@ -95,7 +89,7 @@ class System(Parametrised):
 
     def constitutive(
         self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
-    ) -> tuple[Any, Any, Any] | MaterialLaw | InternalState | Float[Any, " z"]:
+    ) -> tuple[Any, Any, Any] | MaterialLaw | InternalState | StressedLaw | Float[Any, " z"]:
         """Return C (z, z), D (z, z) and f2 (z,) of C z + D z_t = f2, at arclength s (m) and time t (s).
 
         A law of another form is a `MaterialLaw`. If z depends on no rate of z, it may be returned itself.
@@ -113,9 +107,12 @@ class System(Parametrised):
         raise NotImplementedError(f"{type(self).__name__} gives no `balance`")
 
     @property
-    def correction(self) -> Correction | None:
-        """Learned correction of y_s and z; None without one."""
-        return None
+    def corrections(self) -> tuple[Callable[..., Float[Any, " y+z"]], ...]:
+        """Functions of (s, t, y, y_t, z, z_t, control) whose values add to [y_s; z] in turn; none by default.
+
+        z is that of `constitutive`, then with the corrections before.
+        """
+        return ()
 
     # the two ends, and rest
 

@@ -19,7 +19,7 @@ FACTS = (
     "drawing",
 )  # fmt: skip
 #: members of `Wrapped.adapted`: equations and other members that depend on parameters
-EQUATIONS = ("constitutive", "balance", "correction", "base", "scales", "observed")
+EQUATIONS = ("constitutive", "balance", "corrections", "base", "scales", "observed")
 
 
 class Wrapped(System):

@@ -22,10 +22,11 @@ from knode_cosserat.rods.law import (
     LinearLaw,
     MaterialLaw,
     MaxwellBranch,
+    StressedLaw,
     Viscoelastic,
 )
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rotation import dot, inverse
+from knode_cosserat.rotation import dot, inverse, small_inverse
 
 #: largest number of Newton corrections of a strain with a nonlinear moment; the result is then NaN
 CORRECTIONS = 60
@@ -33,6 +34,8 @@ CORRECTIONS = 60
 PARTS = 0.5 ** np.arange(8)
 #: a strain is solved when the residual is at most this fraction of the law's terms
 TOLERANCE = 1e-12
+#: the same numbers for a law with another stress, and the fraction above which it counts as unsolved
+STRESSED_CORRECTIONS, STRESSED_PARTS, UNSOLVED = 40, np.array([1.0, 0.5, 0.2, 0.05]), 1e-8
 
 
 class DiscreteLaw(Protocol):
@@ -57,6 +60,8 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
 
     The rod's `length` (m) is a scale: curvatures are found to a small part of 1 / length.
     """
+    if isinstance(law, StressedLaw):
+        return StressedStep(discrete_law(law.law, layout, c0, hz, length), law, c0, hz)
     if isinstance(law, InternalState):
         internal = {
             name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
@@ -257,3 +262,72 @@ def _searched(law: NonlinearStrain) -> Float[Any, "3"]:
 
     strain, _ = jax.lax.while_loop(continues, corrected, (start, 0))
     return jnp.where(unsolved(strain), jnp.nan, strain)
+
+
+@dataclasses.dataclass(frozen=True)
+class StressedStep:
+    """A law with another stress of all of z and z_t = c0 z + ʰz."""
+
+    nominal: DiscreteLaw
+    law: StressedLaw
+    c0: Any
+    hz: Float[Any, " z"]
+
+    @property
+    def linear(self) -> bool:
+        """True if both parts are."""
+        return self.nominal.linear and self.law.linear
+
+    def _stress(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        return self.law.stress(z, self.c0 * z + self.hz)
+
+    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return the residual of the law without the stress, plus the stress."""
+        return self.nominal.residual(z) + self._stress(z)
+
+    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
+        """Return the derivative of the residual by z."""
+        return jax.jacfwd(self.residual)(jnp.zeros_like(z) if self.linear else z)
+
+    def strains(self) -> Float[Any, " z"]:
+        """Return z, by corrections of the strains without the stress; NaN if Newton's method fails."""
+        z0 = self.nominal.strains()
+        if self.linear:
+            # one correction is exact, and its matrix is the same along the whole rod
+            return z0 - dot(small_inverse(self.matrix(z0)), self._stress(z0))
+        M = self.nominal.matrix(z0)
+
+        def residual(z: Any) -> Any:
+            own = dot(M, z - z0) if self.nominal.linear else self.nominal.residual(z)
+            return own + self._stress(z)
+
+        # the search is not differentiated: one more correction has the derivatives of the implicit function
+        function, constants = jax.closure_convert(residual, z0)
+        constants = jax.lax.stop_gradient(constants)
+        size = jnp.sum(jnp.abs(M) * (2.0 * jnp.abs(z0) + 1e-3), axis=1)
+        z = _stressed_strains(
+            lambda z: function(z, *constants), *jax.lax.stop_gradient((z0, TOLERANCE * size))
+        )
+        return z - dot(jax.lax.stop_gradient(small_inverse(jax.jacfwd(residual)(z))), residual(z))
+
+
+def _stressed_strains(residual: Any, z0: Float[Any, " z"], tolerance: Float[Any, " z"]) -> Float[Any, " z"]:
+    """Return the root by Newton's method with a line search: with friction, full corrections overshoot."""
+
+    def size(values: Any) -> Any:
+        return jnp.max(jnp.abs(values) / tolerance)
+
+    def continues(state: Any) -> Any:
+        count, _, values = state
+        return (size(values) > 1.0) & (count < STRESSED_CORRECTIONS)
+
+    def corrected(state: Any) -> Any:
+        count, z, values = state
+        tried = z - STRESSED_PARTS[:, None] * dot(small_inverse(jax.jacfwd(residual)(z)), values)
+        results = jax.vmap(residual)(tried)
+        sizes = jax.vmap(size)(results)
+        best = jnp.argmin(jnp.where(jnp.isfinite(sizes), sizes, jnp.inf))
+        return count + 1, tried[best], results[best]
+
+    _, z, values = jax.lax.while_loop(continues, corrected, (0, z0, residual(z0)))
+    return jnp.where(size(values) <= UNSOLVED / TOLERANCE, z, jnp.nan)

@@ -6,8 +6,7 @@ turns them into an ordinary differential equation along the rod:
     z   = (C + c0 D)⁻¹ (f2 - D ʰz)
     y_s = (A + c0 B)⁻¹ (f1 - B ʰy_s)
 
-`discrete_law` has the constitutive laws. A system with a learned `correction` is corrected here, since a
-correction applies to y_s and z.
+`discrete_law` has the constitutive laws. The `corrections` of a system add to y_s and z.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands
-from knode_cosserat.rods.system import Correction, System
-from knode_cosserat.solvers.discrete_law import DiscreteLaw, StatedStrains, discrete_law
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.discrete_law import DiscreteLaw, discrete_law
 
 
 class History(NamedTuple):
@@ -57,6 +56,10 @@ class Point(NamedTuple):
         """Rate of y in time."""
         return self.history.y_t(self.y)
 
+    def z_t(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return the rate of z in time."""
+        return self.history.z_t(z)
+
 
 def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> History:
     """Return the history at one point from its packed record: y, z and, if B is not zero, y_s."""
@@ -81,11 +84,9 @@ def derivatives(system: System, point: Point) -> tuple[Float[Any, " y"], Float[A
     """Return y_s and z at one point (paper eq. 4, semi-discretised general class)."""
     if system.strands > 1:
         return _of_strands(system, point)
-    correction = system.correction
-    if correction is not None:
-        return correction.residual.derivatives(correction.system, point)
-    z = strains(system, point)
-    return rates(system, point, z), z
+    z = law(system, point).strains()
+    added, corrected = _corrected(system, point, z)
+    return _balanced(system, point, z) + added, corrected
 
 
 def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
@@ -99,12 +100,18 @@ def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[A
     return y_s.reshape(-1), z.reshape(-1)
 
 
+def _corrected(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
+    """Return the corrections of y_s, and z with its corrections, from z of the law."""
+    added: Any = 0.0
+    for correction in system.corrections:
+        both = correction(point.s, point.t, point.y, point.y_t, z, point.z_t(z), point.control)
+        size = point.y.shape[0]
+        added, z = added + both[:size], z + both[size:]
+    return added, z
+
+
 def law(system: System, point: Point) -> DiscreteLaw:
-    """Return the law of z at one point."""
-    if system.strands > 1:
-        return StatedStrains(_of_strands(system, point)[1])
-    if system.correction is not None:
-        return _CorrectedLaw(system.correction, point)
+    """Return the law of z at one point of a strand, before corrections of z."""
     s, t, y, control, history = point
     stated = system.constitutive(s, t, y, point.y_t, control)
     return discrete_law(stated, system.z_layout, history.c0, history.z, system.length)
@@ -112,11 +119,14 @@ def law(system: System, point: Point) -> DiscreteLaw:
 
 def strains(system: System, point: Point) -> Float[Any, " z"]:
     """Return z at one point."""
-    return law(system, point).strains()
+    if system.strands > 1:
+        return _of_strands(system, point)[1]
+    return _corrected(system, point, law(system, point).strains())[1]
 
 
 def law_residual(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
-    """Return the residual of the law of z, at any z."""
+    """Return the residual of the law of z, at any z less the corrections of the law's z."""
+    _, z = _uncorrected(system, point, z)
     return law(system, point).residual(z)
 
 
@@ -124,9 +134,21 @@ def rates(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]
     """Return y_s at one point, for any z; with several strands, for the z of their law."""
     if system.strands > 1:
         return _of_strands(system, point)[0]
-    correction = system.correction
-    if correction is not None:
-        return correction.residual.rates(correction.system, point, z)
+    added, z = _uncorrected(system, point, z)
+    return _balanced(system, point, z) + added
+
+
+def _uncorrected(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
+    """Return the corrections of y_s at the law's z, and a given z less the corrections there."""
+    if not system.corrections:
+        return 0.0, z
+    of_law = law(system, point).strains()
+    added, corrected = _corrected(system, point, of_law)
+    return added, z - (corrected - of_law)
+
+
+def _balanced(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
+    """Return y_s of the balance."""
     balance = _balance(system, point, z)
     if not isinstance(balance, tuple):
         return balance
@@ -136,8 +158,6 @@ def rates(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]
 
 def load_matrix(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, "y y"]:
     """Return A + c0 B, whose inverse turns loads into rates."""
-    if system.correction is not None:
-        return load_matrix(system.correction.system, point, z)
     balance = _balance(system, point, z)
     if not isinstance(balance, tuple):
         return jnp.eye(system.y_layout.size)
@@ -146,28 +166,8 @@ def load_matrix(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any,
 
 
 def _balance(system: System, point: Point, z: Float[Any, " z"]) -> Any:
-    s, t, y, control, history = point
-    return system.balance(s, t, y, point.y_t, z, history.z_t(z), control)
-
-
-class _CorrectedLaw(NamedTuple):
-    """Law of z with a learned correction."""
-
-    correction: Correction
-    point: Point
-
-    @property
-    def linear(self) -> bool:
-        return law(self.correction.system, self.point).linear and bool(self.correction.residual.linear)
-
-    def strains(self) -> Float[Any, " z"]:
-        return self.correction.residual.strains(self.correction.system, self.point)
-
-    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
-        return self.correction.residual.law_residual(self.correction.system, self.point, z)
-
-    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
-        return jax.jacfwd(self.residual)(z)
+    s, t, y, control, _ = point
+    return system.balance(s, t, y, point.y_t, z, point.z_t(z), control)
 
 
 # the ends, and jumps

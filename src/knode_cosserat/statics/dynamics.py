@@ -145,7 +145,7 @@ def _step(
         m = min(COLUMNS, count - k)
         d_past = np.zeros((2, count, m))
         d_past[0, k : k + m] = np.eye(m)
-        d_past = d_past.reshape(2, *records.shape, m)
+        d_past = d_past.reshape(settings.memory, *records.shape, m)
         state = TangentState(past, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
         changes = SystemMoves(None, np.zeros((0, m))), np.zeros((1, system.control_size, m))
         after, _ = tangent_time_loop(

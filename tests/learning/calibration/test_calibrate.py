@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -18,8 +19,7 @@ from knode_cosserat.learning.calibration.unknowns import (
 )
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.samples import DataError
-from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 from tests.learning.calibration.data import DT, FOUR, ROBOT, noisy, sines
 
@@ -133,9 +133,9 @@ class Stiffer(Residual):
 
     factor: Any
 
-    def derivatives(self, knowledge, point):
-        z = 1.0 + self.factor * (semi_discrete.strains(knowledge, point) - 1.0)
-        return semi_discrete.rates(knowledge, point, z), z
+    def constitutive(self, knowledge, s, t, y, y_t, control):
+        C, D, f2 = knowledge.constitutive(s, t, y, y_t, control)
+        return C / self.factor, D / self.factor, f2 + (1.0 / self.factor - 1.0) * jnp.sum(C, axis=1)
 
 
 def test_the_knowledge_of_a_model(swings):

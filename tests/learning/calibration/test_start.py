@@ -16,7 +16,7 @@ from knode_cosserat.learning.calibration.unknowns import (
     values,
     with_numbers,
 )
-from knode_cosserat.learning.samples import DataError
+from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, Bar, pulled
 
 

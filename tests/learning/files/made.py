@@ -13,11 +13,16 @@ import pytest
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.learning.knode import KNODE, About, ModelFileError
-from knode_cosserat.learning.residual import Network, Residual, input_size
-from knode_cosserat.learning.structured.expansion import CURVED, expansion
-from knode_cosserat.learning.structured.residual import Load, Structured, ambient_layout, loaded
+from knode_cosserat.learning.residual import Network, Residual, input_layout
+from knode_cosserat.learning.structured.residual import (
+    CURVED,
+    Load,
+    Structured,
+    ambient_layout,
+    expansion,
+    loaded,
+)
 from knode_cosserat.rods.system import unknown_count
-from knode_cosserat.solvers import semi_discrete
 
 # few nodes and tensions that no other test has: what is compiled here was not compiled before
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5, youngs_modulus=10e9 / 3)
@@ -33,7 +38,7 @@ def fails(*parts, error=ModelFileError):
 
 def network(knowledge=ROBOT, hidden=3, seed=0, number=np.asarray):
     rng = np.random.default_rng(seed)
-    inputs, outputs = input_size(knowledge, False), knowledge.y_layout.size + knowledge.z_layout.size
+    inputs, outputs = input_layout(knowledge, False).size, knowledge.y_layout.size + knowledge.z_layout.size
     shapes = ((hidden, inputs), (hidden,), (outputs, hidden), (outputs,), (inputs,))
     arrays = [number(1e-2 * rng.normal(size=shape)) for shape in shapes]
     return Network(*arrays, number(np.ones(inputs)), number(np.full(outputs, 1e-2)))
@@ -90,10 +95,9 @@ class Pull(Residual):
         )
         self.options = (Odd("x"), (1.5, None, True), "text")
 
-    def derivatives(self, knowledge, point):
-        y_s, z = semi_discrete.derivatives(knowledge, point)
-        where = knowledge.y_layout.slice("n")
-        return y_s.at[where].add(self.force), z
+    def balance(self, knowledge, s, t, y, y_t, z, z_t, control):
+        y_s = knowledge.balance(s, t, y, y_t, z, z_t, control)
+        return y_s.at[knowledge.y_layout.slice("n")].add(self.force)
 
 
 def models():

@@ -160,9 +160,9 @@ def test_an_array_in_the_place_of_a_constant_spoils_nothing():
     """JAX compares models with those that it has seen; an array there has no truth value."""
 
     def edit(header):
-        header["residual"]["fields"]["history"] = {"$array": "residual.input_biases"}
+        header["residual"]["fields"]["convex"] = {"$array": "residual.input_biases"}
 
-    with fails("residual.history is a ndarray; allowed is a constant"):
+    with fails("residual.convex is a ndarray; allowed is a constant"):
         decoded_model(forged(BYTES, edit), "model")
     assert type(decoded_model(BYTES, "model")) is KNODE
 
@@ -220,7 +220,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         {"input_mean": np.zeros((28, 28))},
         {"input_biases": "text"},
         {"output_scale": None},
-        {"history": True},
+        {"c0": np.zeros(())},
     ):
         with fails("model: residual and knowledge do not fit together: "):
             KNODE(ROBOT, dataclasses.replace(net, **change)).save(tmp_path / "model")

@@ -203,7 +203,7 @@ def test_a_class_that_has_changed_since(tmp_path):
     fields = {"force": Any, "bag": Any, "options": Any}
 
     def changed(**more):
-        body = {"__annotations__": {**fields, **more}, "derivatives": Pull.derivatives}
+        body = {"__annotations__": {**fields, **more}, "balance": Pull.balance}
         body["options"] = eqx.field(static=True)
         return body
 

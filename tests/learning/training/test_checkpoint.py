@@ -23,17 +23,17 @@ from knode_cosserat.learning.training.checkpoint import (
     data_hash,
     unpacked,
 )
-from knode_cosserat.learning.training.progress import ProgressMonitor
+from knode_cosserat.learning.training.runs import ProgressMonitor
 from tests.learning.bar import BAR, WRONG, pulled
 
 ROOT = Path(__file__).parents[3]
 CONFIG = FitConfig(
     NetworkOptions(hidden=5, convex=False, standardised=True),
-    Training(epochs=130, noise=0.01, schedule="plateau", patience=5),
+    Training(epochs=130, schedule="plateau", patience=5),
 )
 LONG = FitConfig(
     NetworkOptions(hidden=5, convex=False, standardised=True),
-    Training(epochs=4000, noise=0.01, learning_rate=3e-3),
+    Training(epochs=4000, learning_rate=3e-3),
     RolloutTraining(updates=150, horizon=6),
     seed=(2, 5),
 )

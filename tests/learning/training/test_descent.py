@@ -15,16 +15,15 @@ import knode_cosserat as kc
 from knode_cosserat.learning.config import NetworkOptions, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, network
-from knode_cosserat.learning.samples import predict_segment, samples
 from knode_cosserat.learning.training import descent as program
-from knode_cosserat.learning.training.losses import (
+from knode_cosserat.learning.training.descent import (
     PaperLoss,
     StandardisedLoss,
     euler_angles,
     loss_for,
     value_scales,
 )
-from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.segments import predict_segment, samples
 from tests.learning.bar import BAR, WRONG, pulled
 
 DT = 0.05
@@ -194,9 +193,6 @@ class Nested(Residual):
     inner: Inner
     parts: tuple
 
-    def derivatives(self, knowledge, point):
-        raise NotImplementedError
-
 
 def test_weights_are_what_is_not_fixed():
     tree = Nested(Inner(jnp.ones(2), jnp.ones(3)), (jnp.ones(4), jnp.arange(5), {"a": np.ones(6)}))
@@ -217,7 +213,7 @@ def trained(data, net, training, seeds=(0,)):
     """Weights and losses (epochs, seeds) after all epochs; `net` one for each seed."""
     nets = net if isinstance(net, list) else [net]
     given = program.prepared(WRONG, nets[0], data, training)
-    state = program.started(nets, training, seeds)
+    state = program.started(nets, training)
     losses, rates = [], []
     while state.epoch < training.epochs:
         done = int(state.epoch)
@@ -269,7 +265,7 @@ def test_plateau_is_that_of_pytorch():
     rng = np.random.default_rng(0)
     losses = np.minimum.accumulate(rng.exponential(size=400)) * (1.0 + 1e-4 * rng.normal(size=400))
     losses[100:200] = losses[100] * (1.0 - 0.9e-4) ** np.arange(100)  # falls, but never by enough at once
-    numbers = program.Numbers(0.01, 7, 0.5, 0.0, 0.0, 400.0)
+    numbers = program.Numbers(0.01, 7, 0.5, 0.0, 400.0)
     rate, best, bad = 0.01, np.inf, 0
     state = (jnp.array(0.01), jnp.array(np.inf), jnp.array(0))
     step = jax.jit(program.plateau)
@@ -315,15 +311,13 @@ class Softer(Residual):
 
     softness: jax.Array
 
-    def derivatives(self, knowledge, point):
-        softer = dataclasses.replace(knowledge, stiffness=knowledge.stiffness / (1.0 + self.softness))
-        return semi_discrete.derivatives(softer, point)
+    def adapted(self, knowledge):
+        return dataclasses.replace(knowledge, stiffness=knowledge.stiffness / (1.0 + self.softness))
 
 
-@pytest.mark.parametrize("noise", [0.0, 0.05])
-def test_a_seed_does_not_depend_on_those_beside_it(bars, noise):
+def test_a_seed_does_not_depend_on_those_beside_it(bars):
     data = samples(WRONG, bars)
-    training = Training(epochs=30, noise=noise)
+    training = Training(epochs=30)
     together, losses, _ = trained(data, [small(seed) for seed in (3, 4, 5)], training, (3, 4, 5))
     alone, loss, _ = trained(data, small(4), training, (4,))
     other, _, _ = trained(data, small(5), training, (5,))
@@ -331,23 +325,6 @@ def test_a_seed_does_not_depend_on_those_beside_it(bars, noise):
     for beside, found, another in zip(*map(jax.tree.leaves, (together, alone, other)), strict=True):
         np.testing.assert_allclose(beside[1], found[0], rtol=1e-7, atol=1e-10)
         assert not np.allclose(found, another, rtol=1e-2)
-
-
-def test_noise_is_new_in_every_epoch_and_of_the_asked_size(bars):
-    """With weights that stay (no rate to speak of) only the noise moves the loss."""
-    data = samples(WRONG, bars)
-    net = program.standardised(small(), WRONG, data)
-    losses = {}
-    for noise in (0.0, 1e-4, 2e-4):
-        training = Training(epochs=40, learning_rate=1e-300, schedule="constant", noise=noise)
-        losses[noise] = trained(data, net, training)[1][:, 0]
-    assert np.ptp(losses[0.0]) == 0.0
-    assert len(np.unique(losses[1e-4])) == 40
-    small_effect, double = (np.std(losses[noise]) for noise in (1e-4, 2e-4))
-    np.testing.assert_allclose(double / small_effect, 2.0, rtol=0.2)
-    again = Training(epochs=40, learning_rate=1e-300, schedule="constant", noise=1e-4)
-    np.testing.assert_array_equal(trained(data, net, again)[1][:, 0], losses[1e-4])
-    assert not np.allclose(trained(data, net, again, (1,))[1][:, 0], losses[1e-4], rtol=1e-9)
 
 
 def test_first_weights_are_as_the_paper_has_them(robot):

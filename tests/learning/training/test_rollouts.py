@@ -12,11 +12,9 @@ from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTra
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.learning.training import rollouts as module
-from knode_cosserat.learning.training.descent import split
-from knode_cosserat.learning.training.progress import ProgressMonitor
 from knode_cosserat.learning.training.rollouts import (
+    RolloutRun,
     RolloutTargets,
     held_out_batches,
     loss_and_slope,
@@ -24,8 +22,8 @@ from knode_cosserat.learning.training.rollouts import (
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError
-from knode_cosserat.learning.training.stages import RolloutRun
+from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, split
+from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled
 
 OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)
@@ -52,29 +50,23 @@ def evaluated(along, residual):
     return loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
 
 
-def only_positions(trajectory, after=0):
-    """A trajectory of which nothing but the positions is known, from a row on."""
-    y, z = np.array(trajectory.y), np.array(trajectory.z)
-    y[after:, :, 1:] = np.nan
-    z[after:] = np.nan
-    return dataclasses.replace(trajectory, y=y, z=z)
+def only_positions(trajectory):
+    """A trajectory of which nothing but the positions is known."""
+    y = np.array(trajectory.y)
+    y[:, :, 1:] = np.nan
+    return dataclasses.replace(trajectory, y=y, z=np.full(np.shape(trajectory.z), np.nan))
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("first", [None, pytest.param(4, marks=pytest.mark.campaign)])
-def test_loss_and_gradient(bars, residual, first):
+def test_loss_and_gradient(bars, residual):
     """The loss by `simulate` and NumPy; the gradient by finite differences along random directions."""
-    options = dataclasses.replace(OPTIONS, first_row=first)
-    known = [only_positions(each, 0 if first is None else first + 1) for each in bars]
-    along = trajectory_batches(WRONG, known, options)
+    along = trajectory_batches(WRONG, [only_positions(each) for each in bars], OPTIONS)
     value, slope = evaluated(along, residual)
-    start, model, squares, paths = first or 0, KNODE(WRONG, residual), [], []
+    model, squares, paths = KNODE(WRONG, residual), [], []
     for each in bars:
-        rows = slice(start + 1, start + 7)
-        initial = None if first is None else each[: first + 1]
-        found = kc.simulate(model, each.control[rows], each.dt, initial=initial)
-        squares.append((found.part("p")[1:] - each.part("p")[rows]) ** 2)
-        paths.append(each.part("p")[start : start + 7])
+        found = kc.simulate(model, each.control[1:7], each.dt)
+        squares.append((found.part("p")[1:] - each.part("p")[1:7]) ** 2)
+        paths.append(each.part("p")[:7])
     spread = np.mean([np.var(path, axis=0) for path in paths])
     np.testing.assert_allclose(value, np.mean(squares) / spread, rtol=1e-6)
     assert value > 1e-3
@@ -213,8 +205,8 @@ def test_a_step_that_cannot_be_simulated_is_halved(bars, residual, monkeypatch):
     # Adam's first steps are of the size of the rate: 0.3, then 0.6 is beyond the wall, 0.45 is not, …
     first = [calls[0] for calls in bumpy.calls]
     np.testing.assert_allclose(first[:4], [0.0, 0.3, 0.6, 0.45], atol=0.02)
-    assert np.all(np.isfinite(run.history(0)["loss"])) and np.all(np.diff(run.history(0)["loss"]) < 0.0)
-    rates = run.history(0)["learning_rate"]
+    assert np.all(np.isfinite(run.report(0)["loss"])) and np.all(np.diff(run.report(0)["loss"]) < 0.0)
+    rates = run.report(0)["learning_rate"]
     assert rates[0] == 0.3 and rates[1] == 0.15 and rates[2] < 0.15
     found = run.residuals()[0].input_biases
     assert np.all(found < 0.5) and np.all(found > 0.45)
@@ -276,9 +268,7 @@ def test_what_is_compared_must_be_known(bars):
             {"compared": ("p", "n")},
             "trajectory 0 has y that is not finite in row 0",
         ),
-        ([only_positions(bars[0])], {"first_row": 3}, "trajectory 0 has y that is not finite in row 0"),
-        ([bars[0], moving], {}, "trajectory 1 begins at 1 s, in motion.*first_row"),
-        ([bars[0], bars[1][:6]], {"first_row": 5}, "trajectory 1 has 6 rows; after row 5"),
+        ([bars[0], moving], {}, "trajectory 1 begins at 1 s, in motion"),
         (["x"], {}, "trajectory 0 is a str"),
         ([], {}, "there are no trajectories"),
     ]
@@ -286,10 +276,3 @@ def test_what_is_compared_must_be_known(bars):
         with pytest.raises(DataError, match=words) as caught:
             trajectory_batches(WRONG, trajectories, RolloutTraining(**options))
         assert "\n" not in str(caught.value)
-
-
-def test_a_motion_is_gone_on_with(bars):
-    """From a row of the truth the true bar makes no error, with the history of the rows before."""
-    along = trajectory_batches(BAR, bars, RolloutTraining(first_row=7))
-    found = module.simulated_batch(BAR, along.parts[0], along.settings, along.dt)
-    np.testing.assert_allclose(found, along.parts[0].y, atol=1e-7)

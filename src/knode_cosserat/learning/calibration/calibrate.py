@@ -28,9 +28,9 @@ from knode_cosserat.learning.calibration.unknowns import (
     values,
     with_numbers,
 )
-from knode_cosserat.learning.samples import DataError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 

@@ -22,7 +22,9 @@ from knode_cosserat.learning.calibration.unknowns import (
     with_coordinates,
     with_numbers,
 )
-from knode_cosserat.learning.samples import (
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.solvers.segments import (
     Dataset,
     Samples,
     TipSamples,
@@ -30,8 +32,6 @@ from knode_cosserat.learning.samples import (
     rows_are_states,
     samples,
 )
-from knode_cosserat.rods.system import System
-from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import unpacked_history
 from knode_cosserat.trajectory import Trajectory
 

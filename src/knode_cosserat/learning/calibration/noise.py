@@ -17,9 +17,9 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.calibration.misfit import LinearisedMisfit, SegmentMisfit, by_group
 from knode_cosserat.learning.calibration.search import Misfit, SearchResult
-from knode_cosserat.learning.discontinuities import slopes_of
-from knode_cosserat.learning.samples import histories, segment_history
 from knode_cosserat.solvers.replay import replayed_settings
+from knode_cosserat.solvers.segments import histories, segment_history
+from knode_cosserat.solvers.slopes import slopes_of
 from knode_cosserat.trajectory import Trajectory
 
 #: relative accuracy of the numbers of states

@@ -27,7 +27,6 @@ from knode_cosserat.learning.calibration.unknowns import (
     with_coordinates,
     with_numbers,
 )
-from knode_cosserat.learning.samples import DataError, samples
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.rotation import since_first
@@ -44,6 +43,7 @@ from knode_cosserat.solvers.places import Places, places_at, positions_at, quate
 from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, run_one
+from knode_cosserat.solvers.segments import DataError, samples
 from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme

@@ -6,13 +6,24 @@
     tip         + the same two at the tip: a mass, a weight, a force that the nominal model lacks
 
 The geometry (p_s, h_s, q_s, ω_s of a rod) stays exact, and the laws do not depend on the time step. Each of
-σ, f and g is an `Expansion`. A system's layouts mark loads and rotated fields (`Field.frame`,
-`Field.load`); without such marks every rate may be corrected.
+σ, f and g is an `Expansion`: a weighted sum of simple functions of named vectors. A system's layouts mark
+loads and rotated fields (`Field.frame`, `Field.load`); without such marks every rate may be corrected.
+
+The functions of a vector x with the natural size σ, with k a learned slope:
+
+    linear       x/σ
+    square       |xᵢ| xᵢ/σ², cube   xᵢ³/σ³, for each component (drag)
+    square_norm  |x| x/σ², cube_norm   |x|² x/σ³ (stiffening or softening, in any direction)
+    saturating   tanh(k xᵢ/σ)/k, for several k (friction): a hidden layer with units along the axes
+    saturating_norm   x/σ / √(1 + k²|x|²/σ²), the same in any direction
+
+They are few enough for least squares, and each can be interpreted.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, NamedTuple
+from collections.abc import Sequence
+from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
 import jax
@@ -21,18 +32,132 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.structured.expansion import Expansion
+from knode_cosserat.rods.law import StressedLaw
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.system import System, with_length_factor
-from knode_cosserat.rotation import dot, rotation_matrix, small_inverse
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import Point
+from knode_cosserat.rotation import dot, rotation_matrix
 
-#: largest number of Newton corrections of a nonlinear law, and the damping factors tried for each
-MOST_CORRECTIONS = 40
-PARTS = np.array([1.0, 0.5, 0.2, 0.05])
-#: a law is solved when its residual is this part of its terms
-SOLVED = 1e-12
+LINEAR = ("linear",)
+#: functions of velocities: drag is linear or quadratic
+DRAG = ("linear", "square")
+CURVED = ("linear", "square", "cube", "square_norm", "cube_norm", "saturating", "saturating_norm")
+#: initial slopes of the saturating functions
+SLOPES = (0.5, 1.0, 2.0, 4.0)
+
+
+class Term(NamedTuple):
+    """One function of one vector: the vector's position, and the indices of its scale and slope."""
+
+    name: str
+    start: int
+    stop: int
+    form: str
+    scale: int
+    slope: int = -1
+
+    @property
+    def size(self) -> int:
+        """Number of values of the function."""
+        return self.stop - self.start
+
+
+class Expansion(eqx.Module):
+    """Weighted sum (outputs,) of functions of a packed vector (x,)."""
+
+    #: attributes that gradient training does not change
+    fixed: ClassVar[tuple[str, ...]] = ("scales",)
+
+    #: (outputs, 1 + features), the constant first
+    weights: Float[Any, "outputs features"]
+    scales: Float[Any, " vectors"]
+    slopes: Float[Any, " slopes"]
+    terms: tuple[Term, ...] = eqx.field(static=True)
+
+    def features(self, x: Float[Any, " x"]) -> Float[Any, " features"]:
+        """Return the functions' values, the constant first."""
+        values = [
+            _value(term, x[term.start : term.stop] / self.scales[term.scale], self.slopes)
+            for term in self.terms
+        ]
+        return jnp.concatenate([jnp.ones(1), *values])
+
+    def __call__(self, x: Float[Any, " x"]) -> Float[Any, " outputs"]:
+        """Return the weighted sum."""
+        if self.curved:
+            return self.weights @ self.features(x)
+        # one small product of numbers that do not change along the rod
+        sizes = [jnp.full(term.size, self.scales[term.scale]) for term in self.terms]
+        weights = self.weights / jnp.concatenate([jnp.ones(1), *sizes])
+        inputs = jnp.concatenate([x[:0], *(x[term.start : term.stop] for term in self.terms)])
+        return weights[:, 0] + weights[:, 1:] @ inputs
+
+    @property
+    def curved(self) -> bool:
+        """True if there are nonlinear functions."""
+        return any(term.form != "linear" for term in self.terms)
+
+    def columns(self) -> list[tuple[Term, range]]:
+        """Return each term with the indices of its features."""
+        starts = np.cumsum([1, *(term.size for term in self.terms)]).tolist()
+        return [
+            (term, range(start, start + term.size)) for term, start in zip(self.terms, starts, strict=False)
+        ]
+
+    def columns_of(self, other: Self) -> list[int]:
+        """Return the indices here of another expansion's features; its terms must be a subset."""
+        columns = {(term.name, term.form, term.slope): where for term, where in self.columns()}
+        return [0, *(k for term in other.terms for k in columns[term.name, term.form, term.slope])]
+
+    def pruned(self) -> Self | None:
+        """Return a copy without terms of zero weight; None if all weights are zero."""
+        used = np.any(np.asarray(self.weights) != 0.0, axis=0)
+        if not used.any():
+            return None
+        keep = [(term, where) for term, where in self.columns() if used[list(where)].any()]
+        columns = [0, *(k for _, where in keep for k in where)]
+        return type(self)(self.weights[:, columns], self.scales, self.slopes, tuple(term for term, _ in keep))
+
+
+def _value(term: Term, x: Any, slopes: Any) -> Any:
+    if term.form == "linear":
+        return x
+    if term.form == "square":
+        return x * jnp.abs(x)
+    if term.form == "cube":
+        return x * x * x
+    if term.form == "square_norm":
+        # the square root of zero has no derivative
+        return x * jnp.sqrt(jnp.sum(x * x) + 1e-24)
+    if term.form == "cube_norm":
+        return x * jnp.sum(x * x)
+    slope = slopes[term.slope]
+    if term.form == "saturating_norm":
+        return x / jnp.sqrt(1.0 + slope**2 * jnp.sum(x * x))
+    return jnp.tanh(slope * x) / slope
+
+
+def expansion(
+    layout: Layout, values: Float[Any, "S x"], forms: dict[str, Sequence[str]], outputs: int
+) -> Expansion:
+    """Return an expansion with zero weights, scaled by the vectors' rms values in the data."""
+    terms: list[Term] = []
+    scales: list[float] = []
+    slopes: list[float] = []
+    for k, field in enumerate(layout.fields):
+        where = layout.slice(field.name)
+        rms = float(np.sqrt(np.mean(np.square(values[:, where]))))
+        scales.append(rms if rms > 0.0 else 1.0)
+        for form in forms.get(field.name, LINEAR):
+            if field.size == 1 and form.endswith("_norm"):
+                continue  # the same function as for the component
+            if not form.startswith("saturating"):
+                terms.append(Term(field.name, where.start, where.stop, form, k))
+                continue
+            for slope in SLOPES:
+                terms.append(Term(field.name, where.start, where.stop, form, k, len(slopes)))
+                slopes.append(slope)
+    count = 1 + sum(term.size for term in terms)
+    return Expansion(np.zeros((outputs, count)), np.array(scales), np.array(slopes), tuple(terms))
 
 
 class Load(eqx.Module):
@@ -47,69 +172,13 @@ class Load(eqx.Module):
         """Return the load, laid out by `layout`, in the frames of the equations."""
         total = jnp.zeros(layout.size)
         if self.material is not None:
-            total = turned_back(layout, frames, y, self.material(jnp.concatenate([observables, control])))
-        if self.ambient is not None:
-            total = total + self.ambient(control)
-        return total
-
-
-class _Law(NamedTuple):
-    """Sum of the nominal law and σ(z - z*, c0 z + ʰz), for the strains z at one point."""
-
-    stress: Expansion
-    #: derivative of the nominal law at z0; the whole law if it is linear
-    M: Float[Any, "z z"]
-    c0: Any
-    z_rest: Float[Any, " z"]
-    z0: Float[Any, " z"]
-    hz: Float[Any, " z"]
-
-    #: factors of strain and rate at the point (see `law_inputs`); None: one
-    factors: Any = None
-    #: the nominal model and its arguments, if its law is nonlinear
-    point: Any = None
-
-    def left(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
-        """Return the residual of the law."""
-        strain, rate = z - self.z_rest, self.c0 * z + self.hz
-        if self.factors is not None:
-            strain, rate = strain * self.factors[0], rate * self.factors[1]
-        return self._own(z) + self.stress(jnp.concatenate([strain, rate]))
-
-    def _own(self, z: Float[Any, " z"]) -> Any:
-        if self.point is None:
-            return dot(self.M, z - self.z0)
-        knowledge, point = self.point
-        return semi_discrete.law_residual(knowledge, point, z)
-
-
-def solved_strains(law: _Law) -> Float[Any, " z"]:
-    """Return the strains of a nonlinear law, by damped Newton's method from z0; NaN if it fails.
-
-    Each correction uses the damping factor with the least residual: with friction, laws are so steep that
-    full corrections always overshoot.
-    """
-    n = law.z0.shape[0]
-    # natural size of the law's terms, for each number
-    enough = SOLVED * jnp.sum(jnp.abs(law.M) * (jnp.abs(law.z0) + jnp.abs(law.z_rest) + 1e-3), axis=1)
-
-    def size(left: Any) -> Any:
-        return jnp.max(jnp.abs(left) / enough)
-
-    def going(state: Any) -> Any:
-        count, _, left = state
-        return (size(left) > 1.0) & (count < MOST_CORRECTIONS)
-
-    def corrected(state: Any) -> Any:
-        count, z, left = state
-        step = dot(small_inverse(jax.jacfwd(law.left)(z)), left)
-        tried = z - PARTS[:, None] * step
-        leaves = jax.vmap(law.left)(tried)
-        best = jnp.argmin(jnp.where(jnp.isfinite(jax.vmap(size)(leaves)), jax.vmap(size)(leaves), jnp.inf))
-        return count + 1, tried[best], leaves[best]
-
-    _, z, left = jax.lax.while_loop(going, corrected, (0, law.z0, law.left(law.z0)))
-    return jnp.where(size(left) <= 1e4, z, jnp.full(n, jnp.nan))
+            load = self.material(jnp.concatenate([observables, control]))
+            parts = layout.split(load)
+            total = jnp.concatenate([
+                dot(rotation_matrix(frames.get(y, field.frame)), part) if field.frame else part
+                for field, part in zip(layout.fields, parts, strict=True)
+            ])  # fmt: skip
+        return total if self.ambient is None else total + self.ambient(control)
 
 
 class Structured(Residual):
@@ -129,58 +198,31 @@ class Structured(Residual):
         """Return the nominal model with corrected length."""
         return with_length_factor(knowledge, 1.0 + self.stretch)
 
-    def derivatives(self, knowledge: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return y_s and z: strains are corrected first, then loads are added to the balance equations."""
-        z = self.strains(knowledge, point)
-        return self.rates(knowledge, point, z), z
+    def constitutive(self, knowledge: System, s: Any, t: Any, y: Any, y_t: Any, control: Any) -> Any:
+        """Return the nominal law with the learned stress."""
+        law, stress = knowledge.constitutive(s, t, y, y_t, control), self.stress
+        if stress is None:
+            return law
+        inputs = law_inputs(knowledge, s, control)
+        return StressedLaw(law, lambda z, z_t: stress(inputs(z, z_t)), not stress.curved)
 
-    def rates(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
-        """Return y_s at strains z: the nominal model's, with the learned loads."""
-        y_s = semi_discrete.rates(knowledge, point, z)
+    def balance(
+        self, knowledge: System, s: Any, t: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any
+    ) -> Any:
+        """Return the nominal balance with the learned loads."""
+        balance = knowledge.balance(s, t, y, y_t, z, z_t, control)
         if self.load is None:
-            return y_s
-        observed = self._observed(self.load, knowledge, point, z)
-        layout, inputs = loaded(knowledge), ambient_inputs(knowledge, point.control)
-        load = self.load(layout, knowledge.y_layout, point.y, observed, inputs)
-        added = jnp.zeros(point.y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
-        if knowledge.mixed:
-            added = jnp.linalg.solve(semi_discrete.load_matrix(knowledge, point, z), added)
-        return y_s + added
-
-    def strains(self, knowledge: System, point: Point) -> Float[Any, " z"]:
-        """Return z of the corrected law, the nominal one plus σ(z - z*, c0 z + ʰz), from the nominal z0."""
-        nominal = semi_discrete.law(knowledge, point)
-        z0 = nominal.strains()
-        if self.stress is None:
-            return z0
-        s, _, _, control, history = point
-        observed = knowledge.observed
-        z_rest, factors = observed.unstressed(s, control), observed.law_factors(s, control)
-        M, linear = nominal.matrix(z0), nominal.linear
-        whole = None if linear else (knowledge, point)
-        law = _Law(self.stress, M, history.c0, z_rest, z0, history.z, factors, whole)
-        if linear and not self.stress.curved:
-            # linear: one correction from z0 is exact, and its matrix is the same along the whole rod
-            n = jnp.zeros_like(z_rest)
-            inverse = small_inverse(jax.jacfwd(law._replace(z0=n, hz=n).left)(n))
-            return z0 - dot(inverse, law.left(z0))
-        # the iteration is not differentiated: at the solution one more correction changes nothing, but has
-        # the derivatives of the implicit function
-        z = solved_strains(jax.lax.stop_gradient(law))
-        inverse = jax.lax.stop_gradient(small_inverse(jax.jacfwd(law.left)(z)))
-        return z - dot(inverse, law.left(z))
-
-    def law_residual(self, knowledge: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
-        """Return the residual of the nominal law at z, plus the learned stress."""
-        left = semi_discrete.law_residual(knowledge, point, z)
-        if self.stress is None:
-            return left
-        return left + self.stress(law_inputs(knowledge, point.s, point.control, z, point.history.z_t(z)))
-
-    @property
-    def linear(self) -> bool:
-        """True if the learned stress is linear."""
-        return self.stress is None or not self.stress.curved
+            return balance
+        observed = None
+        if self.load.material is not None:
+            observed = knowledge.observed.observables(s, y, y_t, z, z_t, control)
+        layout, inputs = loaded(knowledge), ambient_inputs(knowledge, control)
+        load = self.load(layout, knowledge.y_layout, y, observed, inputs)
+        load = jnp.zeros(y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
+        if not isinstance(balance, tuple):
+            return balance + load
+        A, B, f1 = balance
+        return A, B, f1 + load
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
@@ -190,24 +232,15 @@ class Structured(Residual):
         if self.tip_load is None:
             return conditions
         observed = tip_observables(knowledge, y, y_t, control)
-        layout, inputs = knowledge.ends.layout, ambient_inputs(knowledge, control)
-        return conditions + self.tip_load(layout, knowledge.y_layout, y, observed, inputs)
-
-    @staticmethod
-    def _observed(load: Load, knowledge: System, point: Point, z: Any) -> Any:
-        if load.material is None:
-            return None
-        s, _, y, control, history = point
-        return knowledge.observed.observables(s, y, history.y_t(y), z, history.z_t(z), control)
+        inputs = ambient_inputs(knowledge, control)
+        return conditions + self.tip_load(knowledge.ends.layout, knowledge.y_layout, y, observed, inputs)
 
 
-def law_inputs(knowledge: System, s: Any, control: Any, z: Any, z_t: Any) -> Float[Any, " 2z"]:
-    """Return the inputs of stress: strain and rate, scaled by the local factors of the section."""
-    observed = knowledge.observed
-    strain, factors = z - observed.unstressed(s, control), observed.law_factors(s, control)
-    if factors is None:
-        return jnp.concatenate([strain, z_t])
-    return jnp.concatenate([strain * factors[0], z_t * factors[1]])
+def law_inputs(knowledge: System, s: Any, control: Any) -> Any:
+    """Return a function of z and z_t: the inputs of stress, scaled by the local factors of the section."""
+    rest, factors = knowledge.observed.unstressed(s, control), knowledge.observed.law_factors(s, control)
+    strain, rate = (1.0, 1.0) if factors is None else factors
+    return lambda z, z_t: jnp.concatenate([(z - rest) * strain, z_t * rate])
 
 
 def tip_observables(knowledge: System, y: Float[Any, " y"], y_t: Any, control: Any) -> Any:
@@ -223,12 +256,6 @@ def loaded(knowledge: System) -> Layout:
     return Layout(*stated) if stated else knowledge.y_layout
 
 
-def geometric(knowledge: System) -> tuple[str, ...]:
-    """Return the fields of y with geometric rates; none if no loads are marked."""
-    names = knowledge.y_layout.names
-    return tuple(name for name in names if name not in loaded(knowledge).names)
-
-
 def material_layout(knowledge: System) -> Layout:
     """Return the input layout of a material-frame load: the observables, and the ambient inputs."""
     return knowledge.observed.layout + ambient_layout(knowledge)
@@ -239,7 +266,7 @@ def ambient_layout(knowledge: System) -> Layout:
     if not knowledge.observed.has_actuation:
         return knowledge.control_layout
     size = jax.eval_shape(knowledge.observed.actuation, np.zeros(knowledge.control_size)).shape[0]
-    actuation = Field("actuation", size, "", "what of the control enters the equations")
+    actuation = Field("actuation", size, "", "part of the control that enters the equations")
     return knowledge.control_layout + Layout(actuation)
 
 
@@ -248,14 +275,3 @@ def ambient_inputs(knowledge: System, control: Any) -> Any:
     if not knowledge.observed.has_actuation:
         return control
     return jnp.concatenate([control, knowledge.observed.actuation(control)])
-
-
-def turned_back(layout: Layout, frames: Layout, y: Any, load: Any) -> Any:
-    """Return a material-frame load in the frames of the equations."""
-    parts = []
-    for field in layout.fields:
-        part = layout.get(load, field.name)
-        if field.frame:
-            part = dot(rotation_matrix(frames.get(y, field.frame)), part)
-        parts.append(part)
-    return jnp.concatenate(parts)

@@ -2,7 +2,9 @@
 
 With a scheme without stages, a network adds to the prediction of the nominal model. That prediction does not
 depend on the weights and is evaluated once; an epoch is then two matrix products and their derivatives. Other
-schemes and residuals are predicted in every epoch by `samples.predict_segment`.
+schemes and residuals are predicted in every epoch by `segments.predict_segment`.
+
+Arrays of a loss have numbers first and samples last, (numbers, S), like the outputs of a network.
 """
 
 from __future__ import annotations
@@ -16,45 +18,141 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax  # type: ignore[import-untyped]
-from jaxtyping import Float, Int, UInt32
+from jaxtyping import Float, Int
 
 from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
-from knode_cosserat.learning.samples import Dataset, Samples, end_of, predict_segment, start_of
-from knode_cosserat.learning.training.losses import Loss, field_sizes, loss_for, value_scales
+from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
+from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
+from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.semi_discrete import Point, unpacked_history
+from knode_cosserat.solvers.segments import Dataset, Samples, end_point, predict_segment, start_point
+from knode_cosserat.solvers.semi_discrete import Point
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: largest number of epochs in one call of the program
 PIECE = 50
 #: relative decrease of the best loss that counts as an improvement, as in PyTorch's ReduceLROnPlateau
 LEAST_GAIN = 1e-4
-
-ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
-
-
-# weights
-
-
-def split(residual: Residual) -> tuple[Any, Any]:
-    """Split a residual into its weights and the rest; `equinox.combine` joins them."""
-    mask = jax.tree_util.tree_map_with_path(lambda path, leaf: _is_weight(residual, path, leaf), residual)
-    return eqx.partition(residual, mask)
+#: fields of y in the paper's loss
+PAPER_FIELDS = ("p", "h", "n", "m", "q", "w")
+#: a number whose spread is below this part of its field's largest is scaled by the field's spread
+LEAST_PART = 1e-3
+#: relative variation below which a field is constant
+ROUNDING = 1e-12
+#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
+DIVERGED, NOTHING = 1e6, 1e-6
 
 
-def _is_weight(node: Any, path: Any, leaf: Any) -> bool:
-    for key in path:
-        name = getattr(key, "name", None)
-        if name in getattr(type(node), "fixed", ()):
-            return False
-        index = getattr(key, "idx", getattr(key, "key", None))
-        node = node[index] if name is None else getattr(node, name)
-    return bool(np.issubdtype(jnp.result_type(leaf), np.floating))
+# losses
+
+
+class PaperLoss(eqx.Module):
+    """The paper's loss: the sum of four mean squares, with orientations as Euler angles.
+
+    The four are positions, Euler angles, strains z, and n, m, q and ω together, all in SI units. Means are
+    over the numbers of a step and over steps, sums over trajectories.
+    """
+
+    y: Float[Any, "y S"]
+    z: Float[Any, "z S"]
+    angles: Float[Any, "3 S"]
+    weight: Float[Any, " S"]
+    layout: Layout = eqx.field(static=True)
+
+    def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
+        """Return the loss (paper eq. 8, training loss), in mixed units."""
+        p, h, *rest = (y[self.layout.slice(name)] for name in PAPER_FIELDS)
+        p_true, _, *rest_true = (self.y[self.layout.slice(name)] for name in PAPER_FIELDS)
+        squares = (
+            _mean_square(p - p_true)
+            + _mean_square(jnp.concatenate(rest) - jnp.concatenate(rest_true))
+            + _mean_square(euler_angles(h) - self.angles)
+            + _mean_square(z - self.z)
+        )
+        return jnp.sum(self.weight * squares)
+
+
+class StandardisedLoss(eqx.Module):
+    """Mean square of all errors, each over its own spread, for any system.
+
+    Errors of y are scaled by the spread of its increments over a segment, errors of z by the spread of z.
+    """
+
+    y: Float[Any, "y S"]
+    z: Float[Any, "z S"]
+    y_spread: Float[Any, " y"]
+    z_spread: Float[Any, " z"]
+    weight: Float[Any, " S"]
+
+    def __call__(self, y: Float[Any, "y S"], z: Float[Any, "z S"]) -> Float[Any, ""]:
+        """Return the loss (dimensionless)."""
+        errors = [(y - self.y) / self.y_spread[:, None], (z - self.z) / self.z_spread[:, None]]
+        return jnp.sum(self.weight * _mean_square(jnp.concatenate(errors)))
+
+
+def loss_for(name: str, knowledge: System, segments: Samples) -> PaperLoss | StandardisedLoss:
+    """Return the "paper" loss if y has the fields for it, otherwise the "standardised" loss."""
+    y, z = segments.y_next.T, segments.z.T
+    if name == "paper" and set(PAPER_FIELDS) <= set(knowledge.y_layout.names):
+        angles = np.asarray(_angles(y[knowledge.y_layout.slice("h")]))
+        return PaperLoss(y, z, angles, segments.weight, knowledge.y_layout)
+    increments = segments.y_next - segments.y
+    return StandardisedLoss(
+        y,
+        z,
+        value_scales(increments, field_sizes(knowledge.y_layout)),
+        value_scales(segments.z, field_sizes(knowledge.z_layout)),
+        segments.weight,
+    )
+
+
+def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
+    """Return angles (rad) of quaternions (scalar first, any length) about the fixed z, then y, then x axis.
+
+    The order is SciPy's "zyx". If the second angle is ±π/2 they are not unique, and have no derivative.
+    """
+    R = jax.vmap(rotation_matrix, in_axes=-1, out_axes=-1)(h)
+    return jnp.stack(
+        [
+            jnp.arctan2(-R[0, 1], R[0, 0]),
+            jnp.arcsin(jnp.clip(R[0, 2], -1.0, 1.0)),
+            jnp.arctan2(-R[1, 2], R[2, 2]),
+        ]
+    )
+
+
+_angles = jax.jit(euler_angles)
+
+
+def field_sizes(layout: Layout) -> list[int]:
+    """Return the size of each field."""
+    return [field.size for field in layout.fields]
+
+
+def value_scales(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.ndarray, " x"]:
+    """Return the standard deviation of every number, never zero, as a scale of errors, noise and inputs.
+
+    Args:
+        values: one row a sample.
+        fields: size of each field, in order. A number that hardly varies, such as a force normal to the plane
+            of motion, gets a part of its field's largest; the numbers of a constant field get one.
+    """
+    found = []
+    for part in np.split(np.asarray(values), np.cumsum(fields)[:-1], axis=1):
+        deviation = np.std(part, axis=0)
+        largest = deviation.max(initial=0.0)
+        varies = largest > ROUNDING * max(1e-3, np.abs(part).max(initial=0.0))
+        found.append(np.maximum(deviation, LEAST_PART * largest) if varies else np.ones_like(deviation))
+    return np.concatenate(found)
+
+
+def _mean_square(errors: Float[Any, "x S"]) -> Float[Any, " S"]:
+    return jnp.mean(errors * errors, axis=0)
 
 
 # predictions of the nominal model
@@ -80,18 +178,15 @@ def nominal_predictions(
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
-    def at(s: Any, sample: Samples, y: Any, record: Any) -> Point:
-        history = unpacked_history(knowledge, sample.c0, record)
-        return Point(s, sample.t, y, sample.control, history)
-
     def inputs_at(point: Point, z: Any) -> Any:
-        return (net.inputs(knowledge, point, z) - net.input_mean) / net.input_scale
+        inputs = net.inputs(knowledge, point.y, point.y_t, z, point.z_t(z), point.control)
+        return (inputs - net.input_mean) / net.input_scale
 
     def one(sample: Samples) -> Any:
         y, z = predict_segment(knowledge, space, sample)
-        inputs = [inputs_at(at(start_of(knowledge, sample.place), sample, sample.y, sample.history[0]), z)]
+        inputs = [inputs_at(start_point(knowledge, sample), z)]
         if space.implicit:
-            end = at(end_of(knowledge, sample.place), sample, sample.y_next, sample.history[1])
+            end = end_point(knowledge, sample)
             inputs.append(inputs_at(end, semi_discrete.strains(knowledge, end)))
         return inputs, y, z
 
@@ -102,7 +197,7 @@ def nominal_predictions(
 
 
 def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
-    """Return the predictions of all samples by nominal model and network, equal to `samples.predict_segment`.
+    """Return the predictions of all samples by nominal model and network, as `segments.predict_segment`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
     epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
@@ -122,8 +217,8 @@ def _product(weights: Float[Any, "outputs hidden"], units: Float[Any, "hidden S"
     return weights @ units
 
 
-def _product_slope(given: Any, slope: Any) -> Any:
-    weights, units = given
+def _product_slope(factors: Any, slope: Any) -> Any:
+    weights, units = factors
     # the barrier forces a copy: XLA's product with a transposed matrix takes twice the time
     turned = jax.lax.optimization_barrier(weights.T)
     return slope @ units.T, turned @ slope
@@ -147,7 +242,9 @@ def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
     return dataclasses.replace(
         net,
         input_mean=jnp.asarray(inputs.mean(axis=0)),
-        input_scale=jnp.asarray(value_scales(inputs, field_sizes(input_layout(knowledge, net.history)))),
+        input_scale=jnp.asarray(
+            value_scales(inputs, field_sizes(input_layout(knowledge, net.c0 is not None)))
+        ),
         output_scale=jnp.asarray(scale),
     )
 
@@ -170,7 +267,6 @@ class Numbers(NamedTuple):
     patience: Any
     factor: Any
     weight_decay: Any
-    noise: Any
     epochs: Any
 
 
@@ -179,7 +275,6 @@ class Recipe(NamedTuple):
 
     space: SpaceScheme
     schedule: str
-    noisy: bool
 
 
 class TrainingData(NamedTuple):
@@ -189,9 +284,7 @@ class TrainingData(NamedTuple):
     rest: Any
     samples: Samples | None
     known: NominalPredictions | None
-    loss: Loss
-    y_spread: Float[Any, " y"]
-    history_spread: Float[Any, " x"]
+    loss: PaperLoss | StandardisedLoss
 
 
 class State(NamedTuple):
@@ -204,44 +297,14 @@ class State(NamedTuple):
     rate: Float[Any, " G"]
     best: Float[Any, " G"]
     waited: Int[Any, " G"]
-    key: UInt32[Any, "G 2"]
 
 
-def _loss(weights: Any, recipe: Recipe, data: TrainingData, noise: Any, key: Any) -> Any:
+def _loss(weights: Any, recipe: Recipe, data: TrainingData) -> Any:
     residual = eqx.combine(weights, data.rest)
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
-    samples: Any = data.samples
-    if recipe.noisy:
-        samples = _noisy(samples, data, noise, key)
-    if _adds(residual, recipe.space, data.knowledge):
-        return data.loss(
-            *corrected(residual, nominal_predictions(residual, data.knowledge, samples, recipe.space))
-        )
     model = KNODE(data.knowledge, residual)
-    return data.loss(*jax.vmap(lambda one: predict_segment(model, recipe.space, one), out_axes=-1)(samples))
-
-
-def _adds(residual: Residual, space: SpaceScheme, knowledge: System) -> bool:
-    """True if a prediction is the nominal model's plus a linear combination of the network's outputs."""
-    parted = grid_of(knowledge).parts.shape[1] > 1
-    return isinstance(residual, Network) and not space.formula.stages and not parted
-
-
-def _noisy(samples: Samples, data: TrainingData, noise: Any, key: Any) -> Samples:
-    """Return samples with noise in states and histories at the segments' starts; targets are unchanged."""
-    for_y, for_history = jax.random.split(key)
-    y = samples.y + noise * data.y_spread * jax.random.normal(for_y, samples.y.shape)
-    # the same along the segment: a perturbation of the whole history
-    shift = noise * data.history_spread * jax.random.normal(for_history, samples.history[:, 0].shape)
-    later = samples.later + shift[:, None, None]
-    return samples._replace(y=y, history=samples.history + shift[:, None], later=later)
-
-
-def _rate(recipe: Recipe, numbers: Numbers, epoch: Any, rate: Any) -> Any:
-    if recipe.schedule == "cosine":
-        return numbers.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers.epochs))
-    return rate
+    return data.loss(*_predicted(model, recipe.space, data.samples))
 
 
 def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
@@ -258,10 +321,11 @@ def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> t
 
 def _epoch(recipe: Recipe, numbers: Numbers, data: TrainingData, epoch: Any, of_seed: Any) -> Any:
     """Run one update of one seed: return its new state, the loss before, and the rate."""
-    weights, adam, rate, best, waited, key = of_seed
-    fresh = jax.random.fold_in(key, epoch) if recipe.noisy else None
-    loss, slope = jax.value_and_grad(_loss)(weights, recipe, data, numbers.noise, fresh)
-    now = _rate(recipe, numbers, epoch, rate)
+    weights, adam, rate, best, waited = of_seed
+    loss, slope = jax.value_and_grad(_loss)(weights, recipe, data)
+    now = rate
+    if recipe.schedule == "cosine":
+        now = numbers.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers.epochs))
     direction, adam = ADAM.update(slope, adam)
 
     def updated(weight: Any, change: Any) -> Any:
@@ -272,7 +336,7 @@ def _epoch(recipe: Recipe, numbers: Numbers, data: TrainingData, epoch: Any, of_
     weights, _ = split(eqx.combine(weights, data.rest).clamped())
     if recipe.schedule == "plateau":
         rate, best, waited = plateau(numbers, loss, rate, best, waited)
-    return (weights, adam, rate, best, waited, key), loss, now
+    return (weights, adam, rate, best, waited), loss, now
 
 
 @functools.partial(jax.jit, static_argnames="recipe")
@@ -314,30 +378,21 @@ def prepared(
     knowledge: System, residual: Residual, dataset: Dataset, training: Training
 ) -> tuple[Recipe, Numbers, TrainingData]:
     """Return the program's inputs besides its state."""
-    segments = dataset.segments
-    recipe = Recipe(dataset.space, training.schedule, training.noise > 0.0)
+    segments, space = dataset.segments, dataset.space
     numbers = Numbers(
-        training.learning_rate, training.patience, training.factor, training.weight_decay, training.noise,
+        training.learning_rate, training.patience, training.factor, training.weight_decay,
         float(training.epochs),
     )  # fmt: skip
-    _, rest = split(residual)
-    given: Any = residual
-    ready = (
-        _known(given, knowledge, segments, dataset.space)
-        if _adds(residual, dataset.space, knowledge) and not recipe.noisy
-        else None
-    )
-    per_y, per_z = field_sizes(knowledge.y_layout), field_sizes(knowledge.z_layout)
-    fields = [*per_y, *per_z, *(per_y if knowledge.mixed else [])]
-    data = TrainingData(
-        knowledge, rest, None if ready else segments, ready,
-        loss_for(training.loss, knowledge, segments),
-        value_scales(segments.y, per_y), value_scales(segments.history[:, 0], fields),
-    )  # fmt: skip
-    return recipe, numbers, jax.tree.map(jnp.asarray, data)
+    # the prediction is the nominal model's plus a linear combination of the network's outputs
+    divided = grid_of(knowledge).parts.shape[1] > 1
+    adds = isinstance(residual, Network) and not space.formula.stages and not divided
+    known = _known(residual, knowledge, segments, space) if adds else None
+    loss = loss_for(training.loss, knowledge, segments)
+    data = TrainingData(knowledge, split(residual)[1], None if adds else segments, known, loss)
+    return Recipe(space, training.schedule), numbers, jax.tree.map(jnp.asarray, data)
 
 
-def started(residuals: Sequence[Residual], training: Training, seeds: Sequence[int]) -> State:
+def started(residuals: Sequence[Residual], training: Training) -> State:
     """Return the state before the first epoch, with one residual for each seed."""
     every = [split(residual)[0] for residual in residuals]
     weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
@@ -349,5 +404,70 @@ def started(residuals: Sequence[Residual], training: Training, seeds: Sequence[i
         jnp.full(count, training.learning_rate),
         jnp.full(count, jnp.inf),
         jnp.zeros(count, dtype=int),
-        jnp.stack([jax.random.key_data(jax.random.fold_in(jax.random.key(seed), 1)) for seed in seeds]),
     )
+
+
+class SegmentRun(Run):
+    """Epochs on one-segment samples, for one seed or several in one program."""
+
+    stage = "segments"
+
+    def __init__(
+        self, knowledge: System, residuals: Sequence[Residual], dataset: Dataset, training: Training,
+        seeds: tuple[int, ...], held_out: TrajectoryBatches | None,
+    ):  # fmt: skip
+        state = started(residuals, training)
+        super().__init__(seeds, training.epochs, state, Best(state.weights, training.stop_after))
+        self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
+        self._inputs = prepared(knowledge.strand, residuals[0], dataset, training)
+
+    def compile(self) -> None:
+        """Compile the epochs' program without running one, and run one held-out rollout."""
+        run_epochs(*self._inputs, self.state, self.done)
+        if self._held_out:
+            tip_error(KNODE(self._knowledge, self._residual(0)), self._held_out)
+
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+        """Run epochs up to the next check, at most `PIECE`."""
+        first = self.done
+        stop = min(stop, first + PIECE, self.steps)
+        if self._held_out:
+            stop = min(stop, first - first % self._every + self._every)
+        state, losses, rates = run_epochs(*self._inputs, self.state, stop)
+        losses, rates = (np.asarray(values)[: stop - first] for values in (losses, rates))
+        self._require_sane(losses, state.weights)
+        self.state = state
+        self.losses = np.concatenate([self.losses, losses])
+        self.rates = np.concatenate([self.rates, rates])
+        watch.steps(self.stage, self.seeds, first, losses, rates)
+        if self._held_out and (stop % self._every == 0 or stop == self.steps):
+            models = [KNODE(self._knowledge, self._residual(k)) for k in range(len(self.seeds))]
+            errors = [tip_error(model, self._held_out) for model in models]
+            self.best.offer(stop, errors, state.weights)
+            for seed, error in zip(self.seeds, errors, strict=True):
+                watch.error(self.stage, seed, stop, error)
+
+    def _require_sane(self, losses: np.ndarray, weights: Any) -> None:
+        start = np.concatenate([self.losses, losses])[0]
+        active = self.best.stopped < 0
+        bad = ~(losses <= DIVERGED * np.maximum(start, NOTHING)) & active
+        if bad.any():
+            row, k = np.argwhere(bad)[0]
+            raise FitError(
+                f"the loss of seed {self.seeds[k]} became {losses[row, k]:.3g} in epoch {self.done + row} "
+                f"({start[k]:.3g} in the first): a smaller learning rate may help"
+            )
+        if not is_finite([np.asarray(leaf)[active] for leaf in jax.tree.leaves(weights)]):
+            raise FitError(
+                f"weights are not finite after epoch {self.done + len(losses)}: "
+                "a smaller learning rate may help"
+            )
+
+    def _residual(self, k: int) -> Residual:
+        """Return the residual of seed k with its last weights."""
+        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._inputs[2].rest)
+
+    def residuals(self) -> list[Residual]:
+        """Return residuals with the last weights, or the best if training may stop early."""
+        chosen = [self.best.chosen(k, self.state.weights) for k in range(len(self.seeds))]
+        return [eqx.combine(weights, self._inputs[2].rest) for weights in chosen]

@@ -1,4 +1,4 @@
-"""Whole simulations compared with trajectories: the loss of fine-tuning, and the held-out error.
+"""Fine-tuning through whole simulations compared with trajectories, and the held-out error.
 
 Only the compared fields of a trajectory must be known. Every solved step is differentiable by the implicit
 function theorem (`solvers.sensitivity`), so that any residual can be trained in this way.
@@ -15,34 +15,29 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
 from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.samples import DataError, samples, settings_of
+from knode_cosserat.learning.residual import Residual
+from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.segments import DataError, samples, settings_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
 #: fields compared by default, if the system has them
 POSE = ("p", "h")
-
-
-class InitialRows(NamedTuple):
-    """Rows of trajectories (B) up to the initial row of the simulations."""
-
-    time: Float[Any, "B rows"]
-    y: Float[Any, "B rows nodes y"]
-    z: Float[Any, "B rows nodes z"]
-    control: Float[Any, "B rows c"]
+#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
+DIVERGED, NOTHING = 1e6, 1e-6
 
 
 class TrajectoryBatch(NamedTuple):
     """Trajectories (B) of one length: controls and target states."""
 
-    past: InitialRows | None
     control: Float[Any, "B T c"]
     #: row 0 is the initial state of the simulations
     y: Float[Any, "B T+1 nodes y"]
@@ -68,43 +63,30 @@ def trajectory_batches(
             or is not finite where it is used.
     """
     compared = _checked_names(knowledge, options.compared)
-    first = options.first_row
     try:
-        samples(knowledge, [_relevant(knowledge, one, compared, first) for one in trajectories])
+        samples(knowledge, [_relevant(knowledge, one, compared) for one in trajectories])
     except DataError as error:
         raise DataError(f"{what}{error}") from None
     by_length: dict[int, list[TrajectoryBatch]] = {}
     for k, trajectory in enumerate(trajectories):
-        name = f"{what}trajectory {k}"
-        if first is None and float(trajectory.time[0]) != 0.0:
+        if float(trajectory.time[0]) != 0.0:
             raise DataError(
-                f"{name} begins at {float(trajectory.time[0]):g} s, in motion; simulations start at rest, at "
-                "time 0, unless RolloutTraining.first_row says where"
+                f"{what}trajectory {k} begins at {float(trajectory.time[0]):g} s, in motion; simulations "
+                "start at rest, at time 0"
             )
-        start, rows = first or 0, len(trajectory.time)
-        stop = min(rows, start + 1 + (options.horizon or rows))
-        if stop - start < 2:
-            raise DataError(f"{name} has {rows} rows; after row {start} there must be at least one more")
-        part = _course(trajectory, first, start, stop)
-        by_length.setdefault(stop, []).append(part)
+        rows = min(len(trajectory.time), 1 + (options.horizon or len(trajectory.time)))
+        y, control = (np.asarray(part, dtype=float)[:rows] for part in (trajectory.y, trajectory.control))
+        by_length.setdefault(rows, []).append(TrajectoryBatch(control[1:], y))
     joined = [jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in by_length.values()]
     settings = settings_of(trajectories[0])
     return TrajectoryBatches(tuple(joined), compared, settings, trajectories[0].dt)
 
 
-def _course(trajectory: Trajectory, first: int | None, start: int, stop: int) -> TrajectoryBatch:
-    arrays = (trajectory.time, trajectory.y, trajectory.z, trajectory.control)
-    time, y, z, control = (np.asarray(array, dtype=float) for array in arrays)
-    before = slice(0, start + 1)
-    past = None if first is None else InitialRows(time[before], y[before], z[before], control[before])
-    return TrajectoryBatch(past, control[start + 1 : stop], y[start:stop])
-
-
-def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[str, ...]:
+def _checked_names(knowledge: System, compared: tuple[str, ...] | None) -> tuple[str, ...]:
     known = knowledge.y_layout.names
     # a strand's number may follow
     pose = tuple(name for name in known if name.rstrip("0123456789") in POSE)
-    names = pose if given is None else given
+    names = pose if compared is None else compared
     for name in names:
         if name not in known:
             raise DataError(f"RolloutTraining.compared has {name!r}; y has {', '.join(known)}")
@@ -113,18 +95,15 @@ def _checked_names(knowledge: System, given: tuple[str, ...] | None) -> tuple[st
     return names
 
 
-def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...], first: int | None) -> Any:
+def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...]) -> Any:
     """Return a trajectory with zeros in all unused values, which may be unknown."""
     if not isinstance(trajectory, Trajectory) or np.ndim(trajectory.y) != 3:
         return trajectory
-    y, z = np.array(trajectory.y, dtype=float), np.array(trajectory.z, dtype=float)
-    after = slice(0 if first is None else first + 1, None)
+    y = np.array(trajectory.y, dtype=float)
     if y.shape[-1] == knowledge.y_layout.size:
-        others = [name for name in knowledge.y_layout.names if name not in names]
-        if others:
-            y[after, :, knowledge.y_layout.indices(tuple(others))] = 0.0
-    z[after] = 0.0
-    return dataclasses.replace(trajectory, y=y, z=z)
+        unused = tuple(name for name in knowledge.y_layout.names if name not in names)
+        y[..., knowledge.y_layout.indices(unused)] = 0.0
+    return dataclasses.replace(trajectory, y=y, z=np.zeros(np.shape(trajectory.z)))
 
 
 # simulating
@@ -135,20 +114,13 @@ def simulated_batch(
 ) -> Float[Any, "B T+1 nodes y"]:
     """Return y of all trajectories simulated by the model, one after the other; NaN in unsolved steps."""
 
-    def one(given: Any) -> Any:
-        past, control = given
-        initial = None
-        if past is not None:
-            none, zero = jnp.zeros(past.time.shape[0], dtype=int), jnp.zeros(past.time.shape[0])
-            initial = Trajectory(
-                model, settings, past.time, past.y, past.z, past.control, none, zero, iterations=none
-            )
+    def one(control: Any) -> Any:
         return simulate(
             model, control, dt, space=settings.space, start=settings.start, newton=settings.newton,
-            between=settings.between, initial=initial, time=settings.time,  # type: ignore[arg-type]  # None is refused there
+            between=settings.between, time=settings.time,  # type: ignore[arg-type]  # None is refused there
         ).y  # fmt: skip
 
-    return jax.lax.map(one, (course.past, course.control))
+    return jax.lax.map(one, course.control)
 
 
 @functools.partial(jax.jit, static_argnames=("settings", "dt"))
@@ -236,3 +208,118 @@ def _difference(name: str, found: Any, truth: Any) -> Any:
     found, truth = (h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True)) for h in (found, truth))
     same = jnp.sum(found * truth, axis=-1, keepdims=True) >= 0.0
     return found - jnp.where(same, truth, -truth)
+
+
+# fine-tuning
+
+
+@jax.jit
+def _proposal(weights: Any, rest: Any, adam: Any, slope: Any, rate: Any, clip: Any) -> Any:
+    slope, _ = optax.clip_by_global_norm(clip).update(slope, optax.EmptyState())
+    direction, adam = ADAM.update(slope, adam)
+    moved = jax.tree.map(lambda weight, change: weight - rate * change, weights, direction)
+    return split(eqx.combine(moved, rest).clamped())[0], adam
+
+
+class RolloutState(NamedTuple):
+    """State of fine-tuning: weights, optimiser, gradient, weights of least loss, factor on the step."""
+
+    weights: Any
+    adam: Any
+    slope: Any
+    lowest: Any
+    scale: Any
+
+
+class RolloutRun(Run):
+    """Fine-tuning of one seed's residual through whole simulations.
+
+    A step after which the simulation fails or the loss diverges is rejected: it is halved, and so are all
+    later steps.
+    """
+
+    stage = "rollouts"
+    loss_after = True
+
+    def __init__(
+        self, knowledge: System, residual: Residual, courses: TrajectoryBatches, options: RolloutTraining,
+        seed: int, held_out: TrajectoryBatches | None,
+    ):  # fmt: skip
+        weights, rest = split(residual)
+        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
+        slope = jax.tree.map(jnp.zeros_like, weights)
+        state = RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
+        super().__init__((seed,), options.updates, state, Best(_one(weights), options.stop_after))
+        self._courses, self._options, self._held_out = courses, options, held_out
+        measured = np.array(scales(courses, knowledge.y_layout))
+        self._aim = RolloutTargets(knowledge, rest, courses.parts, measured)
+
+    def compile(self) -> None:
+        """Compile by one evaluation and one held-out rollout."""
+        self._evaluated(self.state.weights)
+        if self._held_out:
+            tip_error(self._model(), self._held_out)
+
+    def _evaluated(self, weights: Any) -> tuple[float, Any]:
+        courses = self._courses
+        loss, slope = loss_and_slope(weights, self._aim, courses.compared, courses.settings, courses.dt)
+        return float(loss), slope
+
+    def _begin(self, watch: ProgressMonitor) -> None:
+        """Evaluate the loss before the first update. Raises `FitError` if the simulation fails."""
+        loss, slope = self._evaluated(self.state.weights)
+        if not np.isfinite(loss) or not is_finite(slope):
+            raise FitError(
+                f"the model of seed {self.seeds[0]} cannot be simulated over the trajectories and so not "
+                "be fine-tuned: train it longer on segments, or simulate fewer rows (RolloutTraining.horizon)"
+            )
+        self.state, self.losses = self.state._replace(slope=slope), np.array([[loss]])
+        self._check(watch)
+
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+        """Run one update."""
+        if len(self.losses) == 0:
+            self._begin(watch)
+        options, state = self._options, self.state
+        rate, scale = options.learning_rate, float(state.scale)
+        if options.schedule == "cosine":
+            rate *= 0.5 * (1.0 + np.cos(np.pi * self.done / options.updates))
+        for _ in range(options.rejections):
+            step = rate * scale
+            weights, adam = _proposal(
+                state.weights, self._aim.rest, state.adam, state.slope, step, options.clip
+            )
+            loss, slope = self._evaluated(weights)
+            if loss <= DIVERGED * max(self.losses[0, 0], NOTHING) and is_finite((weights, slope)):
+                break
+            scale /= 2.0
+        else:
+            raise FitError(
+                f"fine-tuning of seed {self.seeds[0]} stopped in update {self.done}: with the step halved "
+                f"{options.rejections} times, to {step:.3g}, the robot still cannot be simulated after it"
+            )
+        lowest = weights if loss < self.losses.min() else state.lowest
+        self.state = RolloutState(weights, adam, slope, lowest, np.array(scale))
+        watch.steps(self.stage, self.seeds, self.done, self.losses[-1:], np.array([[step]]))
+        self.losses = np.append(self.losses, [[loss]], axis=0)
+        self.rates = np.append(self.rates, [[step]], axis=0)
+        self._check(watch)
+
+    def _model(self) -> KNODE:
+        return KNODE(self._aim.knowledge, eqx.combine(self.state.weights, self._aim.rest))
+
+    def _check(self, watch: ProgressMonitor) -> None:
+        if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
+            return
+        error = tip_error(self._model(), self._held_out)
+        self.best.offer(self.done, [error], _one(self.state.weights))
+        watch.error(self.stage, self.seeds[0], self.done, error)
+
+    def residuals(self) -> list[Residual]:
+        """Return the weights with the lowest loss, or the lowest held-out error if it may stop early."""
+        return [eqx.combine(self.best.chosen(0, _one(self.state.lowest)), self._aim.rest)]
+
+
+def _one(weights: Any) -> Any:
+    """Return the weights of one seed, with the seeds' axis."""
+    return jax.tree.map(lambda leaf: leaf[None], weights)

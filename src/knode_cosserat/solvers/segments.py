@@ -3,6 +3,9 @@
 A sample is one segment of the rod at one time. From the true y at its start, with the true history, a model
 predicts y at its end and z at its start (`predict_segment`). Integration spans one segment only, so that
 errors do not accumulate and all samples are predicted in parallel.
+
+A trajectory holds y on the near side of a discontinuity and z on the far side. A segment starts on the far
+side, and its sample has y there.
 """
 
 from __future__ import annotations
@@ -17,7 +20,6 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.learning.discontinuities import far_side, slopes_of
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
@@ -26,6 +28,7 @@ from knode_cosserat.solvers.history import coefficient_table, history_of, rows_s
 from knode_cosserat.solvers.replay import replay, replayed_settings
 from knode_cosserat.solvers.semi_discrete import Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.settings import MEASURED, Settings
+from knode_cosserat.solvers.slopes import slopes_of
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -82,14 +85,40 @@ class Dataset:
     segments: Samples
     tips: TipSamples
     space: SpaceScheme
-    #: number of segments used in each row
-    per_row: int
     #: estimated error of `Samples.slope` (rms)
     doubt: Float[Any, " y"]
 
 
 #: Newton's corrections of y at a discontinuity inside a segment
 CORRECTIONS = 4
+
+
+# points where a system's equations are evaluated
+
+
+def start_point(system: System, sample: Samples) -> Point:
+    """Return the point at a segment's start; slightly inside if the rod has discontinuities."""
+    s, ds = sample.place * system.length, system.length / (system.nodes - 1)
+    s = inside(s, s, s + ds) if system.cuts else s
+    history = unpacked_history(system, sample.c0, sample.history[0])
+    return Point(s, sample.t, sample.y, sample.control, history)
+
+
+def end_point(system: System, sample: Samples) -> Point:
+    """Return the point at a segment's end; slightly inside if the rod has discontinuities."""
+    s, ds = sample.place * system.length, system.length / (system.nodes - 1)
+    s = inside(s + ds, s, s + ds) if system.cuts else s + ds
+    history = unpacked_history(system, sample.c0, sample.history[1])
+    return Point(s, sample.t, sample.y_next, sample.control, history)
+
+
+def tip_point(system: System, sample: TipSamples) -> Point:
+    """Return the point at the tip."""
+    history = unpacked_history(system, sample.c0, sample.history)
+    return Point(system.length, sample.t, sample.y, sample.control, history)
+
+
+# predictions
 
 
 def predict_segment(
@@ -120,7 +149,7 @@ def predict_segment(
             found.append(rates(stage.place, y, records[2 + k]))
         return start + h * sum(b * f for b, f in zip(space.formula.weights, found, strict=True))
 
-    z = derivatives(start_of(system, sample.place), sample.y, sample.history[0])[1]
+    z = semi_discrete.derivatives(system, start_point(system, sample))[1]
     grid, ds = grid_of(system, space), system.length / (system.nodes - 1)
     if grid.parts.shape[1] == 1:
         s = sample.place * system.length
@@ -158,18 +187,6 @@ def predict_segment(
     return y_next, z
 
 
-def start_of(system: System, place: Any) -> Any:
-    """Return the arclength (m) of a segment's start; slightly inside if the rod has discontinuities."""
-    s, ds = place * system.length, system.length / (system.nodes - 1)
-    return inside(s, s, s + ds) if system.cuts else s
-
-
-def end_of(system: System, place: Any) -> Any:
-    """Return the arclength (m) of a segment's end; slightly inside if the rod has discontinuities."""
-    s, ds = place * system.length, system.length / (system.nodes - 1)
-    return inside(s + ds, s, s + ds) if system.cuts else s + ds
-
-
 def samples(
     knowledge: System, trajectories: Sequence[Trajectory], nodes: Sequence[int] | None = None,
     model: System | None = None,
@@ -188,7 +205,7 @@ def samples(
     *joined, doubts = zip(*parts, strict=True)
     segments, tips = (jax.tree.map(lambda *leaves: np.concatenate(leaves), *each) for each in joined)
     doubt = np.sqrt(np.mean(np.square(doubts), axis=0))
-    return Dataset(segments, tips, settings_of(trajectories[0]).space, len(ends), doubt)
+    return Dataset(segments, tips, settings_of(trajectories[0]).space, doubt)
 
 
 def rows_are_states(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
@@ -216,7 +233,7 @@ def strand_samples(knowledge: System, data: Dataset) -> Dataset:
     every |= {"history": past(segments.history), "later": past(segments.later)}
     every |= {"weight": every["weight"] / count}
     doubt = np.sqrt(np.mean(np.square(in_strands(knowledge, data.doubt)), axis=0))
-    return dataclasses.replace(data, segments=Samples(**every), per_row=data.per_row * count, doubt=doubt)
+    return dataclasses.replace(data, segments=Samples(**every), doubt=doubt)
 
 
 def settings_of(trajectory: Trajectory) -> Settings:
@@ -241,7 +258,7 @@ def _of_one(
         parts = [(each[..., : y.shape[-1]], each[..., y.shape[-1] :][..., : z.shape[-1]]) for each in between]
         stages = np.stack([recorded(*part, slopes_of(settings, part[0])[0]) for part in parts], axis=1)
     c0, history = histories(settings, dt, record, stages)
-    beyond = far_side(knowledge, time, c0, y, control, history)
+    beyond = _far_side(knowledge, time, c0, y, control, history)
     if knowledge.cuts:
         slope, doubt = slopes_of(settings, y, beyond, knowledge.cuts)
     # earlier rows equal the first row if that is the start of a motion, and are unknown otherwise
@@ -322,6 +339,44 @@ def histories(
             history[i] = history_of(newest, rate, coefficients, settings)
             rate, newest = c0[i] * now + history[i], [now, *newest[:-1]]
     return c0, history
+
+
+def _far_side(
+    knowledge: System, t: Float[Any, " T"], c0: Float[Any, " T"], y: Float[Any, "T N y"],
+    control: Float[Any, "T c"], history: Float[Any, "T N x"],
+) -> Float[Any, "T N y"]:  # fmt: skip
+    """Return y at all nodes, on the far side of the nominal model's discontinuities."""
+    if not (knowledge.cuts and knowledge.jump):
+        return y
+    # the discontinuities at the exact start of each segment
+    grid = grid_of(knowledge)
+    acting = grid.acting[grid.nodes[:-1]]
+    jumping = np.flatnonzero(acting.any(axis=1))
+    if not len(jumping):
+        return y
+    beyond = y.copy()
+    beyond[:, jumping] = _jump(knowledge, acting[jumping], t, c0, y[:, jumping], control, history[:, jumping])
+    return beyond
+
+
+@jax.jit
+def _jump(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
+    def at_node(acting: Any, t: Any, c0: Any, y: Any, control: Any, record: Any) -> Any:
+        return semi_discrete.jump(knowledge, acting, t, y, control, unpacked_history(knowledge, c0, record))
+
+    at_row = jax.vmap(at_node, in_axes=(0, None, None, 0, None, 0))
+    return jax.vmap(at_row, in_axes=(None, 0, 0, 0, 0, 0))(
+        jnp.asarray(acting), *map(jnp.asarray, (t, c0, y, control, history))
+    )
+
+
+def undivided(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
+    """Return 1 for each segment (by its start, a part of the length) without inner discontinuity, else 0."""
+    if not knowledge.cuts:
+        return np.ones(len(place))
+    grid = grid_of(knowledge)
+    segment = np.round(np.asarray(place) * (knowledge.nodes - 1)).astype(int)
+    return (grid.bounds[grid.nodes[segment], 1] == 1.0).astype(float)
 
 
 # checks

@@ -1,52 +1,11 @@
-"""Discontinuities at nodes: the state on the far side, and the slopes on both sides.
-
-A trajectory holds y on the near side of a discontinuity and z on the far side. Predictions and regressions
-use the segment that starts at a node, and therefore need y and its slope on the far side.
-"""
+"""Rates along the rod of a trajectory's rows, from y at the nodes alone; no spline spans a discontinuity."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
-from knode_cosserat.rods.system import System
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import ON_NODE, grid_of
-from knode_cosserat.solvers.semi_discrete import unpacked_history
+from knode_cosserat.solvers.grid import ON_NODE
 from knode_cosserat.solvers.settings import Settings
-
-
-def far_side(
-    knowledge: System, t: Float[Any, " T"], c0: Float[Any, " T"], y: Float[Any, "T N y"],
-    control: Float[Any, "T c"], history: Float[Any, "T N x"],
-) -> Float[Any, "T N y"]:  # fmt: skip
-    """Return y at all nodes, on the far side of the nominal model's discontinuities."""
-    if not (knowledge.cuts and knowledge.jump):
-        return y
-    # the discontinuities at the exact start of each segment
-    grid = grid_of(knowledge)
-    acting = grid.acting[grid.nodes[:-1]]
-    jumping = np.flatnonzero(acting.any(axis=1))
-    if not len(jumping):
-        return y
-    beyond = y.copy()
-    beyond[:, jumping] = _jump(knowledge, acting[jumping], t, c0, y[:, jumping], control, history[:, jumping])
-    return beyond
-
-
-@jax.jit
-def _jump(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
-    def at_node(acting: Any, t: Any, c0: Any, y: Any, control: Any, record: Any) -> Any:
-        return semi_discrete.jump(knowledge, acting, t, y, control, unpacked_history(knowledge, c0, record))
-
-    at_row = jax.vmap(at_node, in_axes=(0, None, None, 0, None, 0))
-    return jax.vmap(at_row, in_axes=(None, 0, 0, 0, 0, 0))(
-        jnp.asarray(acting), *map(jnp.asarray, (t, c0, y, control, history))
-    )
 
 
 def slopes_of(
@@ -68,10 +27,10 @@ def slopes_of(
     for first, end in pieces(cuts, last + 1):
         values = y[:, first : end + 1].copy()
         values[:, 0] = beyond[:, first]
-        own, doubt = _spline_slopes(values, last)
+        rates, doubt = _spline_slopes(values, last)
         if settings.space.order == 2:
-            own = _trapezoidal_slopes(values, own, last)
-        slope[:, first : end + 1], wrong[:, first : end + 1] = own, doubt
+            rates = _trapezoidal_slopes(values, rates, last)
+        slope[:, first : end + 1], wrong[:, first : end + 1] = rates, doubt
     # a node alone between discontinuities has no spline: use the slope of the segment, with a large error
     alone = [first for first, end in pieces(cuts, last + 1) if first == end]
     for node in alone:
@@ -79,15 +38,6 @@ def slopes_of(
         slope[:, node] = (y[:, other + 1] - beyond[:, other]) * last
         wrong[:, node] = slope[:, node]
     return slope, 0.1 * np.sqrt(np.mean(np.square(wrong), axis=(0, 1)))
-
-
-def whole(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
-    """Return 1 for each segment (by its start, a part of the length) without inner discontinuity, else 0."""
-    if not knowledge.cuts:
-        return np.ones(len(place))
-    grid = grid_of(knowledge)
-    segment = np.round(np.asarray(place) * (knowledge.nodes - 1)).astype(int)
-    return (grid.bounds[grid.nodes[segment], 1] == 1.0).astype(float)
 
 
 def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
