@@ -34,7 +34,7 @@ LAYERS = (
     ("recordings", "statics", "estimation"),
     ("control",),
     ("hardware",),
-    ("learning", "calibration"),
+    ("learning",),
     ("identification",),
     ("evaluation", "figures"),
     ("viewer", "diagnosis", "sweeps", "envs"),

@@ -15,10 +15,10 @@ import numpy as np
 
 from knode_cosserat.evaluation.tables import markdown_table
 from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.experiments import DT
 from knode_cosserat.identification.fit import with_residual
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import Imperfect, imperfect_robot
-from knode_cosserat.identification.inputs import DT
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.load import load_recording
