@@ -215,14 +215,16 @@ class States(Output):
     def error(
         self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
     ) -> Float[Any, " e"]:
-        """Return the differences; quaternions in the reference are normalised, with the nearer sign."""
+        """Return the differences; quaternions are normalised, and the reference has the nearer sign."""
         target = reference[: y.size].reshape(y.shape)
         if "h" in system.y_layout.names:
             where = system.y_layout.slice("h")
-            turn = target[:, where].reshape(len(y), -1, 4)
-            turn = turn / jnp.linalg.norm(turn, axis=-1, keepdims=True)
-            same = jnp.sum(turn * y[:, where].reshape(turn.shape), axis=-1, keepdims=True)
-            turn = turn * jnp.where(same < 0.0, -1.0, 1.0)
+            unit, turn = (
+                h / jnp.linalg.norm(h, axis=-1, keepdims=True)
+                for h in (rows[:, where].reshape(len(y), -1, 4) for rows in (y, target))
+            )
+            turn = turn * jnp.where(jnp.sum(turn * unit, axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+            y = y.at[:, where].set(unit.reshape(len(y), -1))
             target = target.at[:, where].set(turn.reshape(len(y), -1))
         return self.value(system, y, z) - jnp.concatenate([target.ravel(), reference[y.size :]])
 
