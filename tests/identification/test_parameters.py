@@ -192,7 +192,7 @@ def test_undetermined_parameters_are_named(swings):
     result = identify(ROPES, swings, parameters="all")
     assert set(result.undetermined) == {"colour", "ropes"}
     assert "colour has no effect on these data" in result.steps
-    assert "not determined by these data, unchanged: colour, ropes" in str(result)
+    assert "not determined by these data, unchanged: ropes, colour" in str(result)
     assert result["stiffness"].value == pytest.approx(20.0, rel=1e-7)
     with pytest.raises(IdentificationError, match=r"^these data determine none of colour: colour has no"):
         identify(ROPES, swings, parameters=["colour"])
