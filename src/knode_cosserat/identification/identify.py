@@ -193,9 +193,9 @@ def _require_start(search: Search, x: np.ndarray) -> None:
         if data.held is None or rollout is None or places is None:
             continue
         apart = np.linalg.norm(_positions(rollout, data)[:1], axis=-1)
-        seen = places(data.data)
-        motion = np.sqrt(np.nanmean(np.sum((seen - seen[:1]) ** 2, axis=-1), axis=0))
-        away, usual = np.nanmax(np.nan_to_num(apart)), np.nanmax(np.nan_to_num(motion))
+        moved = np.sum((places(data.data) - places(data.data)[:1]) ** 2, axis=-1)
+        count = np.maximum(np.isfinite(moved).sum(axis=0), 1)
+        away, usual = np.max(np.nan_to_num(apart)), np.max(np.sqrt(np.nansum(moved, axis=0) / count))
         if away > max(AWAY * length, OF_MOTION * usual):
             raise DataError(
                 f"{data.name}: row 0 is {1e3 * away:.3g} mm from the equilibrium under "

@@ -165,8 +165,9 @@ class Search:
             return np.full(len(fields), LEAST_SCALE * self.length)
         if len(fields) == 1:
             return np.array([LEAST * self.length])
-        usual = np.sqrt(np.nanmean(np.square(data.data[1:]), axis=0))
-        sizes = np.array([np.max(np.nan_to_num(usual[groups == k])) for k in range(len(fields))])
+        count = np.maximum(np.isfinite(data.data[1:]).sum(axis=0), 1)
+        usual = np.sqrt(np.nansum(np.square(data.data[1:]), axis=0) / count)
+        sizes = np.array([np.max(usual[groups == k]) for k in range(len(fields))])
         return LEAST * np.where(sizes > 0.0, sizes, 1.0)
 
     @property
