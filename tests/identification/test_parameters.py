@@ -221,7 +221,7 @@ def test_the_end_of_the_allowed_range_is_no_estimate(swings):
 
 def test_a_search_that_does_not_converge_is_an_error(swings, monkeypatch):
     monkeypatch.setattr(search, "EXACT", (1, 1e-15))
-    monkeypatch.setattr(search, "ROUGH", (1, 1e-2))
+    monkeypatch.setattr(search, "FIRST", (1, 1e-2))
     with pytest.raises(IdentificationError, match=r"^the search did not converge; begin closer"):
         identify(WRONG, swings, parameters=["stiffness", "drag"])
 

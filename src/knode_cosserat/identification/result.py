@@ -115,7 +115,8 @@ class Identified:
         ]
         for it in self.estimates:
             low, value, high = (_text(at, it.error) for at in (it.interval[0], it.value, it.interval[1]))
-            effect = "" if it.label.startswith(it.effect) else it.effect
+            # a plain parameter is its own cause
+            effect = "" if it.effect in (it.label, it.label.partition("[")[0]) else it.effect
             rows.append(
                 (
                     effect, it.label, it.unit, f"{it.nominal:.6g}", value, f"{low} to {high}",

@@ -41,7 +41,9 @@ FOLDS = 5
 #: duration of the blocks (s) for the scatter of an effect's improvement; at least two blocks
 BLOCK = 1.0
 #: evaluations of a search at one horizon, and of the last one; parts by which the cost falls at their end
-ROUGH, FINE, EXACT = (6, 2e-2), (25, 1e-3), (100, 1e-10)
+ROUGH, FINE = (6, 2e-2), (25, 1e-3)
+#: the same without priors, where a start may be far
+FIRST, EXACT = (50, 1e-5), (100, 1e-10)
 #: evaluations with one scale where there are priors, most updates of the scale, and its relative change at
 #: the end
 PASS, PASSES, SETTLED = 5, 8, 0.05
@@ -212,7 +214,7 @@ class Search:
         rows = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
         for horizon in dict.fromkeys(rows):
             if horizon < 0.8 * longest:
-                x = self.run(x, free, horizon, *ROUGH).x
+                x = self.run(x, free, horizon, *(FIRST if self.exact else ROUGH)).x
         return self.run(x, free, None, *(EXACT if self.exact else FINE))
 
     def run(
