@@ -1,4 +1,4 @@
-"""From recorded bags to a model that predicts: record, read, calibrate, test on a held-out recording.
+"""From recorded bags to a model that predicts: record, read, identify, test on a held-out recording.
 
 A virtual robot is recorded, with friction, ribs, a lag and noisy sensors that the model does not have.
 `knode-cosserat record-virtual` makes the same bags; with your own bags, start at `load_recording`.
@@ -14,7 +14,7 @@ NAMES = ("youngs_modulus", "bending_damping")
 
 
 def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, float]:
-    """Calibrate from one sine, predict another; return the tip's errors (RMSE in m) before and after."""
+    """Identify from one sine, predict another; return the tip's errors (RMSE in m) before and after."""
     with tempfile.TemporaryDirectory() as folder:
         bags = {"sine:1.5": Path(folder) / "seen.bag", "sine:1.0": Path(folder) / "unseen.bag"}
         for signal, path in bags.items():
@@ -23,9 +23,9 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
         recordings = [kc.load_recording(path, config) for path in bags.values()]
     seen, unseen = (recording.sampled(0.0125, mean=True) for recording in recordings)
 
-    # realistic tendons, which bend the rod; `kc.identify` finds their friction too, and takes longer
+    # realistic tendons, which bend the rod; without names, friction is found too, which takes longer
     knowledge = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
-    found = kc.calibrate(knowledge, [seen], NAMES, by="rollouts")
+    found = kc.identify(knowledge, [seen], parameters=NAMES)
     print(found)
     before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.0125) for each in (knowledge, found.robot))
     kc.figures.prediction_against_measurement(after, unseen).savefig(out)

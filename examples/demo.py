@@ -95,7 +95,7 @@ def predict_a_held_out_recording(out: Path) -> None:
     training = load_example().sampled(DT).between(1.0, 7.0)
     held_out = kc.load_recording(HELD_OUT).sampled(DT).between(1.0, 11.0)
     nominal = kc.load_robot("delrin-tendon-robot")
-    found = kc.calibrate(nominal, [training], ["youngs_modulus", "bending_damping"], by="rollouts")
+    found = kc.identify(nominal, [training], parameters=["youngs_modulus", "bending_damping"])
     kc.save_robot(found.robot, out / "calibrated.yaml")
     # row 0 is the state at rest, so the last row's tension is not used
     predictions = {

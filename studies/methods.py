@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
+from knode_cosserat.identification import IdentificationError, identify
 from knode_cosserat.learning.config import FitConfig, StructuredOptions
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.training.runs import FitError
@@ -36,13 +36,10 @@ def baseline(imperfect: System, training: Trajectories, seeds: Sequence[int]) ->
 def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the imperfect model with calibrated parameters, without a residual."""
     try:
-        result = calibrate(imperfect, training)
-    except CalibrationError as error:
+        result = identify(imperfect, training, parameters="all")
+    except IdentificationError as error:
         return LearnedSystems({0: str(error)})
-    found = {
-        name: {"before": np.asarray(result.before[name]).tolist(), "estimate": np.asarray(value).tolist()}
-        for name, value in result.estimates.items()
-    }
+    found = {it.label: {"before": it.nominal, "estimate": it.value} for it in result.estimates}
     return LearnedSystems(
         {0: result.robot}, found={**found, "undetermined": [str(name) for name in result.undetermined]}
     )

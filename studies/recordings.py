@@ -16,7 +16,6 @@ import numpy as np
 from knode_cosserat.identification.evaluate import Evaluation, compared, predict
 from knode_cosserat.identification.fit import fit as learn
 from knode_cosserat.identification.identify import IdentificationError, identify
-from knode_cosserat.learning.calibration.calibrate import CalibrationError, calibrate
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
@@ -283,8 +282,8 @@ def _calibrated(knowledge: System, train: Sequence[str], read: _Read, seeds: Seq
     names = ("youngs_modulus", "density", "bending_damping", "drag", "gravity")
     rows = [read.rows(name, FINER) for name in train]
     try:
-        found = calibrate(knowledge, rows, names, by="rollouts", undetermined="keep", space=SPACE)
-    except CalibrationError as error:
+        found = identify(knowledge, rows, parameters=names, space=SPACE)
+    except IdentificationError as error:
         return TrainedSystems({0: str(error)}, FINER)
     return TrainedSystems({0: found.robot}, FINER, told=str(found))
 

@@ -14,10 +14,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.experiments import DT
 from knode_cosserat.identification.fit import with_residual
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
-from knode_cosserat.identification.inputs import DT
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements

@@ -23,7 +23,7 @@ LAYERS = (
     ("metrics", "evaluation.metrics", "evaluation.state_errors"),
     ("recordings", "statics", "estimation"),
     ("control",),
-    ("learning", "calibration"),
+    ("learning",),
     ("loading",),
     ("identification",),
     ("evaluation", "figures"),

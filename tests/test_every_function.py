@@ -159,12 +159,12 @@ def reached(robot: kc.System, it: Made) -> Any:
     return found.control
 
 
-def calibrated(robot: kc.System, it: Made, by: Any) -> Any:
+def identified(robot: kc.System, it: Made, measured: bool) -> Any:
     name = name_of_a_parameter(robot)
     data: Any = it.motion
-    if by == "rollouts":  # they begin unloaded
+    if measured:  # they begin unloaded
         data = kc.recordings.Measurements.of(kc.simulate(robot, it.controls, DT), (0.5, 1.0))
-    found = kc.calibrate(robot, [data], [name], by=by)
+    found = kc.identify(robot, [data], parameters=[name])
     assert type(found.robot) is type(robot)
     np.testing.assert_allclose(getattr(found.robot.nominal, name), getattr(robot.nominal, name), rtol=1e-3)
     return getattr(found.robot.nominal, name)
@@ -191,14 +191,14 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "fit, structured": structured,
     "fit, network": lambda robot, it: fitted(robot, it, NETWORK),
     "fit, passive": lambda robot, it: fitted(robot, it, PASSIVE),
-    "calibrate, segments": lambda robot, it: calibrated(robot, it, "segments"),
-    "calibrate, rollouts": lambda robot, it: calibrated(robot, it, "rollouts"),
+    "identify, states": lambda robot, it: identified(robot, it, False),
+    "identify, poses": lambda robot, it: identified(robot, it, True),
     "estimate_states": lambda robot, it: estimated(robot, it, "best"),
     "estimate_states, paper": lambda robot, it: estimated(robot, it, "paper"),
     "evaluate": predicted,
 }
 #: they compile for long
-SLOW = {"stability", "equilibrium_path", "calibrate, rollouts", "fit, passive", "fit, network"}
+SLOW = {"stability", "equilibrium_path", "identify, poses", "fit, passive", "fit, network"}
 #: kinds for which every other function is called each time
 OFTEN = {"model of a model"}
 #: functions that are not called each time for a model of a model: they compile as long again

@@ -161,9 +161,9 @@ def test_bend_by_pressure(run):
 def test_calibrate_parameters(run):
     found = run("calibrate_parameters", steps=40)
     for name, true in (("youngs_modulus", 2.757903e9), ("bending_damping", 0.03)):
-        low, high = found.intervals[name]
+        low, high = found[name].interval
         # three half-widths: a seed may lie outside one interval of 95 %
-        assert abs(found.estimates[name] - true) < 1.5 * (high - low)
+        assert abs(found[name].value - true) < 1.5 * (high - low)
         assert (high - low) < 0.02 * true
 
 

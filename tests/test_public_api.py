@@ -302,14 +302,12 @@ def test_recordings_and_measurements_show_their_extent(motion):
     short(kc.controls.Controls(kc.controls.sine(1.5, 4, 0.05), 0.05), "4 steps of 0.05 s; 4 tendons, 5", " N")
 
 
-def test_calibrated_and_identified_robots_show_their_numbers():
-    before, after, error, interval = (
-        {"youngs_modulus": value} for value in (1e9, 2.7e9, 1e6, (2.6e9, 2.8e9))
+def test_identified_robots_show_their_numbers():
+    estimate = kc.identification.Estimate(
+        "youngs_modulus", "youngs_modulus", "Pa", 1e9, 2.7e9, (2.6e9, 2.8e9), error=1e6
     )
-    found = kc.calibration.Calibration(
-        ROBOT, before, after, error, interval, 0.95, ("youngs_modulus",), ("Pa",), np.eye(1), (), {}, ()
-    )
+    found = kc.identification.Identified(ROBOT, ("youngs_modulus",), (estimate,))
     short(found, "95 % intervals: youngs_modulus = 2.7e+09 Pa (2.6e+09 to 2.8e+09)")
     errors = {"one": 1e-3, "two": 3e-3}
-    found = kc.identification.Identified(ROBOT, ("friction",), (), errors, errors, {"one": None}, ())
+    found = kc.identification.Identified(ROBOT, ("friction",), error=errors, held_out_error={"one": None})
     short(found, "effects: friction", "tip error, identified: 2 mm")

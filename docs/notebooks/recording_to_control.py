@@ -42,17 +42,17 @@ kc.figures.states({"truth": truths["sine:1.5"], "estimated": states}, ("q", "w")
 # %% [markdown]
 # ## A model from measured poses alone
 #
-# Realistic tendons bend the rod. Stiffness and damping are calibrated by whole simulations, and the other recording
-# tests the result. (`kc.identify` finds friction as well, and takes longer.)
+# Realistic tendons bend the rod. Stiffness and damping are identified by whole simulations, and the other recording
+# tests the result. (Without names of parameters, `kc.identify` finds friction as well, and takes longer.)
 
 # %%
 knowledge = kc.robots.RoutedTendonRobot.like(crude)
 measured = recording.sampled(0.025, mean=True)
-found = kc.calibrate(knowledge, [measured], ["youngs_modulus", "bending_damping"], by="rollouts")
+found = kc.identify(knowledge, [measured], parameters=["youngs_modulus", "bending_damping"])
 print(found)
 
 # %% [markdown]
-# The last line is a warning: friction and ribs are missing, so the residual is not noise, and the intervals are too
+# The line "not explained" is a warning: friction and ribs are missing, so the residual is not noise, and the intervals are too
 # narrow. The test is the prediction of the held-out recording:
 
 # %%

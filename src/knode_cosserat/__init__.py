@@ -1,7 +1,7 @@
 """Simulate Cosserat-rod robots, learn what the physics misses, predict real robots.
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
-public names are in the namespaces `robots`, `solvers`, `learning`, `calibration`, `recordings`, `statics`,
+public names are in the namespaces `robots`, `solvers`, `learning`, `recordings`, `statics`,
 `estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `named_controls`,
 `envs` and `sweeps`. Drivers of robots are a distribution of their own, `knode_cosserat_hardware`. Events are
 logged to the logger "knode_cosserat", which is quiet unless a handler is added.
@@ -15,7 +15,6 @@ from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
     from knode_cosserat import (
-        calibration,
         control,
         controls,
         envs,
@@ -32,7 +31,6 @@ if TYPE_CHECKING:
         sweeps,
         viewer,
     )
-    from knode_cosserat.calibration import calibrate
     from knode_cosserat.errors import KnodeCosseratError
     from knode_cosserat.identification.fit import fit
     from knode_cosserat.identification.identify import identify
@@ -55,8 +53,6 @@ __all__ = [
     "System",
     "Trajectory",
     "TrajectoryFileError",
-    "calibrate",
-    "calibration",
     "catalog",
     "control",
     "controls",
@@ -92,7 +88,6 @@ __all__ = [
 make_lazy(
     __name__,
     {
-        "knode_cosserat.calibration": "calibrate",
         "knode_cosserat.errors": "KnodeCosseratError",
         "knode_cosserat.identification": "fit identify",
         "knode_cosserat.learning": "KNODE FitConfig load_model",

@@ -3,6 +3,7 @@
 import numpy as np
 
 import knode_cosserat as kc
+from knode_cosserat.rotation import since_first
 
 DT = 0.025
 NOISE = 2e-4
@@ -33,8 +34,6 @@ def measured(robot, true_tension, source, *, seed=0, noise=NOISE, reading=None, 
     quaternion = np.array(np.asarray(moved.quaternion)[:, nodes])
     if turned:
         # as a reader has them that takes the first row for upright
-        from knode_cosserat.identification.misfit import since_first
-
         quaternion = since_first(quaternion)
     quaternion = quaternion + 5.0 * noise * rng.normal(size=quaternion.shape)
     seen = true_tension if reading is None else reading(true_tension)

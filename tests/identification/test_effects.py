@@ -24,7 +24,7 @@ TENSION = np.array([7.0, 5.0, 3.0, 5.0])
 
 @pytest.fixture(scope="module")
 def model():
-    return Model(NOMINAL, np.tile(TENSION, (4, 1)))
+    return Model.of_library(NOMINAL, np.tile(TENSION, (4, 1)))
 
 
 def shape(robot, tension=TENSION, **more):
@@ -146,7 +146,7 @@ def test_tendons_whose_routing_is_stated_are_moved_by_effects_of_that():
     routing = tuple(
         Straight(0.02 * np.cos(angle), 0.02 * np.sin(angle)) for angle in np.asarray(NOMINAL.tendon_angles)
     )
-    model = Model(ROUTED.replace(routing=routing), np.tile(TENSION, (4, 1)))
+    model = Model.of_library(ROUTED.replace(routing=routing), np.tile(TENSION, (4, 1)))
     assert not {"tendon offset", "tendon angles", "tendon twist"} & set(model.names)
     x = np.zeros(model.size)
     x[model.slice("routing by motor")] = [1.0, 0.0, 0.0, 0.0]

@@ -7,8 +7,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import coverage, evaluate
+from knode_cosserat.identification.experiments import poses_of_nodes
 from knode_cosserat.identification.fit import coordinates_of, fit
-from knode_cosserat.identification.inputs import poses_of_nodes
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified
@@ -68,10 +68,10 @@ def test_a_passive_network_does_not_diverge_and_its_spread_is_told():
     )
     unseen = measured(TRUE, tensions("random", 2.0, seed=9), "unseen", seed=9)
     before = evaluate(NOMINAL, unseen).tip_rmse
-    model = Model(NOMINAL, unseen.tension)
-    from knode_cosserat.identification.misfit import data_of
+    model = Model.of_library(NOMINAL, unseen.tension)
+    from knode_cosserat.identification.experiments import of_measurements
 
-    data = [data_of(each, model, each.source) for each in given]
+    data = [of_measurements(each, model, each.source) for each in given]
     for member in members:
         assert evaluate(member, unseen).tip_rmse < 0.5 * before
         assert failed_trial(member, data, "lobatto2") is None
@@ -97,7 +97,7 @@ def test_what_is_kept():
 
 
 def test_coordinates_are_those_of_the_estimates():
-    model = Model(NOMINAL, np.full((4, 4), 5.0))
+    model = Model.of_library(NOMINAL, np.full((4, 4), 5.0))
     x = np.where(model.mask(("stiffness", "damping", "rest curvature")), 0.3, 0.0)
     values = model.values(x)
     estimates = [
@@ -106,7 +106,7 @@ def test_coordinates_are_those_of_the_estimates():
         for k in range(*model.slice(name).indices(model.size))
         for number in [model.numbers[k]]
     ]
-    found = Identified(NOMINAL, ("stiffness", "damping", "rest curvature"), tuple(estimates), {}, {}, {}, ())
+    found = Identified(NOMINAL, ("stiffness", "damping", "rest curvature"), tuple(estimates))
     assert np.allclose(coordinates_of(model, found), x, rtol=0.0, atol=1e-12)
 
 
@@ -127,7 +127,7 @@ def test_bad_input():
         fit(NOMINAL, [rows], kc.FitConfig.paper())
     with pytest.raises(kc.learning.FitError, match="checkpoint is for trajectories"):
         fit(NOMINAL, [rows], checkpoint="a")
-    with pytest.raises(DataError, match="recordings holds a float; allowed is"):
+    with pytest.raises(DataError, match="data holds a float; allowed is"):
         fit(NOMINAL, [rows, 3.0])
     with pytest.raises(kc.learning.FitError, match="allowed is a list"):
         fit(NOMINAL, rows)

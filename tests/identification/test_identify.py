@@ -7,7 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
-from knode_cosserat.identification.misfit import data_of
+from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
 from knode_cosserat.rods.load_cells import LoadCells
@@ -104,7 +104,7 @@ def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
 def test_trials_name_what_fails():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
-    data = data_of(seen, Model(NOMINAL, seen.tension), "own")
+    data = of_measurements(seen, Model.of_library(NOMINAL, seen.tension), "own")
     assert failed_trial(true, [data], "lobatto2") is None
     # a rod that its own tendons buckle between its ribs
     weak = true.replace(rib_spacing=RibSpacing(softening=1.0))
@@ -115,7 +115,7 @@ def test_trials_name_what_fails():
 def test_a_grid_is_too_coarse_or_fine_enough():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
-    data = [data_of(seen, Model(NOMINAL, seen.tension), "own")]
+    data = [of_measurements(seen, Model.of_library(NOMINAL, seen.tension), "own")]
     assert not has_coarse_rows(true, data, "lobatto2")
     soft = true.replace(nodes=5, youngs_modulus=2e8, sections=(Sleeve(stiffening=8.0, length=0.1),))
     assert has_coarse_rows(soft, data, "lobatto2")
@@ -133,7 +133,7 @@ def test_bad_input_says_what_is_wrong():
         kc.identify(NOMINAL, seen)
     with pytest.raises(DataError, match="no recordings"):
         kc.identify(NOMINAL, [])
-    with pytest.raises(DataError, match=r"recordings holds a \w+; allowed is what load_recording returns"):
+    with pytest.raises(DataError, match=r"data holds a \w+; allowed is what load_recording returns"):
         kc.identify(NOMINAL, [3])
     with pytest.raises(ParameterError, match="no effect 'frictoin'; did you mean friction"):
         kc.identify(NOMINAL, [seen], ["frictoin"])

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from knode_cosserat.identification.intervals import standard_deviations
+from knode_cosserat.identification.result import standard_deviations
 from knode_cosserat.identification.search import Point, Problem
 
 SIZE, RECORDINGS = 30, 3

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.estimation import BodyPositions
+from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Rollout
 from knode_cosserat.identification.search import Search, SearchError
@@ -21,33 +23,36 @@ class Curve:
     def __init__(self, true=(0.4, -0.3, 0.2), fails=False):
         numbers = tuple((f"number {k}", 0.0) for k in range(3))
         self.model = SimpleNamespace(
-            size=3, nominal=SimpleNamespace(length=1.0), bounds=(np.full(3, -5.0), np.full(3, 5.0)),
+            size=3, nominal=SimpleNamespace(length=1.0), prior=np.ones(3),
+            bounds=(np.full(3, -5.0), np.full(3, 5.0)),
             begin=np.zeros(3), numbers=numbers, names=("curve",), robot=(np.zeros(3),),
         )  # fmt: skip
         t = np.linspace(0.0, 1.0, ROWS)
         self.shape = np.stack([t, np.sin(5.0 * t), t**3])
         rng = np.random.default_rng(0)
         self.data = [self._seen(true, name, rng) for name in ("one", "two")]
-        self.settings, self.calls, self.fails = "none", 0, fails
+        self.calls, self.fails = 0, fails
 
     def _seen(self, true, name, rng):
         position = np.tanh(np.asarray(true) @ self.shape)[:, None, None] + 1e-3 * rng.normal(
             size=(ROWS, BODIES, 3)
         )
-        return SimpleNamespace(
-            name=name, dt=0.05, moves=0, static=False, continuous=False, steps=1, places=(),
-            initial_tension=np.zeros(1), tension=np.zeros((59, 1)), position=position,
-            rotation=np.zeros((ROWS, BODIES, 4)),
+        return Experiment(
+            0.05, np.zeros((ROWS - 1, 1)), BodyPositions((0.5, 1.0)), position.reshape(ROWS, -1),
+            np.zeros(1), name=name,
         )  # fmt: skip
 
-    def differences(self, x, rows=None, which=None, derivatives=True):
+    def differences(self, x, rows=None, which=None):
         self.calls += 1
         value = np.tanh(x @ self.shape)
-        slope = np.broadcast_to(((1.0 - value**2) * self.shape)[:, :, None, None], (3, ROWS, BODIES, 3))
+        slope = np.broadcast_to(((1.0 - value**2) * self.shape)[:, :, None], (3, ROWS, 3 * BODIES))
         chosen = [self.data[k] for k in (range(2) if which is None else which)]
         if self.fails:
             return [None for _ in chosen]
-        return [Rollout(value[:, None, None] - each.position, slope) for each in chosen]
+        return [Rollout(value[:, None] - it.data, lambda: slope) for it in chosen]
+
+    def differentiated(self, rollouts):
+        pass
 
 
 FREE = np.array([True, True, True])

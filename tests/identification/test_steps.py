@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
-from knode_cosserat.identification.misfit import Misfit, data_of
+from knode_cosserat.identification.experiments import of_measurements
+from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.steps import (
     LONGEST,
@@ -76,15 +77,17 @@ def test_recordings_of_both_kinds_are_simulated_as_each_alone_with_its_derivativ
     nominal = ROBOT.replace(nodes=6)
     seen = measured(kc.robots.RoutedTendonRobot.like(nominal), tensions(0.5, 1.5), "own")
     held = dataclasses.replace(seen, time=0.5 * seen.time)
-    model = Model(nominal, seen.tension)
-    data = [data_of(each, model, "own") for each in (dataclasses.replace(held, continuous=True), held)]
+    model = Model.of_library(nominal, seen.tension)
+    data = [
+        of_measurements(each, model, "own") for each in (dataclasses.replace(held, continuous=True), held)
+    ]
     assert [each.steps for each in data] == [2, 1]
-    both = Misfit(model, data, "lobatto2")
+    both = Misfit(model, data)
     k = model.slice("damping").start
     one = 1e-3 * np.eye(model.size)[k]
     low, here, high = (both.differences(part * one) for part in (-1.0, 0.0, 1.0))
     for j, each in enumerate(data):
-        (alone,) = Misfit(model, [each], "lobatto2").differences(np.zeros(model.size), derivatives=False)
+        (alone,) = Misfit(model, [each]).differences(np.zeros(model.size))
         assert_allclose(here[j].values, alone.values, rtol=0, atol=1e-12)
         slope = (high[j].values - low[j].values) / 2e-3
         assert_allclose(here[j].derivatives[k], slope, rtol=0, atol=1e-4 * np.abs(slope).max())

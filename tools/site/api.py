@@ -17,7 +17,6 @@ MAIN = (
     "simulate",
     "equilibrium",
     "fit",
-    "calibrate",
     "load_recording",
     "estimate_states",
     "identify",

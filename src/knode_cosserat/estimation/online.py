@@ -157,14 +157,11 @@ def errors_along(
 ) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
     """Return the errors of an output in every row, and their tangents."""
 
-    def error(record: Any, reference: Any) -> Any:
-        return output.error(system, *split_record(system, record), reference)
+    def errors(records: Any) -> Any:
+        return output.errors(system, *split_record(system, records), references)
 
-    def one(record: Any, reference: Any, d_record: Any) -> Any:
-        value, moved = jax.linearize(lambda record: error(record, reference), record)
-        return value, jax.vmap(moved, in_axes=-1)(d_record)
-
-    return jax.vmap(one, out_axes=(0, 1))(records, references, d_records)
+    value, moved = jax.linearize(errors, records)
+    return value, jax.vmap(moved, in_axes=-1)(d_records)
 
 
 @functools.partial(jax.jit, static_argnames="output")
@@ -172,11 +169,7 @@ def errors_of(
     system: System, output: Output, records: Float[Any, "T N x"], measured: Float[Any, "T p"]
 ) -> Float[Any, "T e"]:
     """Return the errors of an output in every row."""
-
-    def error(record: Any, measured: Any) -> Any:
-        return output.error(system, *split_record(system, record), measured)
-
-    return jax.vmap(error)(records, measured)
+    return output.errors(system, *split_record(system, records), measured)
 
 
 class Predicted(NamedTuple):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import dataclasses
 import functools
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
@@ -44,6 +44,12 @@ class Output(abc.ABC):
     ) -> Float[Any, " e"]:
         """Return the output of a state less a reference; NaN where the reference is NaN."""
         return self.value(system, y, z) - reference
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return the errors of consecutive rows; an output may compare rows with the first one."""
+        return jax.vmap(lambda *row: self.error(system, *row))(y, z, references)
 
     @property
     def size(self) -> int:
@@ -149,6 +155,78 @@ class TipPose(BodyPoses):
     """Position (m) and unit quaternion of the tip."""
 
     fractions: tuple[float, ...] = (1.0,)
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyMotions(BodyPoses):
+    """Positions (m), and rotations since the first row as unit quaternions, at fractions of the length.
+
+    The mounting of the bodies on the rod need not be known.
+    """
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return differences of positions (m), and of rotations since the first row (rad, global frame)."""
+        places = places_at(np.asarray(self.fractions), system.nodes)
+        h, reference = quaternions_at(system, y, places), references.reshape(len(references), -1, 7)
+        product, inverse = jax.vmap(jax.vmap(quaternion_product)), jax.vmap(jax.vmap(conjugate))
+        since = product(h, inverse(jnp.broadcast_to(h[:1], h.shape)))
+        known = jnp.isfinite(reference[..., 3:4])
+        turned = product(since, inverse(jnp.where(known, reference[..., 3:], 1.0)))
+        turned = 2.0 * turned[..., 1:] * jnp.where(turned[..., :1] < 0.0, -1.0, 1.0)
+        moved = positions_at(system, y, places, z) - reference[..., :3]
+        both = jnp.concatenate([moved, jnp.where(known, turned, jnp.nan)], axis=-1)
+        return both.reshape(len(references), -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class States(Output):
+    """All numbers of y and z at the nodes, as in a trajectory: y of node 0, 1, …, then z.
+
+    `names` are the fields of y and z with their sizes; the sign of a quaternion does not matter.
+    """
+
+    nodes: int
+    y_names: tuple[tuple[str, int], ...]
+    z_names: tuple[tuple[str, int], ...]
+
+    @classmethod
+    def of(cls, system: System) -> Self:
+        """Return the states of a system."""
+        layouts = system.y_layout, system.z_layout
+        return cls(system.nodes, *(tuple((it.name, it.size) for it in each.fields) for each in layouts))
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Field of every number of a value."""
+        parts = ([name for name, size in each for _ in range(size)] for each in (self.y_names, self.z_names))
+        return tuple(label for part in parts for label in part * self.nodes)
+
+    @property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Ones: the noise of states is estimated from the differences."""
+        return np.ones(self.size)
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return all numbers."""
+        return jnp.concatenate([y.ravel(), z.ravel()])
+
+    def error(
+        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
+    ) -> Float[Any, " e"]:
+        """Return the differences; quaternions are normalised, and the reference has the nearer sign."""
+        target = reference[: y.size].reshape(y.shape)
+        if "h" in system.y_layout.names:
+            where = system.y_layout.slice("h")
+            unit, turn = (
+                h / jnp.linalg.norm(h, axis=-1, keepdims=True)
+                for h in (rows[:, where].reshape(len(y), -1, 4) for rows in (y, target))
+            )
+            turn = turn * jnp.where(jnp.sum(turn * unit, axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+            y = y.at[:, where].set(unit.reshape(len(y), -1))
+            target = target.at[:, where].set(turn.reshape(len(y), -1))
+        return self.value(system, y, z) - jnp.concatenate([target.ravel(), reference[y.size :]])
 
 
 @dataclasses.dataclass(frozen=True)

@@ -1,16 +1,17 @@
 """Identification of real robots: a library of effects, selected by recordings that were not searched."""
 
-from knode_cosserat.identification.effects import Effect, Number
+from knode_cosserat.identification.effects import Effect, Number, effects_of, register
 from knode_cosserat.identification.evaluate import Evaluation, evaluate, predict
+from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import IdentificationError, identify
-from knode_cosserat.identification.library import effects_of
 from knode_cosserat.identification.result import Estimate, Identified
 
 __all__ = [
     "Effect",
     "Estimate",
     "Evaluation",
+    "Experiment",
     "IdentificationError",
     "Identified",
     "Number",
@@ -19,4 +20,5 @@ __all__ = [
     "fit",
     "identify",
     "predict",
+    "register",
 ]

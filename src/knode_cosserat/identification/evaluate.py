@@ -6,15 +6,16 @@ import dataclasses
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse, rotation_rmse
-from knode_cosserat.identification.misfit import turned_from
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
-from knode_cosserat.rotation import since_first
+from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
@@ -182,7 +183,9 @@ def compared(
     seen, known = measured.position[rows], measured.complete[rows]
     off = position[known, -1] - seen[known, -1]
     # the mounting of bodies is unknown: rotations are relative to the first row, where the robot is at rest
-    turned = turned_from(quaternion[0], np.asarray(since_first(measured.quaternion[rows])))
+    begun = jnp.broadcast_to(quaternion[0], quaternion.shape)
+    since = jnp.asarray(since_first(measured.quaternion[rows]))
+    turned = np.asarray(jax.vmap(jax.vmap(quaternion_product))(since, begun))
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
     mse = rotation = None
     if oriented.any():

@@ -10,9 +10,15 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.experiments import (
+    DT,
+    experiments_of,
+    measured_rows,
+    names_of,
+    poses_of_nodes,
+)
 from knode_cosserat.identification.identify import identify
-from knode_cosserat.identification.inputs import DT, measurements_of, names_of, padded, poses_of_nodes
-from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
+from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual
 from knode_cosserat.identification.residual_model import FixedModel, ResidualModel
@@ -138,15 +144,16 @@ def with_residual(
     Raises:
         DataError: there is one recording only, or they cannot be used.
     """
-    measured = measurements_of(recordings)
+    measured = measured_rows(recordings)
     if len(measured) < 2:
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
     tension = np.concatenate([each.tension for each in measured])
-    model = Model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
+    model = Model.of_library(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
     x = coordinates_of(model, found)
     robot = model.reduced(x, found.effects)
     both = ResidualModel(model, found.effects, passive(robot, tension, seed, hidden))
-    return learn_residual(both, x, _data(measured, model), space, progress or log.info)
+    data = experiments_of(measured, model, space)
+    return learn_residual(both, x, data, space, progress or log.info)
 
 
 def coordinates_of(model: Model, found: Identified) -> np.ndarray:
@@ -163,11 +170,6 @@ def _teller(progress: bool) -> Callable[[str], None]:
     return (lambda line: print(line, file=sys.stderr, flush=True)) if progress else log.info
 
 
-def _data(measured: Sequence[Measurements], model: Any) -> list[RecordingData]:
-    named = zip(measured, names_of(measured), strict=True)
-    return padded([data_of(each, model, name) for each, name in named])
-
-
 def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
     """Return the poses in all data, and the use of each, in words."""
     found, words = [], []
@@ -176,11 +178,11 @@ def _measured(given: Sequence[Any]) -> tuple[list[Measurements], list[str]]:
             found.append(poses_of_nodes(each, f"trajectory {k}"))
             words.append(f"trajectory {k}: poses of its {len(each.time)} rows, not its other states")
             continue
-        (rows,) = measurements_of([each])
+        (rows,) = measured_rows([each])
         found.append(rows)
         how = f"a recording, rows of {DT:g} s with mean tensions" if isinstance(each, Recording) else "rows"
         words.append(f"{names_of([rows])[0]}: {how}, {len(rows.time)} of them, poses and tensions")
-    return measurements_of(found), words
+    return measured_rows(found), words
 
 
 def _with(learned: LearnedResidual, name: str) -> dict[str, float]:
@@ -224,7 +226,7 @@ def _network(
     assert isinstance(options, PassiveOptions)
     model = ResidualModel(FixedModel(knowledge), (), passive(knowledge, tension, 0, options.hidden), WIDE)
     # it has the members of a Model
-    misfit = Misfit(model, _data(measured, model), space)  # type: ignore[arg-type]
+    misfit = Misfit(model, experiments_of(measured, model, space))  # type: ignore[arg-type]
     search = Search(misfit, tell)
     try:
         point = search.from_far(model.mask(PARTS))

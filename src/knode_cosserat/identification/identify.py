@@ -1,37 +1,48 @@
-"""Identification of a robot from recordings: its physical effects, and their parameters."""
+"""Identification of a robot from data: its physical effects, and their parameters."""
 
 from __future__ import annotations
 
+import contextlib
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.identification.inputs import measurements_of, names_of, padded
-from knode_cosserat.identification.intervals import estimates_of
+from knode_cosserat.estimation.outputs import States
+from knode_cosserat.identification.effects import parameter_effects
+from knode_cosserat.identification.experiments import Experiment, experiments_of, measured_rows
 from knode_cosserat.identification.journal import Journal
-from knode_cosserat.identification.misfit import Misfit, RecordingData, data_of
+from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.result import Estimate, Identified
+from knode_cosserat.identification.result import Identified, correlation_of, estimates_of
 from knode_cosserat.identification.search import Point, Search, SearchError
 from knode_cosserat.identification.selection import held_out, improved, selected, sizes
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
+from knode_cosserat.identification.undetermined import gap_of, unexplained
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
 #: nodes are doubled so often at most
 REFINEMENTS = 2
-#: most corrections of a search without one recording
+#: most evaluations of a search without one recording
 FOLD = (8, 5e-3)
+#: row 0 disagrees with the initial equilibrium if it is further away than this part of the length, and than
+#: this part of the motion's root mean square
+AWAY, OF_MOTION = 0.01, 0.25
+
+Tell = Callable[[str], None]
 
 
 class IdentificationError(KnodeCosseratError, ValueError):
@@ -42,101 +53,168 @@ class IdentificationError(KnodeCosseratError, ValueError):
 
 def identify(
     robot: System,
-    recordings: Sequence[Recording | Measurements],
+    data: Sequence[Recording | Measurements | Trajectory | Experiment],
     effects: Sequence[str] | None = None,
     *,
+    parameters: Sequence[str] | Literal["all"] | None = None,
     space: str | SpaceScheme = "lobatto2",
-    progress: Callable[[str], None] | None = None,
+    progress: Tell | None = None,
     checkpoint: str | Path | None = None,
 ) -> Identified:
-    """Identify a tendon robot from recordings: find its physical effects and their parameters.
+    """Find physical effects and parameters of a robot from recordings or trajectories, by least squares.
 
-    Whole simulations start in the equilibrium under the recording's initial tensions. They are compared with
-    the measured positions and with the rotations since the first row; velocities, forces and strains need not
-    be known. Parameters minimise robust squares, with a prior about the data sheet. An effect is kept only if
-    it lowers the error of held-out recordings by more than two standard errors of the improvement. The result
-    has to pass trials with larger and random tensions; effects are removed until it does.
+    Whole simulations, which start as the data do, are compared with everything that was measured: positions
+    and rotations since the first row of recordings, all states of trajectories, or any `Output` of an
+    `Experiment`. Unknown numbers are those of library effects, with priors about the data sheet, or plain
+    parameters of any system, without priors. One objective serves all: robust squares of differences, each
+    kind in units of its usual size, and the priors.
 
-    Time steps are short enough for vibrations (`identification.steps`), unless tensions are held from row to
-    row. Effects are selected with one step from row to row, and then again with the final steps. If the grid
-    is too coarse for the identified robot, its nodes are doubled and the last search is repeated: the result
-    may have more nodes than the nominal robot.
+    Without `effects` and `parameters`, effects of a tendon robot are selected: an effect is kept only if it
+    lowers the error of held-out recordings by more than two standard errors of the improvement. A robot with
+    effects has to pass trials with larger and random tensions; effects are removed until it does. Time steps
+    are short enough for vibrations (`identification.steps`), unless tensions are held from row to row. If the
+    grid is too coarse, its nodes are doubled: the result may have more nodes than the nominal robot.
 
     Args:
-        robot: the nominal robot, from ruler, scale and data sheet; a robot with tendons.
-        recordings: recordings, or their `Measurements` with mean tensions (`recording.sampled(0.0125,
-            mean=True)`), each starting at rest; at least two, to select effects by held-out error.
-        effects: names of effects (`effects_of`) that are all identified; None: select effects.
-        space: the scheme along the rod for which the result is valid.
+        robot: nominal robot, where the search begins; effects need a robot with tendons.
+        data: recordings (`load_recording`, or rows of them, `Recording.sampled(0.0125, mean=True)`), each
+            starting at rest, at least two to select effects; full states; or experiments.
+        effects: names of effects (`effects_of`) that are all identified; None: select effects, unless there
+            are `parameters`.
+        parameters: parameters by name (`System.parameters`), those of parts with dots, such as
+            `loads.0.mass`; "all": all of the robot's own that the data determine.
+        space: scheme along the rod of recordings, for which the result is valid; trajectories have their own.
         progress: called with a line for each step.
         checkpoint: folder in which finished searches are kept; an interrupted run with the same arguments
             resumes from there.
 
     Returns:
-        The `Identified` robot, with estimates, intervals, and errors of held-out recordings.
+        The `Identified` robot, with estimates, 95 % intervals, parameters that the data do not determine, and
+        errors of held-out recordings.
 
     Raises:
-        IdentificationError: the robot has no tendons, or cannot be simulated under the initial tensions.
-        DataError: a recording is too short, or has unknown tensions.
-        ParameterError: an effect that does not exist.
+        IdentificationError: the robot has no tendons but effects are wanted, it cannot be simulated, the data
+            determine no parameter, or the search does not converge within the allowed ranges.
+        DataError: data that are too short, do not fit the robot, or do not start at rest.
+        ParameterError: an effect or a parameter that does not exist, or cannot be searched.
     """
-    tell = progress or log.info
+    system: Any = robot
+    if not isinstance(system, System) or np.ndim(robot.length):
+        raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")
+    tell, journal = progress or log.info, None if checkpoint is None else Journal(checkpoint)
+    plain = [] if parameters is None else parameter_effects(robot, parameters)
+    if effects is None and parameters is not None:
+        model = Model(robot, plain)
+        search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
+        return _with_parameters(search)
     if not isinstance(robot, TendonRod):
         raise IdentificationError(
             f"robot is a {type(robot).__name__}; allowed is a robot with tendons (TendonRobot, "
-            "RoutedTendonRobot)"
+            'RoutedTendonRobot), or name `parameters`, such as parameters="all"'
         )
-    measured = measurements_of(recordings)
-    journal = None if checkpoint is None else Journal(checkpoint)
-    search = _search(robot, measured, space, tell, journal)
-    model, data = search.misfit.model, search.misfit.data
+    measured = measured_rows(data)
+
+    def searched(robot: Any) -> Search:
+        tension = np.concatenate([rows.tension for rows in measured])
+        model = Model.of_library(robot, tension, measured[0].fractions, plain)
+        misfit = Misfit(model, experiments_of(measured, model, space))
+        return Search(misfit, tell, journal=journal)
+
+    search = searched(robot)
+    model = search.misfit.model
     far = search
-    if any(each.steps > 1 for each in data):
-        far = Search(Misfit(model, [each._replace(steps=1) for each in data], space), tell, journal=journal)
+    if any(it.steps > 1 for it in search.misfit.data):
+        far = Search(Misfit(model, [it.replace(steps=1) for it in search.misfit.data]), tell, journal=journal)
     steps: list[str] = []
     try:
         if effects is not None:
-            names = _known(effects, model)
+            names = _known([*effects, *(effect.name for effect in plain)], model)
             point = far.from_far(model.mask(names))
         else:
             names, point, taken = selected(far, tell)
             steps += taken
         if search is not far:
             point = search.run(point.x, model.mask(names))
-        search, point = _refined(search, names, point, measured, steps)
+        for _ in range(REFINEMENTS):
+            model = search.misfit.model
+            if not has_coarse_rows(model.reduced(point.x, names), search.misfit.data, space):
+                break
+            nodes = 2 * model.nominal.nodes
+            tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
+            search = searched(model.nominal.replace(nodes=nodes))
+            point = search.run(point.x, search.misfit.model.mask(names))
+            steps.append(f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
         if effects is None and search is not far:
             names, point, taken = improved(search, names, point, tell, ", by the final steps")
             steps += taken
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
-    return _accepted(search, names, point, search.misfit.data, steps, space, tell)
+    return _accepted(search, names, point, steps, space)
 
 
-def _search(
-    robot: TendonRod, measured: Sequence[Measurements], space: str | SpaceScheme,
-    tell: Callable[[str], None], journal: Journal | None,
-) -> Search:  # fmt: skip
-    tension = np.concatenate([each.tension for each in measured])
-    model = Model(robot, tension, measured[0].fractions)
-    data = [data_of(each, model, name) for each, name in zip(measured, names_of(measured), strict=True)]
-    return Search(Misfit(model, padded(data), space), tell, journal=journal)
+# plain parameters
 
 
-def _refined(
-    search: Search, names: tuple[str, ...], point: Point, measured: Sequence[Measurements], steps: list[str]
-) -> tuple[Search, Point]:
-    """Return the search, and its end, on a grid that is not too coarse for the robot that was found."""
-    space, tell = search.misfit.settings.space, search.tell
-    for _ in range(REFINEMENTS):
-        model, data = search.misfit.model, search.misfit.data
-        if not has_coarse_rows(model.reduced(point.x, names), data, space):
+def _with_parameters(search: Search) -> Identified:
+    """Return the robot with parameters that have flat priors; undetermined ones stay as they are."""
+    model = search.misfit.model
+    names, steps = model.names, list[str]()
+    while True:
+        if not names:
+            raise IdentificationError(f"these data determine none of {', '.join(model.names)}: {steps[-1]}")
+        try:
+            gap = None
+            with contextlib.suppress(SearchError):  # whole motions of a distant robot may have no solution
+                gap = gap_of(search, search.run(np.zeros(model.size), model.mask(names), None, 0), False)
+            if gap is None:
+                point = search.from_far(model.mask(names))
+                gap = gap_of(search, point, True)
+        except SearchError as error:
+            _require_start(search, np.zeros(model.size))
+            raise IdentificationError(str(error)) from None
+        if gap is None:
             break
-        nodes = 2 * model.nominal.nodes
-        tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
-        search = _search(model.nominal.replace(nodes=nodes), measured, space, tell, search.journal)
-        point = search.run(point.x, search.misfit.model.mask(names))
-        steps.append(f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
-    return search, point
+        steps.append(gap.reason)
+        search.tell(gap.reason)
+        names = tuple(name for name in names if name not in gap.names)
+    _require_start(search, point.x)
+    if not point.converged:
+        raise IdentificationError("the search did not converge; begin closer to the data")
+    _require_range(model, names, point)
+    left = tuple(name for name in model.names if name not in names)
+    return _result(search, model.reduced(point.x, names), names, point, steps, undetermined=left)
+
+
+def _require_start(search: Search, x: np.ndarray) -> None:
+    """Raise `DataError` if row 0 is not the equilibrium that an experiment starts from."""
+    length = float(np.asarray(search.misfit.model.nominal.length))
+    for data, rollout in zip(search.misfit.data, search.misfit.differences(x, 0), strict=True):
+        places = _places(data)
+        if data.held is None or rollout is None or places is None:
+            continue
+        apart = np.linalg.norm(_positions(rollout, data)[:1], axis=-1)
+        moved = np.sum((places(data.data) - places(data.data)[:1]) ** 2, axis=-1)
+        count = np.maximum(np.isfinite(moved).sum(axis=0), 1)
+        away, usual = np.max(np.nan_to_num(apart)), np.max(np.sqrt(np.nansum(moved, axis=0) / count))
+        if away > max(AWAY * length, OF_MOTION * usual):
+            raise DataError(
+                f"{data.name}: row 0 is {1e3 * away:.3g} mm from the equilibrium under "
+                f"{np.round(data.held, 4).tolist()}; allowed is data that start at rest. Use the rows "
+                "after the robot has settled, state initial_tension, or give full states"
+            )
+
+
+def _require_range(model: Model, names: Sequence[str], point: Point) -> None:
+    """Raise if a number ended at a limit of its allowed range; a limit of zero is accepted."""
+    for number, value, free in zip(model.numbers, model.values(point.x), model.mask(names), strict=True):
+        for end in (number.low, number.high):
+            if free and end != 0.0 and abs(value - end) <= 1e-6 * abs(end):
+                raise IdentificationError(
+                    f"{number.label} ran to the end of its allowed range, {end:g}; leave it out"
+                )
+
+
+# library effects
 
 
 def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
@@ -146,50 +224,42 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
                 f"there is no effect {name!r}{did_you_mean(name, model.names)}; there are "
                 f"{', '.join(model.names)}"
             )
-    wanted = {*effects, *(each.name for each in model.effects if each.basic)}
+    wanted = {*effects, *(effect.name for effect in model.effects if effect.basic)}
     return tuple(name for name in model.names if name in wanted)
 
 
 def _accepted(
-    search: Search, names: tuple[str, ...], point: Point, data: Sequence[RecordingData], steps: list[str],
-    space: str | SpaceScheme, tell: Callable[[str], None],
-) -> Identified:  # fmt: skip
+    search: Search, names: tuple[str, ...], point: Point, steps: list[str], space: str | SpaceScheme
+) -> Identified:
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails."""
-    model = search.misfit.model
+    model, data = search.misfit.model, search.misfit.data
     while True:
         found = model.reduced(point.x, names)
         reason = failed_trial(found, data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
-        tell(f"not accepted: {reason}")
+        search.tell(f"not accepted: {reason}")
         if not added:
             steps.append(f"the nominal robot is returned: {reason}")
-            return _result(search, model.nominal, (), None, data, steps)
-        fewest = _least_missed(search, point, names, added)
+            return _result(search, model.nominal, (), None, steps)
+
+        def cost(name: str, point: Point = point, names: tuple[str, ...] = names) -> float:
+            """Return the cost without an effect, by the equations linear about the point."""
+            return held_out(point.problem, point.x, model.mask(set(names) - {name}), model)
+
+        fewest = min(added, key=cost)
         steps.append(f"without {fewest}: {reason}")
         names = tuple(name for name in names if name != fewest and fewest not in model.effect(name).needs)
         point = search.run(np.where(model.mask(names), point.x, 0.0), model.mask(names), scale=point.scale)
     left_out, folds = _held_out(search, point)
-    nominal = _errors(search, np.zeros(model.size))
-    better = [np.inf if error is None else error for error in left_out]
-    if len(data) > 1 and np.mean(better) >= np.mean([np.inf if e is None else e for e in nominal]):
+    nominal = [np.inf if error is None else error for error in _errors(search, np.zeros(model.size))]
+    unseen = [np.inf if error is None else error for error in left_out]
+    if len(data) > 1 and np.mean(unseen) >= np.mean(nominal):
         steps.append("the nominal robot is returned: it predicts held-out recordings as well")
-        return _result(search, model.nominal, (), None, data, steps)
+        return _result(search, model.nominal, (), None, steps)
     found = found.replace(trained=trained_range(found, data, space))
-    estimates = estimates_of(model, names, point, folds)
-    return _result(search, found, names, point, data, steps, left_out, estimates)
-
-
-def _least_missed(search: Search, point: Point, names: Sequence[str], added: Sequence[str]) -> str:
-    """Return the added effect whose absence costs least, by the equations linear about the point."""
-    model = search.misfit.model
-
-    def cost(name: str) -> float:
-        fewer = [each for each in names if each != name]
-        return held_out(point.problem, point.x, model.mask(fewer), model)
-
-    return min(added, key=cost)
+    return _result(search, found, names, point, steps, left_out, folds)
 
 
 def _held_out(search: Search, point: Point) -> tuple[list[float | None], list[np.ndarray]]:
@@ -207,34 +277,66 @@ def _held_out(search: Search, point: Point) -> tuple[list[float | None], list[np
     return errors, folds
 
 
+# errors of the tip
+
+
+def _places(data: Experiment) -> Callable[[np.ndarray], np.ndarray] | None:
+    """Return a function from numbers in rows to positions (rows, M, d); None if the data have none."""
+    output = data.output
+    if isinstance(output, States):
+        fields = [name for name, _ in output.y_names]
+        if "p" not in fields:
+            return None
+        sizes = [size for _, size in output.y_names]
+        first = sum(sizes[: fields.index("p")])
+        count, size = sum(sizes), sizes[fields.index("p")]
+        return lambda rows: rows[:, : output.nodes * count].reshape(len(rows), output.nodes, count)[
+            ..., first : first + size
+        ]
+    bodies = len(getattr(output, "fractions", ()))
+    if not bodies or not output.labels[0].startswith("position"):
+        return None
+    dimension = 3 if hasattr(output, "sigma_rotation") else data.data.shape[1] // bodies
+    return lambda rows: rows.reshape(len(rows), bodies, -1)[..., :dimension]
+
+
+def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:
+    places = _places(data)
+    assert places is not None
+    return places(rollout.values * data.noise)
+
+
 def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -> list[float | None]:
-    """Return the root mean square error of the last body's position (m), by recording."""
-    found = search.misfit.differences(x, which=which, derivatives=False)
+    """Return the root mean square error of the last body's position (m), by experiment."""
+    chosen = [search.misfit.data[k] for k in (range(len(search.misfit.data)) if which is None else which)]
     errors: list[float | None] = []
-    for rollout in found:
-        if rollout is None:
+    for data, rollout in zip(chosen, search.misfit.differences(x, which=which), strict=True):
+        if rollout is None or _places(data) is None:
             errors.append(None)
             continue
-        tip = np.sum(rollout.values[:, -1, :3] ** 2, axis=-1)
+        tip = np.sum(_positions(rollout, data)[:, -1] ** 2, axis=-1)
         errors.append(float(np.sqrt(np.nanmean(tip))))
     return errors
 
 
 def _result(
-    search: Search, robot: System, names: tuple[str, ...], point: Point | None, data: Sequence[RecordingData],
-    steps: Sequence[str], left_out: Sequence[float | None] = (), estimates: Sequence[Estimate] = (),
+    search: Search, robot: System, names: tuple[str, ...], point: Point | None, steps: Sequence[str],
+    left_out: Sequence[float | None] = (), folds: Sequence[np.ndarray] = (),
+    undetermined: tuple[str, ...] = (),
 ) -> Identified:  # fmt: skip
     model = search.misfit.model
-    recordings = [each.name for each in data]
+    recordings = [data.name for data in search.misfit.data]
     nominal = _errors(search, np.zeros(model.size))
-    x = np.zeros(model.size) if point is None else point.x
-    identified = _errors(search, x)
+    found = nominal if point is None else _errors(search, point.x)
     return Identified(
         robot=robot,
         effects=names,
-        estimates=tuple(estimates),
+        estimates=() if point is None else tuple(estimates_of(model, names, point, folds)),
+        correlation=np.zeros((0, 0)) if point is None else correlation_of(model, names, point),
         nominal_error=dict(zip(recordings, nominal, strict=True)),
-        error=dict(zip(recordings, identified, strict=True)),
-        held_out_error=dict(zip(recordings, left_out or [None] * len(recordings), strict=True)),
+        error=dict(zip(recordings, found, strict=True)),
+        held_out_error=dict(zip(recordings, left_out, strict=False)),
+        undetermined=undetermined,
+        unexplained=() if point is None else unexplained(search, point),
         steps=tuple(steps),
     )

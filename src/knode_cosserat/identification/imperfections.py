@@ -64,7 +64,7 @@ def imperfect_robot(
     """
     if not 0 <= seed < 2**32:
         raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
-    model, random = Model(nominal, tension, bodies), np.random.default_rng(seed)
+    model, random = Model.of_library(nominal, tension, bodies), np.random.default_rng(seed)
     names: list[str] = []
     own = [effect for effect in model.effects if not effect.of_recordings]
     for effect in own:

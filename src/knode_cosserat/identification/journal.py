@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from knode_cosserat.identification.misfit import Misfit
 
 #: first line of every identity: another format has other files
-FORMAT = "search 2"
+FORMAT = "search 3"
 #: largest file (bytes)
 LARGEST_FILE = 100_000_000
 
@@ -61,17 +61,12 @@ class Journal:
 def identity(misfit: Misfit, prior: np.ndarray) -> str:
     """Return a hash of what every search depends on: model, recordings, settings, and this package."""
     model = misfit.model
-    words = [FORMAT, package_version(), repr(misfit.settings), repr(model.numbers), repr(model.names)]
+    words = [FORMAT, package_version(), repr(model.numbers), repr(model.names)]
     arrays = [prior, *jax.tree.leaves(model.robot)]
     for each in misfit.data:
         words.append(f"{each.name} {each.dt!r} {each.moves} {each.static} {each.continuous} {each.steps}")
-        arrays += [
-            each.initial_tension,
-            each.tension,
-            *jax.tree.leaves(each.places),
-            each.position,
-            each.rotation,
-        ]
+        words += [repr(each.settings), repr(each.output)]
+        arrays += [np.zeros(0) if each.held is None else each.held, each.control, each.data]
     return hashed(*words, *arrays)
 
 

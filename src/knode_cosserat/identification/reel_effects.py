@@ -12,7 +12,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.identification.effects import Effect, Number
+from knode_cosserat.identification.effects import Effect, Number, ReplaceInPart, Usual, register
+from knode_cosserat.rods.reels import Reels
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import Straight
 
@@ -20,12 +21,19 @@ from knode_cosserat.rods.routing import Straight
 TAKEN_IN, TURN = 0.01, 0.1
 
 
-def reel_effects(nominal: RoutedTendonRobot) -> list[Effect]:
-    """Return the effects of a robot with reels, beside those that all tendon robots have."""
-    reels = nominal.reels
-    assert reels is not None
+@register(order=2)
+def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+    """Return the effects of a robot with reels, or with stated routing."""
+    if nominal.drive != "reel":
+        return routing_effects(nominal)
     L, tendons = float(nominal.length), nominal.tendon_count
-    levels = _levels(nominal)
+    reels = nominal.reels or Reels(motors=np.arange(1.0, tendons + 1.0))
+    motors, levels = reels.motor_count(tendons), _levels(nominal)
+    zero = np.zeros(motors) if reels.zero is None else np.asarray(reels.zero)
+    taken_in = np.zeros(tendons) if reels.taken_in is None else np.asarray(reels.taken_in)
+    compliance = np.zeros(tendons) if reels.compliance is None else np.asarray(reels.compliance)
+    zero_width = np.full(motors, TAKEN_IN * L)
+    zero_width = zero_width if reels.radius is None else zero_width / np.asarray(reels.radius)
     effects = [
         Effect(
             "length",
@@ -44,24 +52,27 @@ def reel_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             "angle of each motor at which its reel has taken in nothing",
             tuple(
                 Number(f"reels.zero[{k}]", "rad" if reels.radius is not None else "m", float(at), width)
-                for k, (at, width) in enumerate(zip(reels.zero, _zero_widths(nominal), strict=True))
+                for k, (at, width) in enumerate(zip(zero, zero_width, strict=True))
             ),
-            lambda robot, v: _reels(robot, zero=jnp.stack(v)),
+            ReplaceInPart("reels", ("zero",), True),
+            _with_part("zero", zero),
         ),
         Effect(
             "taken in",
             "length of tendons that is taken in at the motors' zeros, by where they end",
             tuple(
-                Number(f"taken_in to {end:g} L", "m", float(np.mean(reels.taken_in[group])), TAKEN_IN * L)
+                Number(f"taken_in to {end:g} L", "m", float(np.mean(taken_in[group])), TAKEN_IN * L)
                 for end, group in levels
             ),
             lambda robot, v: _reels(robot, taken_in=_by_level(v, levels, tendons)),
+            _with_part("taken_in", taken_in),
         ),
         Effect(
             "springs",
             "compliance of the springs in series with tendons, by where these end",
-            tuple(_spring(end, float(np.mean(reels.compliance[group])), nominal) for end, group in levels),
+            tuple(_spring(end, float(np.mean(compliance[group])), nominal) for end, group in levels),
             lambda robot, v: _reels(robot, compliance=_by_level(v, levels, tendons)),
+            _with_part("compliance", compliance),
         ),
     ]
     if reels.radius is not None:
@@ -124,6 +135,16 @@ def _reels(robot: Any, **changes: Any) -> Any:
     return robot.replace(reels=dataclasses.replace(robot.reels, **changes))
 
 
+def _with_part(name: str, value: Any) -> Any:
+    """Return a function that gives a robot reels with a part."""
+
+    def added(robot: Any) -> Any:
+        reels = robot.reels or Reels(motors=np.arange(1.0, robot.tendon_count + 1.0))
+        return robot.replace(reels=dataclasses.replace(reels, **{name: value}))
+
+    return added
+
+
 def _levels(robot: RoutedTendonRobot) -> list[tuple[float, np.ndarray]]:
     """Return where tendons end, and which do there."""
     ends = np.array([each.end for each in robot.routings])
@@ -146,10 +167,3 @@ def _spring(end: float, given: float, robot: RoutedTendonRobot) -> Number:
     offset = float(np.mean([np.linalg.norm([float(at) for at in each.at(0.0)]) for each in robot.routings]))
     usual = offset**2 * float(robot.length) / float(robot.Kbt[0, 0])
     return Number(label, "m/N", 0.0, usual, 0.0, 1.0, begin=0.3)
-
-
-def _zero_widths(robot: RoutedTendonRobot) -> np.ndarray:
-    reels = robot.reels
-    assert reels is not None and reels.zero is not None
-    width = np.full(len(reels.zero), TAKEN_IN * float(robot.length))
-    return width if reels.radius is None else width / np.asarray(reels.radius)

@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.misfit import Misfit, RecordingData, Rollout
+from knode_cosserat.identification.experiments import Experiment
+from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.residual_model import ResidualModel
 from knode_cosserat.identification.search import (
     FINE,
@@ -24,7 +25,6 @@ from knode_cosserat.identification.search import (
     Search,
     SearchError,
     normal_equations,
-    scales_of,
 )
 from knode_cosserat.identification.selection import held_out
 from knode_cosserat.identification.trials import failed_trial
@@ -92,7 +92,7 @@ class LearnedResidual:
 
 
 def learn_residual(
-    model: ResidualModel, x: Float[np.ndarray, " m"], data: Sequence[RecordingData], space: str | SpaceScheme,
+    model: ResidualModel, x: Float[np.ndarray, " m"], data: Sequence[Experiment], space: str | SpaceScheme,
     tell: Callable[[str], None],
 ) -> LearnedResidual:  # fmt: skip
     """Learn a residual on an identified robot from at least two recordings.
@@ -107,12 +107,13 @@ def learn_residual(
     Raises:
         SearchError: the identified robot cannot be simulated.
     """
-    misfit = Misfit(model, data, space)  # type: ignore[arg-type]  # it offers what a Model does
+    misfit = Misfit(model, data)  # type: ignore[arg-type]  # it offers what a Model does
     begin = model.begun(x)
     rollouts = _solved(misfit, begin)
     search = Search(misfit, tell)
-    scale = scales_of(rollouts, search.length)
-    problem = normal_equations(rollouts, scale, search.thinned())
+    misfit.differentiated(rollouts)
+    scale = search.scales_of(rollouts)
+    problem = normal_equations(rollouts, search.units(scale), search.thinned())
     point = Point(begin, scale, problem, problem, model.mask(()), search.prior)
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
@@ -144,7 +145,7 @@ def learn_residual(
 
 
 def _learned(
-    model: ResidualModel, robot: System, data: Sequence[RecordingData], before: Sequence[PositionErrors],
+    model: ResidualModel, robot: System, data: Sequence[Experiment], before: Sequence[PositionErrors],
     after: Sequence[PositionErrors] | None, steps: list[str], x: np.ndarray, covariance: np.ndarray,
 ) -> LearnedResidual:  # fmt: skip
     names = [each.name for each in data]
@@ -241,20 +242,20 @@ def _in_parts(
                 found[part].append(PositionErrors(np.inf, np.inf))
                 continue
             x = one.point.x + part * (other.point.x - one.point.x)
-            (rollout,) = misfit.differences(x, which=[k], derivatives=False)
+            (rollout,) = misfit.differences(x, which=[k])
             found[part].append(PositionErrors(np.inf, np.inf) if rollout is None else _errors(rollout))
     return found
 
 
 def _errors(found: Rollout) -> PositionErrors:
-    square = np.sum(found.values[..., :3] ** 2, axis=-1)
+    square = np.sum(found.values.reshape(len(found.values), -1, 6)[..., :3] ** 2, axis=-1)
     return PositionErrors(float(np.sqrt(np.nanmean(square[:, -1]))), float(np.sqrt(np.nanmean(square))))
 
 
 def _over_spread(found: Rollout, fold: Point) -> Float[np.ndarray, " m"]:
-    assert found.derivatives is not None
-    values = found.values[1:, :, :3]
-    slopes = found.derivatives[:, 1:, :, :3][fold.free]
+    bodies = (*found.values.shape[:1], -1, 6)
+    values = found.values.reshape(bodies)[1:, :, :3]
+    slopes = found.derivatives[fold.free].reshape(int(fold.free.sum()), *bodies)[:, 1:, :, :3]
     covariance = fold.covariance()[np.ix_(fold.free, fold.free)]
     spread = np.sqrt(np.einsum("i...,ij,j...->...", slopes, covariance, slopes))
     known = np.isfinite(values)

@@ -110,6 +110,11 @@ class ResidualModel:
         return low, high
 
     @property
+    def prior(self) -> Float[np.ndarray, " n"]:
+        """Precision of each coordinate's prior."""
+        return np.ones(self.size)
+
+    @property
     def begin(self) -> Float[np.ndarray, " n"]:
         """Coordinates where a search from far begins: of the nominal robot without a residual."""
         return self.begun(np.zeros(self.model.size))

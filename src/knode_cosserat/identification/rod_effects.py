@@ -13,17 +13,25 @@ from knode_cosserat.identification.effects import (
     Number,
     Replace,
     ReplaceInPart,
-    ReplaceMasses,
+    Usual,
     along_axes,
+    register,
 )
+from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
+from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.section import Sleeve, Stretch
 from knode_cosserat.rotation import quaternion_of, quaternion_product
 
 #: first natural frequency of a clamped rod: β² with β = 1.8751
 FIRST_MODE = 3.516
 #: damping ratio of the first mode for which priors of damping are set
 DAMPING_RATIO = 0.02
+#: uncertainty of the clamped end's position, as a fraction of the length: tensions measured, or reels
+PLACED, PLACED_BY_REELS = 0.004, 0.03
+#: an upright base
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 class UsualSizes(NamedTuple):
@@ -56,14 +64,15 @@ class UsualSizes(NamedTuple):
         )  # fmt: skip
 
 
-def rod_effects(nominal: RoutedTendonRobot, placed: float) -> list[Effect]:
-    """Return the effects of the rod; `placed` is the uncertainty of the clamped end, in lengths."""
+@register(order=0)
+def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+    """Return the effects of the rod."""
     sizes = UsualSizes.of(nominal)
     return [
         *_stiffness_effects(nominal, sizes),
         *_damping_effects(nominal, sizes),
         *_mass_effects(nominal, sizes),
-        *_base_effects(placed * sizes.length),
+        *_base_effects((PLACED_BY_REELS if nominal.drive == "reel" else PLACED) * sizes.length),
     ]
 
 
@@ -85,12 +94,14 @@ def _stiffness_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Ef
                 *along_axes("curvature_slope", "1/m", 0.6 / L, "xy"),
             ),
             _with_curvature,
+            _stretchable,
         ),
         Effect(
             "taper",
             "change of the stiffness along the rod",
             (Number("taper", "", 0.0, 0.4, -1.8, 1.8),),
             _with_taper,
+            _stretchable,
         ),
         Effect(
             "sleeve",
@@ -100,6 +111,7 @@ def _stiffness_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Ef
                 Number("sleeve.length", "", 0.15, 0.5, 0.01, 0.6, True),
             ),
             _with_sleeve,
+            _sleeved,
             usual=True,
         ),
         Effect(
@@ -134,12 +146,14 @@ def _damping_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Effe
                 Number("relaxation.time", "s", slow[1], 1.0, 0.02, 100.0, True),
             ),
             ReplaceInPart("relaxation", ("stiffness", "time")),
+            lambda robot: robot.replace(relaxation=robot.relaxation or Relaxation(stiffness=0.0)),
         ),
         Effect(
             "linear drag",
             "drag in proportion to velocity",
             (Number("linear_drag", "kg/(m s)", fluid, 3.0 * sizes.drag, 0.0, 1e4, begin=0.1),),
             _with_linear_drag,
+            _draggable,
             usual=True,
         ),
         Effect(
@@ -164,6 +178,7 @@ def _mass_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Effect]
             "mass at the tip beyond what is known",
             (Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1),),
             _with_tip_mass,
+            lambda robot: robot.replace(loads=(*robot.loads, AttachedMass(at=1.0, mass=0.0))),
         ),
         Effect(
             "mass along the rod",
@@ -172,14 +187,13 @@ def _mass_effects(nominal: RoutedTendonRobot, sizes: UsualSizes) -> list[Effect]
             Replace(("density",)),
         ),
     ]
-    # the last mass is that of the effect "tip mass"
     known = [
-        (k, float(each.mass)) for k, each in enumerate(nominal.loads[:-1])
+        (k, float(each.mass)) for k, each in enumerate(nominal.loads)
         if isinstance(each, AttachedMass) and float(each.mass) > 0.0
     ]  # fmt: skip
     if known:
         numbers = tuple(Number(f"loads[{k}].mass", "kg", mass, 0.3, 0.0, 1e4, True) for k, mass in known)
-        change = ReplaceMasses(tuple(k for k, _ in known))
+        change = Replace(tuple(f"loads.{k}.mass" for k, _ in known))
         effects.append(Effect("rib masses", "masses on the rod that are known", numbers, change))
     return effects
 
@@ -191,27 +205,54 @@ def _base_effects(placed: float) -> list[Effect]:
             "rotation of the clamped end, or of gravity against the frame",
             along_axes("base_rotation", "rad", 0.05),
             _rotated,
+            _placed,
         ),
         Effect(
             "base position",
             "position of the clamped end",
             along_axes("base_position", "m", placed),
             _displaced,
+            _placed,
         ),
     ]
 
 
-def _stretch(robot: Any, **changes: Any) -> Any:
-    """Change the stretch over the whole rod that `model.extended` has put last but one."""
-    *others, stretch, sleeve = robot.sections
-    return robot.replace(sections=(*others, dataclasses.replace(stretch, **changes), sleeve))
+def _stretchable(robot: Any) -> Any:
+    return robot.replace(sections=(*robot.sections, Stretch(stiffness=(1.0, 0.0))))
+
+
+def _sleeved(robot: Any) -> Any:
+    return robot.replace(sections=(*robot.sections, Sleeve()))
+
+
+def _draggable(robot: Any) -> Any:
+    return robot.replace(linear_drag=np.zeros((3, 3)) if robot.linear_drag is None else robot.linear_drag)
+
+
+def _placed(robot: Any) -> Any:
+    """Return the robot with a stated pose of its clamped end."""
+    held = robot.base_end
+    if not isinstance(held, Clamped):
+        return robot
+    position = np.zeros(3) if held.position is None else held.position
+    orientation = np.array(UPRIGHT) if held.orientation is None else held.orientation
+    return robot.replace(base_end=dataclasses.replace(held, position=position, orientation=orientation))
+
+
+def _section(robot: Any, kind: type, **changes: Any) -> Any:
+    """Change the last section of a kind, which the effect has added."""
+    last = max(k for k, section in enumerate(robot.sections) if isinstance(section, kind))
+    sections = list(robot.sections)
+    sections[last] = dataclasses.replace(sections[last], **changes)
+    return robot.replace(sections=tuple(sections))
 
 
 def _with_curvature(robot: Any, values: list[Any]) -> Any:
     x, y, slope_x, slope_y = values
     zero = jnp.zeros(())
-    return _stretch(
+    return _section(
         robot,
+        Stretch,
         curvature=jnp.stack([x - 0.5 * slope_x, y - 0.5 * slope_y, zero]),
         curvature_slope=jnp.stack([slope_x, slope_y, zero]),
     )
@@ -219,13 +260,11 @@ def _with_curvature(robot: Any, values: list[Any]) -> Any:
 
 def _with_taper(robot: Any, values: list[Any]) -> Any:
     (taper,) = values
-    return _stretch(robot, stiffness=jnp.stack([1.0 - 0.5 * taper, 1.0 * taper]))
+    return _section(robot, Stretch, stiffness=jnp.stack([1.0 - 0.5 * taper, 1.0 * taper]))
 
 
 def _with_sleeve(robot: Any, values: list[Any]) -> Any:
-    *others, sleeve = robot.sections
-    sleeve = dataclasses.replace(sleeve, stiffening=values[0], length=values[1])
-    return robot.replace(sections=(*others, sleeve))
+    return _section(robot, Sleeve, stiffening=values[0], length=values[1])
 
 
 def _with_axes(robot: Any, values: list[Any]) -> Any:

@@ -1,4 +1,8 @@
-"""Robust least squares with priors, over horizons that grow."""
+"""Robust least squares with priors, over horizons that grow.
+
+The one objective of identification: differences of rollouts, in units of their usual size by experiment and
+field, by Huber's loss, and priors of the numbers. `scipy.optimize.least_squares` minimises it.
+"""
 
 from __future__ import annotations
 
@@ -6,37 +10,44 @@ import dataclasses
 import itertools
 import logging
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.journal import Journal, hashed, identity
 from knode_cosserat.identification.misfit import Misfit, Rollout
 
 log = logging.getLogger(__name__)
 
-#: horizons (s) after the first motion; with all rows at once, a search from a poor nominal robot may fail
-HORIZONS = (0.0, 0.2, 0.4, 0.7, 1.1, 1.7, 2.5, 4.0)
-#: correlation time of differences (s): rows within it count as one
+#: parts of the longest motion over which preliminary searches go; with all rows at once, a search from a poor
+#: nominal robot may fail
+HORIZONS = (0.0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)
+#: correlation time of differences from real data (s): rows within it count as one
 CORRELATED = 0.25
 #: largest number of independent bodies
 BODIES = 2.0
 #: threshold of the Huber loss, in units of the scale
 ROBUST = 3.0
-#: smallest scale of the differences, as a fraction of the length
-LEAST_SCALE = 5e-4
-#: largest change of a coordinate in one correction
-LARGEST_MOVE = 1.0
+#: smallest scale of the differences: as a fraction of the length where a model with priors is not exact, and
+#: of natural sizes otherwise, ten times the solver's tolerance
+LEAST_SCALE, LEAST = 5e-4, 1e-9
+#: the scale is at least this part of the root mean square: fields may be zero in most rows
+OF_ALL = 0.2
 #: number of held-out pieces of a single recording
 FOLDS = 5
 #: duration of the blocks (s) for the scatter of an effect's improvement; at least two blocks
 BLOCK = 1.0
-#: corrections of a search at one horizon, and of the last one; parts by which the cost falls at their end
+#: evaluations of a search at one horizon, and of the last one; parts by which the cost falls at their end
 ROUGH, FINE = (6, 2e-2), (25, 1e-3)
-#: failed tries of one correction
-TRIES = 7
+#: the same without priors, where a start may be far
+FIRST, EXACT = (50, 1e-5), (100, 1e-10)
+#: evaluations with one scale where there are priors, most updates of the scale, and its relative change at
+#: the end
+PASS, PASSES, SETTLED = 5, 8, 0.05
+METHOD: Literal["trf"] = "trf"
 
 
 class Problem(NamedTuple):
@@ -51,20 +62,23 @@ class Problem(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """End of a search: coordinates, scales of the differences (m), and the normal equations there."""
+    """End of a search: coordinates, scales of the differences, and the normal equations there."""
 
     x: Float[np.ndarray, " n"]
-    scale: Float[np.ndarray, " R"]
+    #: by experiment and field; of poses in m
+    scale: Float[np.ndarray, "R G"]
     #: rows of each part that is left out together, and of the blocks of each part (equally many), in order
     problem: Problem
     blocks: Problem
     free: Bool[np.ndarray, " n"]
     #: precision of each coordinate's prior
     prior: Float[np.ndarray, " n"]
+    converged: bool = True
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return its arrays by name, for a file."""
-        found = {name: getattr(self, name) for name in ("x", "scale", "free", "prior")}
+        names = ("x", "scale", "free", "prior", "converged")
+        found = {name: np.asarray(getattr(self, name)) for name in names}
         for name in ("problem", "blocks"):
             found |= {f"{name}.{part}": array for part, array in getattr(self, name)._asdict().items()}
         return found
@@ -76,7 +90,8 @@ class Point:
             Problem(**{part: arrays[f"{name}.{part}"] for part in Problem._fields})
             for name in ("problem", "blocks")
         )
-        return cls(arrays["x"], arrays["scale"], problem, blocks, arrays["free"], arrays["prior"])
+        converged = bool(arrays["converged"])
+        return cls(arrays["x"], arrays["scale"], problem, blocks, arrays["free"], arrays["prior"], converged)
 
     @property
     def cost(self) -> float:
@@ -85,7 +100,8 @@ class Point:
 
     def covariance(self) -> Float[np.ndarray, "n n"]:
         """Return the covariance of the coordinates, of the prior where nothing is known or searched."""
-        free, full = self.free, np.diag(1.0 / self.prior)
+        free = self.free
+        full = np.diag(1.0 / np.where(self.prior > 0.0, self.prior, 1.0))
         matrix = self.problem.matrix.sum(axis=0)[np.ix_(free, free)] + np.diag(self.prior[free])
         full[np.ix_(free, free)] = np.linalg.inv(matrix)
         return full
@@ -99,42 +115,26 @@ def huber(values: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def normal_equations(
-    rollouts: Sequence[Rollout], scales: Float[np.ndarray, " R"], thinned: float,
-    folds: Sequence[Any] = (slice(None),),
+    rollouts: Sequence[Rollout], units: Sequence[np.ndarray], thinned: float,
+    folds: Sequence[Any] = (slice(None),), derivatives: bool = True,
 ) -> Problem:  # fmt: skip
-    """Return the normal equations, of each fold of each recording; a difference counts 1 / `thinned`."""
-    parts = []
-    pieces = [
-        (_rows(rollout, fold), scale)
-        for rollout, scale in zip(rollouts, scales, strict=True)
-        for fold in folds
-    ]
-    for rollout, scale in pieces:
-        known = np.isfinite(rollout.values)
-        values = rollout.values[known] / scale
-        cost, weights = huber(values)
-        n = 0 if rollout.derivatives is None else len(rollout.derivatives)
-        gradient, matrix = np.zeros(n), np.zeros((n, n))
-        if rollout.derivatives is not None:
-            slopes = rollout.derivatives[:, known] / scale
-            weighted = slopes * weights
-            gradient, matrix = weighted @ values, weighted @ slopes.T
-        parts.append((cost.sum() / thinned, known.sum() / thinned, gradient / thinned, matrix / thinned))
-    return Problem(*(np.array(part) for part in zip(*parts, strict=True)))
+    """Return the normal equations, of each fold of each rollout; a difference counts 1 / `thinned`.
 
-
-def _rows(rollout: Rollout, fold: Any) -> Rollout:
-    slopes = rollout.derivatives
-    return Rollout(rollout.values[fold], None if slopes is None else slopes[:, fold])
-
-
-def scales_of(rollouts: Sequence[Rollout], length: float) -> Float[np.ndarray, " R"]:
-    """Return the usual size of the differences of each recording (m).
-
-    Each recording is weighted by its residual, so one that cannot be explained does not spoil the others.
+    `units` are sizes (e,) of the differences of each rollout.
     """
-    known = [rollout.values[np.isfinite(rollout.values)] for rollout in rollouts]
-    return np.array([max(1.4826 * float(np.median(np.abs(v))), LEAST_SCALE * length) for v in known])
+    parts = []
+    for rollout, unit in zip(rollouts, units, strict=True):
+        for fold in folds:
+            scaled = rollout.values[fold] / unit
+            known = np.isfinite(scaled)
+            cost, weights = huber(scaled[known])
+            gradient, matrix = np.zeros(0), np.zeros((0, 0))
+            if derivatives:
+                slopes = (rollout.derivatives[:, fold] / unit)[:, known]
+                weighted = slopes * weights
+                gradient, matrix = weighted @ scaled[known], weighted @ slopes.T
+            parts.append((cost.sum() / thinned, known.sum() / thinned, gradient / thinned, matrix / thinned))
+    return Problem(*(np.array(part) for part in zip(*parts, strict=True)))
 
 
 class Search:
@@ -152,10 +152,25 @@ class Search:
         prior: Float[np.ndarray, " n"] | None = None, journal: Journal | None = None,
     ):  # fmt: skip
         self.misfit, self.tell, self.journal = misfit, tell, journal
-        self.prior = np.ones(misfit.model.size) if prior is None else prior
+        self.prior = np.asarray(misfit.model.prior if prior is None else prior)
+        #: True if no number has a prior: the equations are taken to be exact, and noise to be white
+        self.exact = not np.any(self.prior)
         self._identity = "" if journal is None else identity(misfit, self.prior)
-        self.length = float(misfit.model.nominal.length)
+        self.length = float(np.asarray(misfit.model.nominal.length))
         self.low, self.high = misfit.model.bounds
+        self.least = [self._least_scale(data) for data in misfit.data]
+
+    def _least_scale(self, data: Experiment) -> np.ndarray:
+        """Return the smallest scale (G,) of the differences of an experiment."""
+        fields, groups = data.fields, data.groups
+        if not self.exact:
+            return np.full(len(fields), LEAST_SCALE * self.length)
+        if len(fields) == 1:
+            return np.array([LEAST * self.length])
+        count = np.maximum(np.isfinite(data.data[1:]).sum(axis=0), 1)
+        usual = np.sqrt(np.nansum(np.square(data.data[1:]), axis=0) / count)
+        sizes = np.array([np.max(usual[groups == k]) for k in range(len(fields))])
+        return LEAST * np.where(sizes > 0.0, sizes, 1.0)
 
     @property
     def folds(self) -> list[slice]:
@@ -165,7 +180,7 @@ class Search:
             return [slice(None)]
         if first.static:
             return [slice(k, None, FOLDS) for k in range(FOLDS)]
-        edges = np.linspace(0, len(first.tension) + 1, FOLDS + 1).astype(int)
+        edges = np.linspace(0, len(first.control) + 1, FOLDS + 1).astype(int)
         return [slice(low, high) for low, high in itertools.pairwise(edges)]
 
     def blocks(self, count: int) -> list[Int[np.ndarray, " m"]]:
@@ -178,7 +193,9 @@ class Search:
     def thinned(self) -> float:
         """Return how many differences count as one: they are correlated in time, and between bodies."""
         data = self.misfit.data[0]
-        bodies = max(1.0, data.position.shape[1] / BODIES)
+        if self.exact:
+            return 1.0
+        bodies = max(1.0, len(getattr(data.output, "fractions", ())) / BODIES)
         return max(1.0, CORRELATED / data.dt) * bodies
 
     def from_far(self, free: Bool[np.ndarray, " n"]) -> Point:
@@ -189,20 +206,21 @@ class Search:
         """
         x = np.where(free, self.misfit.model.begin, 0.0)
         data = self.misfit.data
-        longest = max(len(each.tension) - each.moves for each in data) * data[0].dt
+        longest = max(len(it.control) - it.moves for it in data)
         wound = {"reel", "motor"} & {*self.misfit.model.nominal.control_layout.names}
         if data[0].static or wound:
             # rows are independent of each other, and wound-up lengths keep the search near the solution
-            longest = 0.0
-        for horizon in [h for h in HORIZONS if h < 0.8 * longest]:
-            rows = round(horizon / data[0].dt)
-            x = self.run(x, free, rows, *ROUGH).x
-        return self.run(x, free, None, *FINE)
+            longest = 0
+        rows = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
+        for horizon in dict.fromkeys(rows):
+            if horizon < 0.8 * longest:
+                x = self.run(x, free, horizon, *(FIRST if self.exact else ROUGH)).x
+        return self.run(x, free, None, *(EXACT if self.exact else FINE))
 
     def run(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None = None,
         most: int = FINE[0], fall: float = FINE[1], which: Sequence[int] | None = None,
-        scale: Float[np.ndarray, " R"] | None = None,
+        scale: Float[np.ndarray, "R G"] | None = None,
     ) -> Point:  # fmt: skip
         """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows.
 
@@ -237,78 +255,163 @@ class Search:
 
     def _searched(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None, most: int,
-        fall: float, which: Sequence[int] | None, scale: Float[np.ndarray, " R"] | None,
+        fall: float, which: Sequence[int] | None, scale: Float[np.ndarray, "R G"] | None,
     ) -> Point:  # fmt: skip
         now = self._solved(x, rows, which)
         if now is None:
             raise SearchError("the robot that the search begins from cannot be simulated")
-        fixed = scale
-        damping = 1e-3
-        for k in range(most):
-            scale = scales_of(now, self.length) if fixed is None else fixed
-            problem = normal_equations(now, scale, self.thinned())
-            cost = problem.cost.sum() + np.sum(self.prior * x**2)
-            step = self._correction(x, free, problem, cost, scale, damping, rows, which)
-            if step is None:
+        remaining, converged, sizes = most, False, scale
+        for _ in range(PASSES if most else 0):
+            sizes = self.scales_of(now, which) if scale is None else scale
+            budget = remaining if scale is not None else min(PASS if not self.exact else most, remaining)
+            descent = _Descent(self, x, free, rows, which, sizes, now)
+            used, converged = descent.run(budget, fall)
+            x, now, remaining = descent.x, descent.rollouts, remaining - used
+            after = self.scales_of(now, which)
+            text = ", ".join(f"{1e3 * size:.2f}" for size in after[:, 0])
+            told = "all rows" if rows is None else f"{rows} rows"
+            self.tell(f"{told}, {most - remaining} evaluations: {text} mm")
+            settled = np.all(np.abs(after - sizes) <= SETTLED * sizes)
+            if scale is not None or (converged and settled) or remaining <= 0:
                 break
-            there, damping, lower = step
-            again = self._solved(there, rows, which)
-            if again is None:  # recovery has its time, and a busy machine gets less done in it
-                break
-            x, now = there, again
-            sizes = ", ".join(f"{1e3 * size:.2f}" for size in scales_of(now, self.length))
-            self.tell(f"{'all rows' if rows is None else f'{rows} rows'}, correction {k + 1}: {sizes} mm")
-            if cost - lower < fall * cost:
-                break
-        scale = scales_of(now, self.length) if fixed is None else fixed
+        sizes = self.scales_of(now, which) if scale is None else scale
+        units = self.units(sizes, which)
+        self.misfit.differentiated(now)
+        if self.exact:
+            problem = normal_equations(now, units, self.thinned())
+            return Point(x, sizes, problem, problem, free, self.prior, converged)
         # a short horizon has fewer rows of a recording that rests for less time
-        rows_of_all = min(len(each.values) for each in now)
-        blocks = normal_equations(now, scale, self.thinned(), self.blocks(rows_of_all))
+        rows_of_all = min(len(rollout.values) for rollout in now)
+        blocks = normal_equations(now, units, self.thinned(), self.blocks(rows_of_all))
         parts = len(now) * len(self.folds)
-        problem = Problem(*(each.reshape(parts, -1, *each.shape[1:]).sum(axis=1) for each in blocks))
-        return Point(x, scale, problem, blocks, free, self.prior)
+        problem = Problem(*(part.reshape(parts, -1, *part.shape[1:]).sum(axis=1) for part in blocks))
+        return Point(x, sizes, problem, blocks, free, self.prior, converged)
+
+    def scales_of(self, rollouts: Sequence[Rollout], which: Sequence[int] | None = None) -> np.ndarray:
+        """Return the usual size (R, G) of the differences by experiment and field.
+
+        Each experiment is weighted by its residual, so one that cannot be explained does not spoil others.
+        """
+        chosen = range(len(self.misfit.data)) if which is None else which
+        found = np.ones((len(rollouts), max(len(self.least[k]) for k in chosen)))
+        for row, rollout, k in zip(found, rollouts, chosen, strict=True):
+            for field, least in enumerate(self.least[k]):
+                values = rollout.values[:, self.misfit.data[k].groups == field]
+                sizes = np.abs(values[np.isfinite(values)])
+                usual = 0.0
+                if len(sizes):
+                    usual = max(1.4826 * float(np.median(sizes)), OF_ALL * float(np.sqrt(np.mean(sizes**2))))
+                row[field] = max(usual, least)
+        if self.exact and len({self.misfit.data[k].fields for k in chosen}) == 1:
+            # white noise of one sensor; separate weights would drift where the model is wrong
+            found[:] = np.sqrt(np.mean(found**2, axis=0))
+        return found
+
+    def units(self, scale: np.ndarray, which: Sequence[int] | None = None) -> list[np.ndarray]:
+        """Return the unit (e,) of every number of a difference."""
+        chosen = range(len(self.misfit.data)) if which is None else which
+        return [sizes[self.misfit.data[k].groups] for sizes, k in zip(scale, chosen, strict=True)]
 
     def _solved(self, x: np.ndarray, rows: int | None, which: Sequence[int] | None) -> list[Rollout] | None:
         found = self.misfit.differences(x, rows, which)
-        return None if any(each is None for each in found) else found  # type: ignore[return-value]
+        return None if any(rollout is None for rollout in found) else found  # type: ignore[return-value]
 
-    def _correction(
-        self, x: np.ndarray, free: np.ndarray, problem: Problem, cost: float, scale: np.ndarray,
-        damping: float, rows: int | None, which: Sequence[int] | None,
-    ) -> tuple[np.ndarray, float, float] | None:  # fmt: skip
-        """Return a better point, the next damping and its cost; None if none was found."""
-        gradient = problem.gradient.sum(axis=0) + self.prior * x
-        matrix = problem.matrix.sum(axis=0) + np.diag(self.prior)
-        for _ in range(TRIES):
-            there = self._proposed(x, free, gradient, matrix, damping)
-            tried = self.misfit.differences(there, rows, which, derivatives=False)
-            if all(each is not None for each in tried):
-                found = [each for each in tried if each is not None]
-                lower = normal_equations(found, scale, self.thinned()).cost.sum()
-                lower = lower + np.sum(self.prior * there**2)
-                if lower < cost:
-                    return there, max(damping / 10.0, 1e-6), float(lower)
-            damping = max(damping, 1e-4) * 8.0
-        return None
 
-    def _proposed(
-        self, x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, damping: float
-    ) -> np.ndarray:
-        """Return the point of a damped correction; coordinates that meet a bound stay there."""
-        active = free.copy()
-        move = np.zeros(len(x))
-        for _ in range(len(x)):
-            where = np.ix_(active, active)
-            damped = matrix[where] + damping * np.diag(np.diag(matrix)[active])
-            move = np.zeros(len(x))
-            move[active] = -np.linalg.solve(damped, gradient[active])
-            out = active & (((x <= self.low) & (move < 0.0)) | ((x >= self.high) & (move > 0.0)))
-            if not out.any():
-                break
-            active &= ~out
-        longest = np.max(np.abs(move))
-        move = move / max(1.0, longest / LARGEST_MOVE)
-        return np.clip(x + move, self.low, self.high)
+class _Descent:
+    """One run of least squares with fixed sizes of the differences, from a point whose rollouts are known."""
+
+    def __init__(
+        self, search: Search, x: np.ndarray, free: np.ndarray, rows: int | None, which: Any,
+        sizes: np.ndarray, rollouts: list[Rollout],
+    ):  # fmt: skip
+        self.search, self.free, self.rows, self.which = search, free, rows, which
+        self.begin, self.x, self.rollouts = x, x, rollouts
+        self.units, self.thinned = search.units(sizes, which), np.sqrt(search.thinned())
+        self.known = [np.isfinite(rollout.values) for rollout in rollouts]
+        self.last: tuple[bytes, list[Rollout] | None] = (x[free].tobytes(), rollouts)
+        self.best = np.inf
+
+    def run(self, most: int, fall: float) -> tuple[int, bool]:
+        """Minimise; return the number of evaluations and a flag of convergence."""
+        from scipy.optimize import least_squares  # imported here: it takes a third of a second
+
+        search, free = self.search, self.free
+        begin = self.x[free]
+        low, high = search.low[free], search.high[free]
+        self.unit = 1.0 / np.sqrt(len(begin))
+        self.origin, self.reach = begin, np.ones(len(begin))
+        if search.exact:
+            self.reach = self._reach(begin)
+        # numbers of length one: the first step is at most that long, and tolerances are relative to it
+        self.origin = begin - self.reach * self.unit
+        low, high = ((end - self.origin) / self.reach for end in (low, high))
+        ended = least_squares(
+            self.values, np.clip(self.unit, low, high), self.slopes, (low, high), method=METHOD,
+            ftol=fall, xtol=1e-9 if search.exact else 1e-4, gtol=1e-15, max_nfev=most,
+        )  # fmt: skip
+        self._at(ended.x)
+        self.x = self._whole(ended.x)
+        assert self.last[1] is not None
+        self.rollouts = self.last[1]
+        return int(ended.nfev), bool(ended.status > 0)
+
+    def _reach(self, begin: np.ndarray) -> np.ndarray:
+        """Return steps of length one: a factor of e, a number's size, or its own Gauss-Newton step."""
+        numbers = [it for it, on in zip(self.search.misfit.model.numbers, self.free, strict=True) if on]
+        values, slopes = self.values(np.zeros(len(begin))), self.slopes(np.zeros(len(begin)))
+        lengths = np.linalg.norm(slopes, axis=0)
+        alone = np.linalg.norm(values) / np.where(lengths > 0.0, lengths, np.inf)
+        zero = np.array([not number.logarithmic and number.value(at) == 0.0
+                         for number, at in zip(numbers, begin, strict=True)])  # fmt: skip
+        return np.where(zero & (alone > 0.0), alone, 1.0)
+
+    def _whole(self, step: np.ndarray) -> np.ndarray:
+        x = self.begin.copy()
+        moved = self.origin + self.reach * step
+        x[self.free] = np.clip(moved, self.search.low[self.free], self.search.high[self.free])
+        return x
+
+    def _at(self, step: np.ndarray) -> list[Rollout] | None:
+        x = self._whole(step)
+        key = x[self.free].tobytes()
+        if self.last[0] != key:
+            self.last = key, self.search._solved(x, self.rows, self.which)
+        return self.last[1]
+
+    def _priors(self) -> np.ndarray:
+        return np.sqrt(self.search.prior[self.free])
+
+    def values(self, step: np.ndarray) -> np.ndarray:
+        """Return square roots of Huber's costs, with signs, and the priors; infinite without a solution."""
+        found, prior = self._at(step), self._priors()
+        count = sum(int(known.sum()) for known in self.known) + len(prior)
+        if found is None:
+            return np.full(count, np.inf)
+        scaled = self._scaled(found)
+        roots = np.sign(scaled) * np.sqrt(huber(scaled)[0]) / self.thinned
+        return np.concatenate([roots, prior * self._whole(step)[self.free]])
+
+    def slopes(self, step: np.ndarray) -> np.ndarray:
+        """Return the derivatives of the values."""
+        found, prior = self._at(step), self._priors()
+        assert found is not None
+        self.search.misfit.differentiated(found)
+        scaled = self._scaled(found)
+        size = np.abs(scaled)
+        # of the square root of the cost
+        factor = np.where(size <= ROBUST, 1.0, ROBUST / np.sqrt(np.maximum(huber(scaled)[0], 1.0)))
+        rows = np.concatenate(
+            [
+                (rollout.derivatives[self.free] / unit)[:, known].T
+                for rollout, unit, known in zip(found, self.units, self.known, strict=True)
+            ]
+        )
+        rows = rows * (factor / self.thinned)[:, None]
+        return np.concatenate([rows, np.diag(prior)]) * self.reach
+
+    def _scaled(self, rollouts: list[Rollout]) -> np.ndarray:
+        parts = zip(rollouts, self.units, self.known, strict=True)
+        return np.concatenate([(rollout.values / unit)[known] for rollout, unit, known in parts])
 
 
 class SearchError(KnodeCosseratError, RuntimeError):

@@ -76,7 +76,7 @@ class Left(NamedTuple):
         """Return the remaining differences with the named effects, linearised about the end of a search."""
         free, blocks, count = model.mask(names), point.blocks, len(point.problem.cost)
         each = [part.reshape(count, -1, *part.shape[1:]) for part in blocks]
-        scale = np.repeat(point.scale, count // len(point.scale)) ** 2
+        scale = np.repeat(point.scale[:, 0], count // len(point.scale)) ** 2
         costs = []
         for k, move in enumerate(_moves(point.problem, point.x, free, model)):
             now, gradient, matrix = each[0][k], each[2][k], each[3][k]
@@ -106,13 +106,9 @@ class Left(NamedTuple):
 
 
 def _linear(
-    x: np.ndarray,
-    free: np.ndarray,
-    gradient: np.ndarray,
-    matrix: np.ndarray,
-    low: np.ndarray,
+    x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray,
     high: np.ndarray,
-) -> np.ndarray:
+) -> np.ndarray:  # fmt: skip
     """Return the move to the least cost, with the prior, of the free numbers within their bounds."""
     fixed = np.where(free, 0.0, -x)
     active = free.copy()
@@ -202,7 +198,7 @@ def _better(
 
 def sizes(point: Point) -> str:
     """Return the usual differences of each recording, in words."""
-    return ", ".join(f"{1e3 * size:.1f}" for size in point.scale) + " mm"
+    return ", ".join(f"{1e3 * size:.1f}" for size in point.scale[:, 0]) + " mm"
 
 
 def _with_another(
@@ -241,13 +237,14 @@ def left_out(search: Search, point: Point) -> float:
         fold = search.without(point, k, *FOLD)
         if fold is None:
             return np.inf
-        (rollout,) = search.misfit.differences(fold.x, which=[k], derivatives=False)
+        (rollout,) = search.misfit.differences(fold.x, which=[k])
         if rollout is None:
             return np.inf
-        found = normal_equations([rollout], point.scale[[k]], search.thinned())
+        units = search.units(point.scale[[k]], [k])
+        found = normal_equations([rollout], units, search.thinned(), derivatives=False)
         cost, amount = float(found.cost[0]), float(found.amount[0])
         # costs are in units of the scale, and each point has its own
-        total += amount * np.log(cost * point.scale[k] ** 2 / amount)
+        total += amount * np.log(cost * point.scale[k, 0] ** 2 / amount)
     return total
 
 

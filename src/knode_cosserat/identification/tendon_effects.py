@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.identification.effects import Effect, Number, Replace, ReplaceInPart
+from knode_cosserat.identification.effects import Effect, Number, Replace, ReplaceInPart, Usual, register
+from knode_cosserat.rods.anchors import EarlyAnchors
 from knode_cosserat.rods.load_cells import LoadCells
+from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+
+#: place of the last rib before the tip, if the robot states none
+LAST_RIB = 8.0 / 9.0
 
 
-def tendon_effects(nominal: RoutedTendonRobot, tensions: float, highest: float) -> list[Effect]:
-    """Return the effects of tendons.
-
-    Args:
-        nominal: the robot with all parts that effects need.
-        tensions: a usual tension of one tendon (N).
-        highest: the highest tension of all tendons together (N).
-    """
+@register(order=1)
+def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+    """Return the effects of tendons; a robot with reels has those only that it states."""
+    pulled = nominal.drive != "reel"
     return [
-        *_place_effects(nominal), *_load_cell_effects(nominal, tensions), *_rib_effects(nominal),
-        *_friction_effects(nominal, tensions * nominal.tendon_count, highest),
-    ]  # fmt: skip
+        *(_place_effects(nominal) if nominal.routing is None else []),
+        *(_load_cell_effects(nominal, usual.tension) if pulled else []),
+        *_rib_effects(nominal, usual.bodies),
+        *(_friction_effects(nominal, usual) if pulled or nominal.friction is not None else []),
+    ]
 
 
 def _place_effects(nominal: RoutedTendonRobot) -> list[Effect]:
@@ -52,6 +54,7 @@ def _place_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             "angle by which ribs, and the tendons in them, turn about the rod from base to tip",
             (Number("tendon_twist", "rad", float(nominal.tendon_twist or 0.0), 0.06),),
             Replace(("tendon_twist",)),
+            lambda robot: robot.replace(tendon_twist=robot.tendon_twist or 0.0),
         ),
     ]
 
@@ -70,7 +73,8 @@ def _load_cell_effects(nominal: RoutedTendonRobot, tensions: float) -> list[Effe
                 Number(f"load_cells.gain[{k}]", "", float(gain[k]), 0.05, 0.1, 10.0, True)
                 for k in range(count)
             ),
-            _with_gains,
+            ReplaceInPart("load_cells", ("gain",), True),
+            _with_cells,
         ),
         Effect(
             "load cell offsets",
@@ -79,28 +83,36 @@ def _load_cell_effects(nominal: RoutedTendonRobot, tensions: float) -> list[Effe
                 Number(f"load_cells.offset[{k}]", "N", float(offset[k]), 0.03 * tensions)
                 for k in range(count)
             ),
-            _with_offsets,
+            ReplaceInPart("load_cells", ("offset",), True),
+            _with_cells,
         ),
         Effect(
             "early anchors",
             "tendons that are anchored at the last rib before the tip",
             tuple(Number(f"anchors.share[{k}]", "", 1.0, 0.5, 0.0, 1.0, begin=-0.3) for k in range(count)),
-            _with_anchors,
+            ReplaceInPart("anchors", ("share",), True),
+            _anchored,
         ),
         Effect(
             "latency",
             "delay of the load cells' readings behind the poses",
             (late,),
-            _with_latency,
+            ReplaceInPart("load_cells", ("latency",)),
+            _with_cells,
             of_recordings=True,
         ),
     ]
 
 
-def _rib_effects(nominal: RoutedTendonRobot) -> list[Effect]:
-    L, ribs = float(nominal.length), nominal.rib_spacing or RibSpacing(share=0.0)
+def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[Effect]:
+    L, stated = float(nominal.length), nominal.rib_spacing
+    ribs = stated or RibSpacing(at=_ribs(nominal) or (bodies if len(bodies) > 1 else None), share=0.0)
     softening, share = float(ribs.softening), float(ribs.share)
-    return [
+
+    def ribbed(robot: Any) -> Any:
+        return robot.replace(rib_spacing=ribs)
+
+    found = [
         Effect(
             "rib spacing",
             "softer bending under tension, for tendons are straight between ribs",
@@ -110,25 +122,38 @@ def _rib_effects(nominal: RoutedTendonRobot) -> list[Effect]:
                 ),
             ),
             ReplaceInPart("rib_spacing", ("softening",)),
+            ribbed,
         ),
         Effect(
             "rib spans",
             "softer bending under tension between the ribs, or bodies, whose places are known",
             (Number("rib_spacing.share", "", share, 0.5, 0.0, 10.0, begin=0.5),),
             ReplaceInPart("rib_spacing", ("share",)),
+            ribbed,
         ),
     ]  # fmt: skip
+    if nominal.drive == "reel" and stated is None:
+        return []
+    return found if ribs.at is not None else found[:1]
 
 
-def _friction_effects(nominal: RoutedTendonRobot, usual: float, highest: float) -> list[Effect]:
-    """Return friction and its loss; `usual` and `highest` are tensions (N) of all tendons together."""
+def _ribs(robot: RoutedTendonRobot) -> tuple[float, ...] | None:
+    """Return the places of the robot's masses, if these are several: they are its ribs, as a rule."""
+    masses = [load for load in robot.loads if isinstance(load, AttachedMass)]
+    found = sorted({load.at for load in masses if load.at > 0.0 and float(load.mass) > 0.0})
+    return tuple(found) if len(found) > 1 else None
+
+
+def _friction_effects(nominal: RoutedTendonRobot, sizes: Usual) -> list[Effect]:
+    """Return friction, and its loss where tensions are measured."""
     L, known = float(nominal.length), nominal.friction or TendonFriction()
-    wobble, curvature, at_rest = (float(each) for each in (known.wobble, known.curvature, known.at_rest))
+    wobble, curvature, at_rest = map(float, (known.wobble, known.curvature, known.at_rest))
     reach = float(known.reach) if wobble or curvature else 0.06 / L
     # above the usual tension: a robot that shakes at rest has no friction to be found
-    shaking = 0.5 * (usual + highest)
+    highest = sizes.highest
+    shaking = 0.5 * (sizes.tension * nominal.tendon_count + highest)
     shaking_width = max(0.5 * (highest - shaking), 0.05 * highest)
-    return [
+    found = [
         Effect(
             "friction",
             "friction of the tendons by their length, with its hysteresis",
@@ -138,6 +163,7 @@ def _friction_effects(nominal: RoutedTendonRobot, usual: float, highest: float) 
                 Number("friction.at_rest", "", at_rest, 1.0, -1.0, 1.0, begin=0.3),
             ),
             ReplaceInPart("friction", ("wobble", "reach", "at_rest")),
+            _rubbing,
             usual=True,
         ),
         Effect(
@@ -145,6 +171,7 @@ def _friction_effects(nominal: RoutedTendonRobot, usual: float, highest: float) 
             "friction of the tendons by the angle they turn",
             (Number("friction.curvature", "1/rad", curvature, 0.1, 0.0, 10.0, begin=0.3),),
             ReplaceInPart("friction", ("curvature",)),
+            _rubbing,
             needs=("friction",),
             usual=True,
         ),
@@ -157,31 +184,35 @@ def _friction_effects(nominal: RoutedTendonRobot, usual: float, highest: float) 
                 Number("vibration.softening", "m2", 0.0, (0.1 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),
             ),
             ReplaceInPart("vibration", ("tension", "rate", "softening")),
+            _shaken,
             needs=("friction",),
             usual=True,
         ),
     ]
+    return found if nominal.drive != "reel" else found[:2]
 
 
 def _with_angles(robot: Any, values: list[Any]) -> Any:
     return robot.replace(tendon_angles=jnp.stack(values))
 
 
-def _load_cells(robot: Any, **changes: Any) -> Any:
-    return robot.replace(load_cells=dataclasses.replace(robot.load_cells, **changes))
+def _with_cells(robot: Any) -> Any:
+    count = robot.tendon_count
+    return robot.replace(
+        load_cells=robot.load_cells or LoadCells(gain=np.ones(count), offset=np.zeros(count))
+    )
 
 
-def _with_gains(robot: Any, values: list[Any]) -> Any:
-    return _load_cells(robot, gain=jnp.stack(values))
+def _anchored(robot: Any) -> Any:
+    """Return the robot with anchors at the last mass before the tip, or at a usual place."""
+    ribs = [load.at for load in robot.loads if isinstance(load, AttachedMass) and 0.0 < load.at < 1.0]
+    anchors = EarlyAnchors(at=max(ribs, default=LAST_RIB), share=np.ones(robot.tendon_count))
+    return robot.replace(anchors=robot.anchors or anchors)
 
 
-def _with_offsets(robot: Any, values: list[Any]) -> Any:
-    return _load_cells(robot, offset=jnp.stack(values))
+def _rubbing(robot: Any) -> Any:
+    return robot.replace(friction=robot.friction or TendonFriction())
 
 
-def _with_latency(robot: Any, values: list[Any]) -> Any:
-    return _load_cells(robot, latency=values[0])
-
-
-def _with_anchors(robot: Any, values: list[Any]) -> Any:
-    return robot.replace(anchors=dataclasses.replace(robot.anchors, share=jnp.stack(values)))
+def _shaken(robot: Any) -> Any:
+    return robot.replace(vibration=robot.vibration or Vibration(tension=1e6, rate=0.0))

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.misfit import RecordingData
+from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.system import System
@@ -29,7 +29,7 @@ FEW = 0.01
 RECOVERY = 2.0
 
 
-def failed_trial(robot: System, data: Sequence[RecordingData], space: str | SpaceScheme) -> str | None:
+def failed_trial(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> str | None:
     """Return why a robot is not accepted, or None if it passes all trials.
 
     It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
@@ -38,7 +38,7 @@ def failed_trial(robot: System, data: Sequence[RecordingData], space: str | Spac
     pulls = robot.control_layout.names[0] == "tension"
     for each in data:
         for amplitude in AMPLITUDES:
-            tension = each.initial_tension + amplitude * (each.tension - each.initial_tension)
+            tension = each.held + amplitude * (each.control - each.held)
             # a tendon does not push; a motor turns either way
             tension = np.maximum(tension, 0.0) if pulls else tension
             reason = _failure(robot, tension, each, space)
@@ -49,14 +49,14 @@ def failed_trial(robot: System, data: Sequence[RecordingData], space: str | Spac
     return f"random tensions: {reason}" if reason else None
 
 
-def has_coarse_rows(robot: System, data: Sequence[RecordingData], space: str | SpaceScheme) -> bool:
+def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> bool:
     """Return True if the grid is too coarse in more than a few rows of the recordings.
 
     A robot that cannot be simulated is not too coarse: `failed_trial` reports it.
     """
     for each in data:
         try:
-            _, found = _moved(robot, each.tension, each, space)
+            _, found = _moved(robot, each.control, each, space)
         except SimulationError:
             return False
         if np.mean(np.asarray(found.result) == Result.COARSE) > FEW:
@@ -64,16 +64,14 @@ def has_coarse_rows(robot: System, data: Sequence[RecordingData], space: str | S
     return False
 
 
-def trained_range(
-    robot: System, data: Sequence[RecordingData], space: str | SpaceScheme
-) -> TrainedRange | None:
+def trained_range(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> TrainedRange | None:
     """Return the range of controls, strains and strain rates of the robot in its recordings."""
-    return TrainedRange.of(part for each in data for part in _moved(robot, each.tension, each, space))
+    return TrainedRange.of(part for each in data for part in _moved(robot, each.control, each, space))
 
 
-def _random(data: Sequence[RecordingData]) -> Float[np.ndarray, "T c"]:
-    low = np.min([each.tension.min(axis=0) for each in data], axis=0)
-    high = np.max([each.tension.max(axis=0) for each in data], axis=0)
+def _random(data: Sequence[Experiment]) -> Float[np.ndarray, "T c"]:
+    low = np.min([each.control.min(axis=0) for each in data], axis=0)
+    high = np.max([each.control.max(axis=0) for each in data], axis=0)
     dt = data[0].dt
     count, hold = max(round(SECONDS / dt), 1), max(round(HELD / dt), 1)
     drawn = np.random.default_rng(0).uniform(low, high, (-(-count // hold), len(low)))
@@ -81,7 +79,7 @@ def _random(data: Sequence[RecordingData]) -> Float[np.ndarray, "T c"]:
 
 
 def _failure(
-    robot: System, tension: Float[np.ndarray, "T c"], like: RecordingData, space: str | SpaceScheme
+    robot: System, tension: Float[np.ndarray, "T c"], like: Experiment, space: str | SpaceScheme
 ) -> str | None:
     try:
         _, found = _moved(robot, tension, like, space)
@@ -93,10 +91,10 @@ def _failure(
 
 
 def _moved(
-    robot: System, tension: Float[np.ndarray, "T c"], like: RecordingData, space: str | SpaceScheme
+    robot: System, tension: Float[np.ndarray, "T c"], like: Experiment, space: str | SpaceScheme
 ) -> tuple[Trajectory, Trajectory]:
     """Return the equilibrium under a recording's initial tensions, and the rows from there."""
-    initial, dt = like.initial_tension, like.dt
+    initial, dt = np.asarray(like.held), like.dt
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")

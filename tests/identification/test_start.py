@@ -6,16 +6,11 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.calibration.calibrate import calibrate
-from knode_cosserat.learning.calibration.rollouts import RolloutMisfit
-from knode_cosserat.learning.calibration.unknowns import (
-    limits,
-    number_units,
-    searched,
-    unknowns_of,
-    values,
-    with_numbers,
-)
+from knode_cosserat.identification import identify
+from knode_cosserat.identification.effects import parameter_effects
+from knode_cosserat.identification.experiments import experiments_of
+from knode_cosserat.identification.misfit import Misfit
+from knode_cosserat.identification.model import Model
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, Bar, pulled
 
@@ -39,8 +34,8 @@ def measured(trajectory, noise=0.0):
 
 
 def found(data):
-    estimates = calibrate(GUESS, [data], NAMES, by="rollouts", space="euler").estimates
-    return estimates["stiffness"], estimates["damping"]
+    result = identify(GUESS, [data], parameters=NAMES, space="euler")
+    return result["stiffness"].value, result["damping"].value
 
 
 def settled(**options):
@@ -87,21 +82,21 @@ def test_what_starts_at_rest_gives_the_robot_that_made_it(data, tolerance):
     ],
 )
 def test_data_that_do_not_start_at_rest_are_refused(data):
-    with pytest.raises(DataError, match=r"recording 1: row 0 is .* mm from the equilibrium under \["):
+    with pytest.raises(DataError, match=r"row 0 is .* mm from the equilibrium under \["):
         found(data())
 
 
 @pytest.mark.slow
 def test_slopes_of_a_start_in_equilibrium_are_exact():
-    unknowns = unknowns_of(GUESS, ["length", "density", *NAMES])
-    misfit = RolloutMisfit(GUESS, [measured(pretensioned())], unknowns, space="euler")
-    at, h = searched(unknowns, values(GUESS, unknowns)), 1e-4
-    slopes = misfit(at).slopes
+    model = Model(GUESS, parameter_effects(GUESS, ["length", "density", *NAMES]))
+    misfit = Misfit(model, experiments_of([measured(pretensioned())], model, "euler"))
+    (here,) = misfit.differences(np.zeros(4))
     # row 0 is compared too, and depends on the stiffness
-    assert np.abs(slopes[1, 2]) > 0.01
-    for k, along in enumerate(h * np.eye(len(at))):
-        expected = (misfit(at + along).values - misfit(at - along).values) / (2.0 * h)
-        np.testing.assert_allclose(slopes[:, k], expected, atol=1e-6 * np.max(np.abs(expected)))
+    assert np.abs(here.derivatives[2, 0, 1]) > 0.01
+    for k, along in enumerate(1e-4 * np.eye(4)):
+        (high,), (low,) = (misfit.differences(sign * along) for sign in (1.0, -1.0))
+        expected = (high.values - low.values) / 2e-4
+        np.testing.assert_allclose(here.derivatives[k], expected, atol=1e-6 * np.max(np.abs(expected)))
 
 
 ROD = kc.robots.SlenderRod(
@@ -116,15 +111,17 @@ ROD = kc.robots.SlenderRod(
 
 def test_parameters_of_parts_have_names_with_dots():
     names = ["youngs_modulus", "loads.0.mass", "loads.1.force"]
-    unknowns = unknowns_of(ROD, names)
-    assert [each.name for each in unknowns] == names
-    numbers = values(ROD, unknowns)
-    np.testing.assert_allclose(numbers, [2e8, 0.02, 0.0, 0.1, 0.0])
-    assert number_units(ROD, unknowns) == ("Pa", "kg", "N", "N", "N")
-    changed = with_numbers(ROD, unknowns, np.array([1e8, 0.05, 0.1, 0.2, 0.3]))
-    assert float(changed.loads[0].mass) == 0.05 and changed.loads[1].force.tolist() == [0.1, 0.2, 0.3]
-    low, high = limits(ROD, unknowns)
-    assert np.all(low <= numbers) and np.all(numbers <= high)
+    model = Model(ROD, parameter_effects(ROD, names))
+    assert list(model.names) == names
+    np.testing.assert_allclose(model.values(np.zeros(5)), [2e8, 0.02, 0.0, 0.1, 0.0])
+    assert tuple(number.unit for number in model.numbers) == ("Pa", "kg", "N", "N", "N")
+    numbers = (1e8, 0.05, 0.1, 0.2, 0.3)
+    x = np.array([it.coordinate(value) for it, value in zip(model.numbers, numbers, strict=True)])
+    changed = model.reduced(x, names)
+    assert float(changed.loads[0].mass) == pytest.approx(0.05)
+    assert changed.loads[1].force.tolist() == pytest.approx([0.1, 0.2, 0.3])
+    low, high = model.bounds
+    assert np.all(low <= 0.0) and np.all(high >= 0.0)
 
 
 @pytest.mark.parametrize(
@@ -140,7 +137,7 @@ def test_parameters_of_parts_have_names_with_dots():
 )
 def test_names_of_parts_that_are_not_right(name, message):
     with pytest.raises(kc.robots.ParameterError, match=message):
-        unknowns_of(ROD, [name])
+        parameter_effects(ROD, [name])
 
 
 @pytest.mark.slow
@@ -148,6 +145,6 @@ def test_a_mass_at_the_tip_is_found():
     t = 0.02 * np.arange(1, 26)[:, None]
     moved = kc.simulate(ROD, 0.03 * np.sin(8.0 * t), 0.02, space="euler", initial="equilibrium")
     guess = ROD.replace(**{"loads.0.mass": 0.03, "youngs_modulus": 2.4e8})
-    estimates = calibrate(guess, [moved], ["youngs_modulus", "loads.0.mass"]).estimates
-    np.testing.assert_allclose(estimates["loads.0.mass"], 0.02, rtol=1e-4)
-    np.testing.assert_allclose(estimates["youngs_modulus"], 2e8, rtol=1e-4)
+    result = identify(guess, [moved], parameters=["youngs_modulus", "loads.0.mass"])
+    np.testing.assert_allclose(result["loads.0.mass"].value, 0.02, rtol=1e-4)
+    np.testing.assert_allclose(result["youngs_modulus"].value, 2e8, rtol=1e-4)

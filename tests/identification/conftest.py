@@ -6,7 +6,7 @@ import pytest
 
 @pytest.fixture(scope="module")
 def training():
-    from tests.learning.calibration.data import ROBOT, sines
+    from tests.identification.motions import ROBOT, sines
 
     return sines(ROBOT)
 
@@ -22,7 +22,7 @@ def swings():
 def string_swing():
     import knode_cosserat as kc
     from examples.hanging_string import HangingString
-    from tests.learning.calibration.data import DT
+    from tests.identification.motions import DT
 
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=21)
     hand = np.array([0.6, -0.1]) + 0.05 * np.sin(np.pi * np.arange(1, 31) * DT)[:, None] ** 2

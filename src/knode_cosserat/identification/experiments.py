@@ -1,0 +1,343 @@
+"""Experiments: how a robot starts, its controls, and the data in each row, from any kind of input."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, States
+from knode_cosserat.identification.model import Model
+from knode_cosserat.identification.steps import steps_per_row, time_scheme
+from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods.system import System
+from knode_cosserat.rotation import since_first
+from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.history import rest_record
+from knode_cosserat.solvers.initial import initial_state
+from knode_cosserat.solvers.places import Places, places_at, positions_at
+from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.segments import DataError
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.trajectory import Trajectory
+
+#: time from row to row of recordings (s)
+DT = 0.0125
+#: a rotation counts as the displacement at this part of the length
+ARM = 0.2
+#: a trajectory starts unstressed if its row 0 is nearer to that shape than so many times to the equilibrium,
+#: measurements if it is so many times nearer: a real robot is never unstressed
+UNSTRESSED = 2.0
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Experiment:
+    """One motion, or list of equilibria, of a robot: controls, start and data.
+
+    Attributes:
+        dt: time from row to row (s).
+        control: from each row to the next (T, c).
+        output: kind of the data, with the noise of its errors.
+        data: values of the output (T + 1, p); NaN where nothing was measured.
+        held: control of the equilibrium from which it starts (c,); None: it starts unstressed, or from
+            `initial`.
+        initial: rows from which it continues; they must be states without noise.
+        settings: of the simulation.
+        name: for messages.
+        moves: the first row in motion.
+        static: true if each row is a separate equilibrium.
+        continuous: true if controls are samples of a continuous signal.
+        steps: time steps from row to row.
+        readings: true if controls are what load cells read, with their latency.
+    """
+
+    dt: float
+    control: Float[np.ndarray, "T c"]
+    output: Output
+    data: Float[np.ndarray, "T+1 p"]
+    held: Float[np.ndarray, " c"] | None = None
+    initial: Trajectory | None = None
+    settings: Settings = Settings()
+    name: str = "experiment"
+    moves: int = 0
+    static: bool = False
+    continuous: bool = False
+    steps: int = 1
+    readings: bool = False
+
+    @functools.cached_property
+    def fields(self) -> tuple[str, ...]:
+        """Names of the data's fields; each has its own size of differences."""
+        if isinstance(self.output, States):
+            return tuple(dict.fromkeys(self.output.labels))
+        return (type(self.output).__name__,)
+
+    @functools.cached_property
+    def groups(self) -> np.ndarray:
+        """Index in `fields` of every number of an error."""
+        if isinstance(self.output, States):
+            number = {field: k for k, field in enumerate(self.fields)}
+            return np.array([number[label] for label in self.output.labels])
+        return np.zeros(len(self.noise), dtype=int)
+
+    @functools.cached_property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Unit of every number of an error."""
+        if type(self.output) is BodyPositions:  # of two or three coordinates
+            return np.full(self.data.shape[1], self.output.sigma)
+        return self.output.noise
+
+    def replace(self, **changes: Any) -> Experiment:
+        """Return a copy with changed attributes."""
+        return dataclasses.replace(self, **changes)
+
+    def padded(self, rows: int) -> Experiment:
+        """Return it with so many controls, the last one held and nothing measured."""
+        more = rows - len(self.control)
+        return self.replace(
+            control=np.concatenate([self.control, np.repeat(self.control[-1:], more, axis=0)]),
+            data=np.pad(self.data, ((0, more), (0, 0)), constant_values=np.nan),
+        )
+
+
+class _Shapes(NamedTuple):
+    """Positions (m) in row 0 at some places, NaN where nothing was seen; without places, y of all nodes."""
+
+    places: Places | None
+    position: Float[np.ndarray, "M d"]
+
+
+def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto2") -> list[Experiment]:
+    """Return the experiments of recordings, measurements, trajectories or experiments.
+
+    Those of measurements have one length, so that they share compiled programs.
+
+    Raises:
+        DataError: data that do not fit the robot or each other, are too short or not finite.
+    """
+    rows = _listed(data)
+    measured = [it for it in rows if isinstance(it, Measurements)]
+    same_steps(measured)
+    names = iter(names_of(measured))
+    found = [
+        it if isinstance(it, Experiment)
+        else of_measurements(it, model, next(names), space) if isinstance(it, Measurements)
+        else of_trajectory(it, model.nominal, f"trajectory {k}")
+        for k, it in enumerate(rows)
+    ]  # fmt: skip
+    if len(measured) < len(rows):
+        return found
+    longest = max(len(it.control) for it in found)
+    return [it.padded(longest) for it in found]
+
+
+def _listed(data: Any) -> list[Any]:
+    """Return data in a list, recordings as rows with mean tensions; `DataError` for anything else."""
+    if isinstance(data, str | Recording | Measurements | Trajectory | Experiment) or not isinstance(
+        data, Sequence
+    ):
+        raise DataError(f"data is a {type(data).__name__}; allowed is a list of recordings or trajectories")
+    if not data:
+        raise DataError("there are no recordings and no trajectories")
+    rows = [it.sampled(DT, mean=True) if isinstance(it, Recording) else it for it in data]
+    for it in rows:
+        if not isinstance(it, Measurements | Trajectory | Experiment):
+            raise DataError(
+                f"data holds a {type(it).__name__}; allowed is what load_recording returns, its "
+                "sampled(0.0125, mean=True), or a Trajectory"
+            )
+    return rows
+
+
+def measured_rows(data: Any) -> list[Measurements]:
+    """Return the rows of recordings; `DataError` for anything else."""
+    rows = _listed(data)
+    for it in rows:
+        if not isinstance(it, Measurements):
+            raise DataError(f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of")
+    same_steps(rows)
+    return rows
+
+
+def same_steps(measured: Sequence[Measurements]) -> None:
+    """Raise `DataError` if the time steps differ."""
+    steps = sorted({it.dt for it in measured}) or [0.0]
+    if steps[-1] - steps[0] > 1e-9:
+        raise DataError(f"time steps differ: {', '.join(f'{dt:g}' for dt in steps)} s; allowed is one")
+
+
+def names_of(measured: Sequence[Measurements]) -> list[str]:
+    """Return a name for each recording: the start of its source, numbered if several are alike."""
+    names = [it.source.partition(":")[0].rpartition("/")[2] for it in measured]
+    return [f"{name} ({k + 1})" if names.count(name) > 1 else name for k, name in enumerate(names)]
+
+
+def of_measurements(
+    measured: Measurements, model: Model, name: str = "recording", space: str | SpaceScheme = "lobatto2"
+) -> Experiment:
+    """Return the experiment of measurements, which start in the equilibrium before row 0.
+
+    Without library effects, a simulation that started unstressed is recognised by its row 0.
+
+    Raises:
+        DataError: too short, unknown controls, nothing seen, or controls of another robot.
+    """
+    robot = model.nominal
+    if len(measured.time) < 3:
+        raise DataError(f"{name}: {len(measured.time)} rows; at least 3 are needed")
+    if measured.tension.shape[1] != robot.control_size:
+        raise DataError(
+            f"{name}: {measured.tension.shape[1]} tensions in a row; the robot has {robot.control_size}"
+        )
+    if measured.static:
+        measured = _as_steps(measured)
+    if not np.all(np.isfinite(measured.tension[:-1])):
+        row = int(np.flatnonzero(~np.isfinite(measured.tension).all(axis=1))[0])
+        raise DataError(
+            f"{name}: no tension is known at {measured.time[row]:g} s; use the part before (`parts`)"
+        )
+    if not np.any(np.isfinite(measured.position[1:])):
+        raise DataError(f"{name}: no position was seen after the first row")
+    control = measured.tension[:-1]
+    held = np.asarray(control[0] if measured.initial_tension is None else measured.initial_tension)
+    swing = np.max(np.abs(control - held), axis=1)
+    moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
+    scheme = time_scheme(measured.dt, measured.continuous)
+    settings = dataclasses.replace(Settings.of(None, space, "paper", NewtonOptions()), time=scheme)
+    output, data = _poses(measured, robot)
+    at_rest = True
+    if not measured.static and np.all(model.prior == 0.0):
+        shapes = _Shapes(places_at(measured.fractions, robot.nodes), measured.position[0])
+        at_rest = not is_unstressed(robot, settings, held, shapes, 1.0 / UNSTRESSED)
+    if not at_rest:
+        data[0] = np.nan
+    return Experiment(
+        measured.dt, control, output, data, held if at_rest else None, None, settings, name,
+        int(moving[0]) if len(moving) and not measured.static else 0, measured.static, measured.continuous,
+        steps_per_row(measured.dt, measured.continuous), True,
+    )  # fmt: skip
+
+
+def _poses(measured: Measurements, robot: System) -> tuple[Output, np.ndarray]:
+    """Return positions, and rotations since row 0 if the robot has orientations, as numbers in rows."""
+    fractions, rows = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist()), len(measured.time)
+    try:
+        robot.drawing.quaternions(np.asarray(robot.rest(0.0)[0]))
+    except AttributeError:
+        return BodyPositions(fractions, 1.0), np.array(measured.position.reshape(rows, -1))
+    turned = np.asarray(since_first(measured.quaternion))
+    data = np.concatenate([measured.position, turned], axis=-1).reshape(rows, -1)
+    return BodyMotions(fractions, 1.0, 1.0 / (ARM * float(np.asarray(robot.length)))), data
+
+
+def _as_steps(measured: Measurements) -> Measurements:
+    """Return equilibria as rows of a motion: each row's own tension leads to it, the first one not seen."""
+
+    def late(rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([np.full_like(rows[:1], np.nan), rows])
+
+    return dataclasses.replace(
+        measured,
+        tension=np.concatenate([measured.tension, measured.tension[-1:]]),
+        position=late(measured.position),
+        quaternion=late(measured.quaternion),
+        initial_tension=measured.tension[0],
+    )
+
+
+def of_trajectory(trajectory: Trajectory, robot: System, name: str) -> Experiment:
+    """Return the experiment of full states; numbers that were not measured are NaN.
+
+    From t = 0 it starts at rest: in the equilibrium under the control of row 0, or unstressed. Any other
+    trajectory continues from its own first rows, which must then be states without noise.
+
+    Raises:
+        DataError: too short, a batch, of another robot, or controls that are not finite.
+    """
+    y, z, control = (np.asarray(it, dtype=float) for it in (trajectory.y, trajectory.z, trajectory.control))
+    if y.ndim != 3:
+        raise DataError(f"{name} is a batch of {len(y)}; give its robots one by one")
+    if len(y) < 3:
+        raise DataError(f"{name} has {len(y)} rows; at least 3 are needed")
+    if y.shape[1:] != (robot.nodes, robot.y_layout.size):
+        raise DataError(
+            f"{name} has {y.shape[1]} nodes of {y.shape[2]} numbers; "
+            f"the robot has {robot.nodes} of {robot.y_layout.size}"
+        )
+    if control.shape[1] != robot.control_size:
+        raise DataError(f"{name} has {control.shape[1]} controls a row; the robot has {robot.control_size}")
+    if not np.all(np.isfinite(control)) or not np.any(np.isfinite(y[1:])):
+        raise DataError(f"{name} has controls that are not finite, or no states")
+    steps = np.diff(np.asarray(trajectory.time, dtype=float))
+    if np.any(steps <= 0.0) or np.ptp(steps) > 1e-6 * steps.max():
+        raise DataError(
+            f"{name} has time steps from {steps.min():g} to {steps.max():g} s; "
+            "they must be positive and equal"
+        )
+    settings, output = trajectory.settings or Settings(), States.of(robot)
+    data = np.concatenate([y.reshape(len(y), -1), z.reshape(len(z), -1)], axis=1)
+    if trajectory.time[0] == 0.0:
+        held = control[0]
+        shapes = _Shapes(None, y[0])
+        if not np.any(held) and is_unstressed(robot, settings, held, shapes, UNSTRESSED):
+            data[0], held = np.nan, None
+        return Experiment(trajectory.dt, control[1:], output, data, held, None, settings, name)
+    first = 3  # the first row with the whole history of its scheme
+    if len(y) <= first:
+        raise DataError(f"{name} has {len(y)} rows and does not start at rest; at least 4 are needed")
+    data = data[first - 1 :]
+    data[0] = np.nan
+    initial = trajectory[:first]
+    return Experiment(trajectory.dt, control[first:], output, data, None, initial, settings, name)
+
+
+def is_unstressed(
+    robot: System, settings: Settings, control: Float[np.ndarray, " c"], seen: _Shapes, ratio: float
+) -> bool:
+    """Return True if row 0 shows the unstressed robot rather than its equilibrium under a control.
+
+    The robot is unstressed if the distance to that
+    shape is below `ratio` times the distance to the equilibrium.
+    """
+    if robot.ends.rest_is_guess:
+        return False
+    try:
+        settled = np.asarray(initial_state(robot, settings, held=control).record)
+    except SimulationError:
+        return False
+    size = robot.y_layout.size
+    shapes: Any = jnp.stack([rest_record(robot)[:, :size], settled[:, :size]])
+    if seen.places is None:
+        shapes, target = (np.asarray(robot.drawing.positions(y)) for y in (shapes, seen.position))
+    else:
+        shapes, target = np.asarray(jax.jit(positions_at)(robot, shapes, seen.places)), seen.position
+    apart = np.nansum((shapes - target) ** 2, axis=(1, 2))
+    return bool(np.any(np.isfinite(target)) and apart[0] <= ratio**2 * apart[1])
+
+
+def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
+    """Return the poses of a trajectory's nodes as if they had been measured, with its controls as tensions.
+
+    Raises:
+        DataError: it has positions or orientations of no one robot.
+    """
+    if np.ndim(trajectory.y) != 3:
+        raise DataError(f"{name} is a batch; allowed is one robot's trajectory")
+    position, quaternion = np.asarray(trajectory.position), np.asarray(trajectory.quaternion)
+    control = np.asarray(trajectory.control)
+    # a trajectory has with each row the control that led to it
+    held = np.concatenate([control[1:], control[-1:]])
+    nodes, seen = position.shape[1], np.ones((len(position), position.shape[1] - 1), dtype=bool)
+    return Measurements(
+        time=np.asarray(trajectory.time), tension=held, fractions=np.arange(1, nodes) / (nodes - 1),
+        position=position[:, 1:], quaternion=quaternion[:, 1:], measured=seen,
+        simulated=True, source=name, initial_tension=control[0],
+    )  # fmt: skip

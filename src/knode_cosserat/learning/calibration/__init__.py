@@ -1,1 +1,0 @@
-"""Calibration of physical parameters from trajectories."""
