@@ -151,7 +151,7 @@ class Misfit:
     def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
         """Return the start of an experiment; None if there is no equilibrium."""
         settings, size = data.settings, system.y_layout.size + system.z_layout.size
-        if data.held is None and not (data.initial is None and system.rest_is_guess):
+        if data.held is None and not (data.initial is None and system.ends.rest_is_guess):
             return self._moving_start(system, x, data)
         control = np.zeros(system.control_size) if data.held is None else np.asarray(data.held, dtype=float)
         still = dataclasses.replace(settings, time=None)
