@@ -83,7 +83,7 @@ WRONG = {
     "a compliance of text": (lambda t: kc.statics.compliance(ROBOT, "x"), "'x'", r"\(4,\).*\(N\)"),
     "to identify text": (lambda t: kc.identify("x", [t], parameters="all"), "str", "one robot"),
     "to identify by one": (lambda t: kc.identify(ROBOT, t, parameters="all"), "Trajectory", "list of"),
-    "to identify from states": (lambda t: kc.identify(ROBOT, [t]), "Trajectory", "sampled"),
+    "to identify from states": (lambda t: kc.identify(ROBOT, [t]), "Trajectory", "recordings"),
     "to estimate from text": (lambda t: kc.estimate_states("x", ROBOT), "str", "a Recording"),
     "a sine of no period": (lambda t: kc.controls.sine(0, 5, 0.05), "0", "seconds above 0"),
     "half a step": (lambda t: kc.controls.sine(1.5, 5.5, 0.05), "5.5", "whole number from 1"),

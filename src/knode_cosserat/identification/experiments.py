@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -78,7 +79,8 @@ class Experiment:
         """Names of the data's fields; each has its own size of differences."""
         if isinstance(self.output, States):
             return tuple(dict.fromkeys(self.output.labels))
-        return (type(self.output).__name__,)
+        words = re.sub(r"(?<!^)(?=[A-Z])", " ", type(self.output).__name__)
+        return (words.lower(),)
 
     @functools.cached_property
     def groups(self) -> np.ndarray:

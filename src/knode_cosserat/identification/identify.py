@@ -38,6 +38,8 @@ log = logging.getLogger(__name__)
 REFINEMENTS = 2
 #: most evaluations of a search without one recording
 FOLD = (8, 5e-3)
+#: numbers of first horizons that searches without priors leave out, one after the other
+SKIPPED = (0, 3, 9)
 #: row 0 disagrees with the initial equilibrium if it is further away than this part of the length, and than
 #: this part of the motion's root mean square
 AWAY, OF_MOTION = 0.01, 0.25
@@ -167,7 +169,7 @@ def _with_parameters(search: Search) -> Identified:
             with contextlib.suppress(SearchError):  # whole motions of a distant robot may have no solution
                 gap = gap_of(search, search.run(np.zeros(model.size), model.mask(names), None, 0), False)
             if gap is None:
-                point = search.from_far(model.mask(names))
+                point = _from_far(search, model.mask(names))
                 gap = gap_of(search, point, True)
         except SearchError as error:
             _require_start(search, np.zeros(model.size))
@@ -183,6 +185,25 @@ def _with_parameters(search: Search) -> Identified:
     _require_range(model, names, point)
     left = tuple(name for name in model.names if name not in names)
     return _result(search, model.reduced(point.x, names), names, point, steps, undetermined=left)
+
+
+def _from_far(search: Search, free: np.ndarray) -> Point:
+    """Return the end of the first search that leaves only noise, or else of the best of some searches.
+
+    With noise the first rows of a motion may mislead a search, while another number of rows does not.
+    """
+    points: list[Point] = []
+    for skipped in SKIPPED:
+        try:
+            point = search.from_far(free, skipped)
+        except SearchError:
+            if not points and skipped == SKIPPED[-1]:
+                raise
+            continue
+        points.append(point)
+        if point.converged and not unexplained(search, point):
+            return point
+    return min(points, key=lambda point: (not point.converged, float(np.sum(np.log(point.scale)))))
 
 
 def _require_start(search: Search, x: np.ndarray) -> None:

@@ -198,8 +198,8 @@ class Search:
         bodies = max(1.0, len(getattr(data.output, "fractions", ())) / BODIES)
         return max(1.0, CORRELATED / data.dt) * bodies
 
-    def from_far(self, free: Bool[np.ndarray, " n"]) -> Point:
-        """Return the end of a search from the nominal robot, over horizons that grow.
+    def from_far(self, free: Bool[np.ndarray, " n"], skipped: int = 0) -> Point:
+        """Return the end of a search from the nominal robot, over horizons that grow, without the first ones.
 
         Raises:
             SearchError: the nominal robot cannot be simulated, not even at rest.
@@ -212,7 +212,7 @@ class Search:
             # rows are independent of each other, and wound-up lengths keep the search near the solution
             longest = 0
         rows = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
-        for horizon in dict.fromkeys(rows):
+        for horizon in [*dict.fromkeys(rows)][skipped:]:
             if horizon < 0.8 * longest:
                 x = self.run(x, free, horizon, *(FIRST if self.exact else ROUGH)).x
         return self.run(x, free, None, *(EXACT if self.exact else FINE))
