@@ -48,9 +48,10 @@ samples: $(READY) ## run a few of the long tests of docs, examples, recordings a
 costs: $(READY) ## measure the CPU time of each test file anew, for the order and the time left of `make test`
 	KNODE_COSSERAT_CACHE=build/cold-cache-$(shell date +%s) $(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not campaign" --write-costs
 
-lint: $(READY) ## check style and formatting
+lint: $(READY) ## check style, formatting and the sizes of the code
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
+	$(BIN)/python -m tools.budget
 
 types: $(READY) ## check the types
 	$(BIN)/mypy

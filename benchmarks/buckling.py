@@ -20,7 +20,8 @@ import scipy.linalg
 import knode_cosserat as kc
 from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import SCHEMES
+from knode_cosserat.solvers.settings import schemes
+from knode_cosserat.solvers.space import SpaceScheme
 
 #: part of the load by which its derivative is taken
 STEP = 1e-4
@@ -43,7 +44,7 @@ def _tip_response(system: Any, control: Any, y: Any, space: Any) -> Any:
 
 def tip_response(rest: kc.Trajectory, space: str = "lobatto4") -> np.ndarray:
     """A = ∂tip/∂ξ at an equilibrium (a trajectory of one row)."""
-    return np.asarray(_tip_response(rest.system, rest.control[-1], rest.y[-1], SCHEMES[space]))
+    return np.asarray(_tip_response(rest.system, rest.control[-1], rest.y[-1], schemes(SpaceScheme)[space]()))
 
 
 def critical_load(

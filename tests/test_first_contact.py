@@ -69,7 +69,7 @@ WRONG = {
     "a missing trajectory": (lambda t: kc.load_trajectory("nope.nc"), "nope.nc", "no such file"),
     "a trajectory of text": (lambda t: kc.load_trajectory(__file__), "test_first_contact", "netCDF"),
     "a missing model": (lambda t: kc.load_model("nope"), "nope", "no such file"),
-    "a model of text": (lambda t: kc.load_model(__file__), "test_first_contact", "not a file of the kind"),
+    "a model of text": (lambda t: kc.load_model(__file__), "test_first_contact", "not a netCDF-4 file"),
     "a missing recording": (lambda t: kc.load_recording("nope.bag"), "nope.bag", "no such file"),
     "a field that is not there": (lambda t: t.part("k"), "'k'", "there are p, h"),
     "a tip in two dimensions": (

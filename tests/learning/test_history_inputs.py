@@ -109,7 +109,9 @@ def test_inputs_are_those_of_the_training_with_the_same_rates():
     model = learned(1.5 / DT)
     for point in points(3):
         z = semi_discrete.strains(ROBOT, point)
-        expected = np.concatenate([point.y, point.history.y, z, point.history.z, ROBOT.observed.actuation(TENSION)])
+        expected = np.concatenate(
+            [point.y, point.history.y, z, point.history.z, ROBOT.observed.actuation(TENSION)]
+        )
         inputs = model.residual.inputs(ROBOT, point.y, point.y_t, z, point.z_t(z), TENSION)
         np.testing.assert_allclose(inputs, expected, rtol=1e-12, atol=1e-12)
 

@@ -24,6 +24,7 @@ from knode_cosserat.rods.section import SectionChange
 from knode_cosserat.rods.surroundings import Obstacle, Sphere
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.rods.virtual_robot import VirtualRobot
+from tests.trajectories import edited
 
 BODY = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6}
 
@@ -294,13 +295,13 @@ def test_trajectories_of_robots_that_differ_in_their_parts_come_back(tmp_path, c
 
 
 def test_a_batch_from_a_damaged_file_is_refused(tmp_path):
-    import h5py
-
     path = tmp_path / "here.nc"
     made([LADEN, LADEN]).save(path)
-    with h5py.File(path, "r+") as file:
-        file.attrs["format_version"] = 1  # without a checksum
+
+    def damage(file):
         file["robot_loads.0.mass"][1] = -1.0
+
+    edited(path, damage)
     with pytest.raises(
         kc.TrajectoryFileError, match=r"a robot of the batch is not possible: AttachedMass: mass"
     ):

@@ -13,7 +13,6 @@ from knode_cosserat.solvers.steps import StepCoefficients, TimeStep
 from knode_cosserat.solvers.time import TimeScheme
 
 
-# example: a time scheme
 @dataclasses.dataclass(frozen=True)
 class BDF3(TimeScheme):
     """Backward differentiation of order 3: the derivative of the cubic through four states."""
@@ -31,9 +30,6 @@ class BDF3(TimeScheme):
             slopes = [np.prod(-np.delete(others, j)) for j in range(len(others))]
             c.append(float(np.sum(slopes) / np.prod(time - others)))
         return *c, 0.0
-
-
-# end of the example
 
 
 SECONDS = 0.8

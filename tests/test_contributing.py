@@ -1,0 +1,57 @@
+"""The examples of CONTRIBUTING.md are those of tests; here is one of an effect that `identify` finds."""
+
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.identification import effects
+from knode_cosserat.identification.effects import Effect, along_axes, register
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = re.findall(
+    r"^```python\n(.*?)^```\n\n`(tests/[\w/]+\.py)`", (ROOT / "CONTRIBUTING.md").read_text(), re.M | re.S
+)
+
+
+def tilted(robot, values):
+    return robot.replace(gravity=jnp.asarray(robot.gravity) + jnp.stack([*values, 0.0 * values[0]]))
+
+
+@pytest.fixture
+def tilt(monkeypatch):
+    monkeypatch.setattr(effects, "_libraries", dict(effects._libraries))
+
+    @register()
+    def tilt_effects(nominal, usual):
+        """Return the effect of a table that is not level."""
+        return [Effect("tilt", "gravity across the rod", along_axes("gravity", "m/s2", 0.5, "xy"), tilted)]
+
+
+def test_each_way_to_extend_the_package_has_an_example():
+    assert len(EXAMPLES) == 6
+
+
+@pytest.mark.parametrize(("code", "file"), EXAMPLES, ids=[file for _, file in EXAMPLES])
+def test_an_example_is_code_of_its_test(code, file):
+    lines = {line.strip() for line in (ROOT / file).read_text().splitlines()}
+    missing = [line for line in code.splitlines() if line.strip() and line.strip() not in lines]
+    assert not missing
+
+
+@pytest.mark.slow
+def test_a_registered_effect_is_identified(tilt):
+    robot = kc.load_robot("delrin-tendon-robot").replace(nodes=6)
+    truth = robot.replace(gravity=(0.2, -0.1, -9.81), bending_damping=1e-3)
+    controls = kc.controls.sine(1.0, 40, 0.05, amplitude=0.5, base=1.0)
+    motion = kc.simulate(truth, controls, 0.05, initial=kc.equilibrium(truth, controls[0]))
+    measured = kc.recordings.Measurements.of(motion, fractions=(0.5, 1.0))
+    found = kc.identify(robot, [measured], effects=["tilt"])
+    # the base's rotation, which is always identified, has nearly the same effect
+    assert "tilt" in found.effects and np.any(np.asarray(found.robot.gravity)[:2] != 0.0)
+    assert {"gravity.x", "gravity.y"} <= {estimate.label for estimate in found.estimates}
+    (nominal,), (error,) = found.nominal_error.values(), found.error.values()
+    assert error < nominal
