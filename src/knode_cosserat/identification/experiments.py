@@ -230,7 +230,7 @@ def of_measurements(
 
 def _poses(measured: Measurements, robot: System) -> tuple[Output, np.ndarray]:
     """Return positions, and rotations since row 0 if the robot has orientations, as numbers in rows."""
-    fractions, rows = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist()), len(measured.time)
+    fractions, rows = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist()), len(measured.position)
     try:
         robot.drawing.quaternions(np.asarray(robot.rest(0.0)[0]))
     except AttributeError:
