@@ -1,7 +1,7 @@
 """Plain parameters from trajectories: accuracy, undetermined parameters, and errors."""
 
 import dataclasses
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +15,7 @@ from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.model import Model
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.segments import DataError
 from tests.identification.motions import DT, FOUR, ROBOT, noisy, sines
@@ -295,10 +296,16 @@ def test_any_output_of_a_sensor_determines_parameters(output):
 # slopes
 
 
+class GuessedRest(Ends):
+    rest_is_guess = True
+
+
 class Hanging(Bar):
     """A bar stretched by its own weight: its start is an equilibrium that has to be found."""
 
-    rest_is_guess: ClassVar = True
+    @property
+    def ends(self):
+        return GuessedRest(self)
 
     def balance(self, s, t, y, y_t, z, z_t, control):
         return super().balance(s, t, y, y_t, z, z_t, control).at[1].add(-9.81 * self.density)

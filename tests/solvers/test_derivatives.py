@@ -248,3 +248,16 @@ def test_derivatives_go_through_a_tendon_that_goes_slack():
     slope = (tip(1.0 + h) - tip(1.0 - h)) / (2.0 * h)
     # the solver's tolerance over h is 1e-7 of the length
     np.testing.assert_allclose(jax.grad(tip)(1.0), slope, rtol=1e-5)
+
+
+class Labelled(kc.robots.SlenderRod):
+    """A rod with a parameter that holds no numbers, as learned residuals may have."""
+
+    nothing: Any = eqx.field(default_factory=lambda: np.zeros(0), kw_only=True)
+
+
+def test_a_parameter_without_numbers_has_a_gradient():
+    rod = Labelled(length=0.3, radius=0.002, density=2e3, youngs_modulus=1e9, bending_damping=1e-4)
+    controls = np.zeros((2, 0))
+    slopes = jax.grad(lambda rod: kc.simulate(rod, controls, 0.02).tip_position[-1, 2])(rod)
+    assert np.shape(slopes.nothing) == (0,) and np.all(np.isfinite(slopes.length))

@@ -244,7 +244,7 @@ def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.nda
     def pull(*given: Any) -> tuple[Any, ...]:
         moved, controls, *states = core.solve(*given)
         leaves = np.split(moved, ends) if shapes else []
-        leaves = [leaf.reshape(*shape, -1) for leaf, shape in zip(leaves, shapes, strict=True)]
+        leaves = [leaf.reshape(*shape, moved.shape[-1]) for leaf, shape in zip(leaves, shapes, strict=True)]
         controls = controls.reshape(steps, spec.task.settings.stages, -1, controls.shape[-1])
         controls = controls.sum(axis=1) if held else controls.reshape(steps, -1, controls.shape[-1])
         return *leaves, controls, *states
