@@ -121,8 +121,9 @@ def predict_a_held_out_recording(out: Path) -> None:
 
 def moved(system: kc.System, control: str, rows: int) -> kc.Trajectory:
     """Return the rows that the paper's study keeps: rest, and the states after all controls but the last."""
-    # the paper's scheme, to compare with its figures
-    return kc.simulate(system, kc.controls.parse(control, rows, DT), DT, space="euler")[:rows]
+    # the paper's schemes, to compare with its figures
+    tensions = kc.controls.parse(control, rows, DT, sampled="end")
+    return kc.simulate(system, tensions, DT, time="bdf2", start="paper", space="euler")[:rows]
 
 
 def main() -> None:

@@ -74,16 +74,6 @@ class SpaceScheme(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class Euler(SpaceScheme):
-    """Forward Euler, order 1: the paper's scheme, to reproduce it. Unstable where segments are long."""
-
-    name = "euler"
-    order = 1
-    formula = Formula((), (1.0, 0.0))
-    check = _SIMPSON
-
-
-@dataclasses.dataclass(frozen=True)
 class Lobatto2(SpaceScheme):
     """Lobatto IIIA of order 2, the trapezoidal (box) rule: the default.
 
@@ -107,6 +97,16 @@ class Lobatto4(SpaceScheme):
     order = 4
     formula = _SIMPSON
     check = _BOOLE
+
+
+@dataclasses.dataclass(frozen=True)
+class Euler(SpaceScheme):
+    """Forward Euler, order 1: the paper's scheme, to reproduce it. Unstable where segments are long."""
+
+    name = "euler"
+    order = 1
+    formula = Formula((), (1.0, 0.0))
+    check = _SIMPSON
 
 
 #: the default

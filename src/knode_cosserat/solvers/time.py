@@ -56,6 +56,37 @@ class TimeScheme(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
+class SDIRK2(TimeScheme):
+    """The singly diagonally implicit Runge-Kutta scheme of two stages, L-stable and stiffly accurate.
+
+    Order 2 for controls that are held in each step, because no step remembers the one before (Alexander 1977,
+    γ = 1 - √½). Both stages have the same c0.
+    """
+
+    name = "sdirk2"
+    order = 2
+    #: γ, and the end of the step
+    ends: ClassVar[tuple[float, ...]] = (1.0 - math.sqrt(0.5), 1.0)
+
+    @property
+    def defect(self) -> float:
+        """Error that a step of y' = J y adds, as a multiple of (γ dt J)² (difference of Y between stages)."""
+        gamma = self.ends[0]
+        return (3.0 * gamma**2 - 2.0 * gamma**3 - 1.0 / 6.0) / (gamma**2 * (1.0 - gamma))
+
+    def coefficients(self, dt: float, *previous: float) -> Coefficients:
+        """Return those of BDF2, for rows whose stages are not known."""
+        return BDF2().coefficients(dt, *previous)
+
+    def stages(self, dt: float) -> tuple[Coefficients, ...]:
+        """Return the coefficients of both stages of a step of dt (s)."""
+        gamma = self.ends[0]
+        c0 = 1.0 / (gamma * dt)
+        second = c0 * (1.0 - gamma) / gamma
+        return (c0, -c0, 0.0, 0.0), (c0, -second, second - c0, 0.0)
+
+
+@dataclasses.dataclass(frozen=True)
 class BDF1(TimeScheme):
     """Implicit Euler. Order 1, damps every vibration; it needs one earlier state only."""
 
@@ -116,37 +147,6 @@ class Trapezoidal(BDFAlpha):
     alpha: float = -0.5
 
     name = "trapezoidal"
-
-
-@dataclasses.dataclass(frozen=True)
-class SDIRK2(TimeScheme):
-    """The singly diagonally implicit Runge-Kutta scheme of two stages, L-stable and stiffly accurate.
-
-    Order 2 for controls that are held in each step, because no step remembers the one before (Alexander 1977,
-    γ = 1 - √½). Both stages have the same c0.
-    """
-
-    name = "sdirk2"
-    order = 2
-    #: γ, and the end of the step
-    ends: ClassVar[tuple[float, ...]] = (1.0 - math.sqrt(0.5), 1.0)
-
-    @property
-    def defect(self) -> float:
-        """Error that a step of y' = J y adds, as a multiple of (γ dt J)² (difference of Y between stages)."""
-        gamma = self.ends[0]
-        return (3.0 * gamma**2 - 2.0 * gamma**3 - 1.0 / 6.0) / (gamma**2 * (1.0 - gamma))
-
-    def coefficients(self, dt: float, *previous: float) -> Coefficients:
-        """Return those of BDF2, for rows whose stages are not known."""
-        return BDF2().coefficients(dt, *previous)
-
-    def stages(self, dt: float) -> tuple[Coefficients, ...]:
-        """Return the coefficients of both stages of a step of dt (s)."""
-        gamma = self.ends[0]
-        c0 = 1.0 / (gamma * dt)
-        second = c0 * (1.0 - gamma) / gamma
-        return (c0, -c0, 0.0, 0.0), (c0, -second, second - c0, 0.0)
 
 
 #: for comparisons with real motions: near the trapezoidal rule, and stiff modes still decay by 18 % in a step
