@@ -38,6 +38,7 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from benchmarks.shapes import resting
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.ends import AXES
 
 #: folder with the entry point by which the suite finds the solver
@@ -151,7 +152,7 @@ def _frames(rod: Rod, scenario: Scenario, times: np.ndarray, dt: float | None, n
     except kc.SimulationError as error:
         raise Diverged(str(error), error.time) from error
     states = states[:, ::segments]
-    position, directors = np.array(system.drawing.positions(states)), _directors(system, states)
+    position, directors = np.array(Drawing.of(system).positions(states)), _directors(system, states)
     position[0], directors[0] = rod.nodes(n_elements), rod.directors(n_elements)
     return position, directors
 
@@ -270,9 +271,9 @@ def _controls(rod: Rod, times: np.ndarray) -> np.ndarray:
 
 def _directors(system: kc.robots.SlenderRod, states: np.ndarray) -> np.ndarray:
     """Return the first director of each element: the mean of its two nodes', normal to the element."""
-    chord = np.diff(np.asarray(system.drawing.positions(states)), axis=1)
+    chord = np.diff(np.asarray(Drawing.of(system).positions(states)), axis=1)
     chord /= np.linalg.norm(chord, axis=2, keepdims=True)
-    h = np.asarray(system.drawing.quaternions(states))
+    h = np.asarray(Drawing.of(system).quaternions(states))
     d1 = Rotation.from_quat(h.reshape(-1, 4), scalar_first=True).as_matrix()[:, :, 0].reshape(*h.shape[:2], 3)
     across = d1[:, 1:] + d1[:, :-1]
     across -= np.sum(across * chord, axis=2, keepdims=True) * chord

@@ -31,6 +31,6 @@ def resting(
     m = frames.apply(u @ np.asarray(system.Kbt).T)
     y = np.concatenate([p, h, n, m, np.zeros((len(p), 6))], axis=1)
     z = np.concatenate([v, u], axis=1)
-    row, none = np.zeros(1), np.zeros((1, system.control_size))
+    row, none = np.zeros(1), np.zeros((1, system.control_layout.size))
     count = row.astype(int)
     return Trajectory(system, None, row, y[None], z[None], none, count, row, count)

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.evaluation.metrics import PoseHistory, pose_mse, tip_dtw
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 
@@ -38,9 +39,6 @@ class NoKnowledge(System):
     base = _of_model("base")
     tip = _of_model("tip")
     scales = _of_model("scales")
-    ends = _of_model("ends")
-    observed = _of_model("observed")
-    drawing = _of_model("drawing")
 
     def __init__(self, model: System):
         self.model = model
@@ -62,6 +60,10 @@ class NoKnowledge(System):
     def replace(self, **changes: Any) -> Self:
         """Return a copy with changed parameters (or nodes) of the model."""
         return type(self)(self.model.replace(**changes))
+
+
+for _aspect in (Ends, Drawing, Observed):
+    _aspect.register(NoKnowledge, lambda system, aspect=_aspect: aspect.of(system.model))
 
 
 class NodePoses(NamedTuple):
@@ -113,7 +115,7 @@ class LinearPredictor(NamedTuple):
                 x = self.A @ x + self.B @ force
                 rows.append(x)
             y = (self.rest + self.scale * np.array(rows)).reshape(len(rows), self.system.nodes, -1)
-        drawing = self.system.drawing
+        drawing = Drawing.of(self.system)
         return NodePoses(np.asarray(drawing.positions(y)), np.asarray(drawing.quaternions(y)))
 
 
@@ -171,7 +173,7 @@ def _fitted(system: System, trajectories: Sequence[Trajectory], rank: int) -> Li
 
 
 def _forces(system: System, tensions: Any) -> np.ndarray:
-    return np.asarray(jax.vmap(system.observed.actuation)(np.asarray(tensions)))
+    return np.asarray(jax.vmap(Observed.of(system).actuation)(np.asarray(tensions)))
 
 
 def _misses(predictor: LinearPredictor, trajectory: Trajectory) -> float:

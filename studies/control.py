@@ -22,6 +22,7 @@ from knode_cosserat.estimation import (
 from knode_cosserat.estimation.observer import TENSION_DEVIATION
 from knode_cosserat.recordings.estimation.estimate import estimate_states
 from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -301,7 +302,7 @@ def _observed(observer: KalmanObserver, start: Any, seed: int) -> tuple[list[flo
         observer.update(measured)
         times.append(clock.perf_counter() - began)
         found, truth = observer.estimate, plant.state
-        apart = np.asarray(robot.drawing.positions(found.y)) - np.asarray(truth.position[-1])
+        apart = np.asarray(Drawing.of(robot).positions(found.y)) - np.asarray(truth.position[-1])
         errors.append(float(np.sqrt(np.mean(np.sum(apart**2, axis=-1)))) / float(robot.length))
         inside.append(observer.covers(truth))
         plant.apply(control)

@@ -38,6 +38,7 @@ from knode_cosserat.evaluation.style import PALETTE, style, width_of
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.simulate import simulate
 from studies import stand_in
 from studies.elastica.plant import ElasticaPlant
@@ -296,7 +297,7 @@ def _on_stand_in(environment: Environment, policy: Policy, key: Any, rod: Elasti
 def _reward(environment: Environment, goal: Any, t: float, tip: Any) -> float:
     """Return the reward of a position of the tip (m) at a time (s), away from obstacles."""
     tangent = environment.arrays.survey.frame[2]
-    length = environment.robot.nominal.length
+    length = nominal_model(environment.robot).length
     return float(environment.task.outcome(goal, t, Tip(tip, tangent), np.inf, length).reward)
 
 

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 import yaml
 
-from knode_cosserat.rods.paths import parameter_at
+from knode_cosserat.rods.parameters import parameter_at
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.sweeps import Plan, Range, Sweep
 from knode_cosserat.sweeps._folder import LOG, SHARDS
@@ -106,7 +107,7 @@ def measure_sweep(
 def _raw_batch(sweep: Sweep) -> dict[str, float]:
     """Return the rate of `simulate` for a batch of the same cases, and the time of a case on a core (s)."""
     plan = Plan.of(sweep)
-    cases, nominal = plan.cases(0), plan.systems[0].nominal
+    cases, nominal = plan.cases(0), nominal_model(plan.systems[0])
     values = {name: array for name, array in cases.values.items() if parameter_at(nominal, name)}
     count = len(cases.case)
     robots = [

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.law import MaterialLaw
 from knode_cosserat.rods.loads import square_law_drag
 from knode_cosserat.rods.parameters import parameter
@@ -188,7 +189,7 @@ class TurningTendons(TendonRobot):
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
         y_s = super().balance(s, t, y, y_t, z, z_t, control)
-        f = self.observed.actuation(control)
+        f = Observed.of(self).actuation(control)
         turned = dot(rotation_matrix(self.y_layout.get(y, "h")), f)
         return y_s.at[self.y_layout.slice("n")].add(self.turning * (f - turned))
 

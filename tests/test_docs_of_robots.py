@@ -26,8 +26,8 @@ def test_the_file_with_two_sections_is_that_of_its_page():
     (shown,) = re.findall(r"```yaml\n(.*?)```", page, re.DOTALL)
     assert shown == (root / "examples" / "two_sections.yaml").read_text(encoding="utf-8")
     robot = kc.load_robot(root / "examples" / "two_sections.yaml")
-    assert isinstance(robot, kc.robots.RoutedTendonRobot) and robot.control_size == 6
-    assert robot.nodes == 17 and robot.cuts == (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
+    assert isinstance(robot, kc.robots.RoutedTendonRobot) and robot.control_layout.size == 6
+    assert robot.nodes == 17 and robot.discontinuities.places == (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
 
 
 def test_every_kind_is_on_the_page():

@@ -15,6 +15,7 @@ from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, Residual, network
 from knode_cosserat.learning.structured.residual import CURVED, LINEAR, Structured, expansion
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
@@ -106,7 +107,7 @@ class Made(NamedTuple):
 @functools.cache
 def made(kind: str) -> Made:
     robot = ROBOTS[kind]
-    mean = np.array([6.0, 5.0, 4.0, 5.0] if robot.control_size == 4 else [0.3, 0.1])
+    mean = np.array([6.0, 5.0, 4.0, 5.0] if robot.control_layout.size == 4 else [0.3, 0.1])
     controls = mean * (1.0 + 0.3 * np.sin(2.0 * np.pi * DT * np.arange(1, STEPS + 1) / 0.4)[:, None])
     rest = kc.equilibrium(robot, controls[0])
     motion = kc.simulate(robot, controls, DT, initial=rest)
@@ -114,7 +115,7 @@ def made(kind: str) -> Made:
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
-    return "bending" if robot.control_size == 2 else "youngs_modulus"
+    return "bending" if robot.control_layout.size == 2 else "youngs_modulus"
 
 
 def fitted(robot: kc.System, it: Made, config: kc.FitConfig) -> Any:
@@ -166,8 +167,10 @@ def identified(robot: kc.System, it: Made, measured: bool) -> Any:
         data = kc.recordings.Measurements.of(kc.simulate(robot, it.controls, DT), (0.5, 1.0))
     found = kc.identify(robot, [data], parameters=[name])
     assert type(found.robot) is type(robot)
-    np.testing.assert_allclose(getattr(found.robot.nominal, name), getattr(robot.nominal, name), rtol=1e-3)
-    return getattr(found.robot.nominal, name)
+    np.testing.assert_allclose(
+        getattr(nominal_model(found.robot), name), getattr(nominal_model(robot), name), rtol=1e-3
+    )
+    return getattr(nominal_model(found.robot), name)
 
 
 def predicted(robot: kc.System, it: Made) -> Any:
@@ -241,7 +244,7 @@ def shown(kind: str) -> kc.Trajectory:
     y[..., :2] += 0.1 * s[:, None] * np.arange(4)[:, None, None]
     rows = np.zeros(4, dtype=int)
     return kc.Trajectory(
-        robot, None, DT * np.arange(4), y, z, np.zeros((4, robot.control_size)), rows, 0.0 * rows, rows
+        robot, None, DT * np.arange(4), y, z, np.zeros((4, robot.control_layout.size)), rows, 0.0 * rows, rows
     )
 
 
@@ -262,8 +265,8 @@ def test_files_figures_and_the_viewer_take_every_robot(kind, tmp_path):
         assert getattr(kc.figures, draw)(trajectory).axes
     kc.viewer.export_scene(trajectory, tmp_path / "a.html")
     assert drawing.drawing(robot, np.arange(robot.nodes))["model"] is isinstance(robot, kc.KNODE)
-    assert len(drawing.sliders(robot)) == robot.control_size
-    assert kc.named_controls.parse(robot, "constant:1.0", 3, DT).shape == (3, robot.control_size)
+    assert len(drawing.sliders(robot)) == robot.control_layout.size
+    assert kc.named_controls.parse(robot, "constant:1.0", 3, DT).shape == (3, robot.control_layout.size)
 
 
 def same(found: kc.System, expected: kc.System) -> None:
@@ -275,9 +278,9 @@ def same(found: kc.System, expected: kc.System) -> None:
 def test_a_change_of_a_model_is_one_of_its_robot():
     nested = ROBOTS["model of a model"]
     changed = nested.replace(youngs_modulus=1e9, nodes=7)
-    assert isinstance(changed, kc.KNODE) and changed.nominal.youngs_modulus == 1e9
-    assert changed.nodes == changed.knowledge.nodes == changed.nominal.nodes == 7
-    assert nested.nominal is ROBOT and ROBOT.nominal is ROBOT
+    assert isinstance(changed, kc.KNODE) and nominal_model(changed).youngs_modulus == 1e9
+    assert changed.nodes == changed.knowledge.nodes == nominal_model(changed).nodes == 7
+    assert nominal_model(nested) is ROBOT and nominal_model(ROBOT) is ROBOT
     longer = [Structured(np.array(stretch), None, None, None) for stretch in (0.1, 0.2)]
     both = kc.KNODE(kc.KNODE(ROBOT, longer[0]), longer[1])
     assert float(both.length) == pytest.approx(1.32 * float(ROBOT.length))
@@ -339,7 +342,7 @@ def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     rng = np.random.default_rng(7)
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])
     history = History(20.0, *(0.1 * rng.normal(size=size) for size in (19, 6, 19)))
-    control = rng.uniform(1.0, 3.0, nominal.control_size)
+    control = rng.uniform(1.0, 3.0, nominal.control_layout.size)
     step = 1e-3 * rng.normal(size=6)
 
     @jax.jit  # one program, instead of one for each operation

@@ -29,7 +29,7 @@ def test_the_trunks_files_fit_together():
     assert RecordingConfig.load(TRUNK / "recording.yaml") == RecordingConfig.asl_trunk()
     for name in ("nominal", "identified_1", "identified_11"):
         robot = trunk(name)
-        assert robot.control_layout.names == ("motor",) and robot.control_size == 6
+        assert robot.control_layout.names == ("motor",) and robot.control_layout.size == 6
         # two tendons of each motor, at opposite sides, that end at one disk; on a reel it is in or out
         taken_in = np.asarray(robot.taken_in(np.ones(6)) - robot.taken_in(np.zeros(6)))
         for k in range(6):

@@ -134,7 +134,7 @@ def synthetic(batch=(), steps=4, nodes=5, robot=ROBOT, settings=PAPER, seed=0, p
         time=0.3 + np.arange(steps) * 0.1,
         y=y,
         z=rng.normal(size=(*rows, nodes, robot.z_layout.size)),
-        control=rng.uniform(size=(*rows, robot.control_size)),
+        control=rng.uniform(size=(*rows, robot.control_layout.size)),
         result=result,
         residual=rng.normal(size=rows),
         iterations=rng.integers(0, 100, size=rows),

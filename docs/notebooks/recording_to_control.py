@@ -72,7 +72,7 @@ kc.figures.prediction_against_measurement(after, unseen)
 turn = np.linspace(0.0, 2.0 * np.pi, points)
 wanted = 0.15 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
 reached = kc.inverse_kinematics(
-    found.robot, wanted, low=3.0, high=10.0, pose=lambda robot, y: (robot.drawing.positions(y)[:2], None)
+    found.robot, wanted, low=3.0, high=10.0, pose=lambda robot, y: (robot.y_layout.get(y, "p")[:2], None)
 )
 print(
     f"{np.sum(reached.converged)} of {points} reached; tensions {reached.control.min():.2f} to "

@@ -25,8 +25,10 @@ from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.io import container
 from knode_cosserat.io.container import ContainerError, Variable
 from knode_cosserat.rods import robot_file
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.solvers.result import Result, ResultCodes
@@ -86,12 +88,12 @@ class Trajectory(eqx.Module):
     @property
     def position(self) -> Any:
         """Positions (…, T, N, 3) in m, global frame."""
-        return self.system.drawing.positions(self.y)
+        return Drawing.of(self.system).positions(self.y)
 
     @property
     def quaternion(self) -> Any:
         """Orientations (…, T, N, 4), scalar first."""
-        return self.system.drawing.quaternions(self.y)
+        return Drawing.of(self.system).quaternions(self.y)
 
     @property
     def tip_position(self) -> Any:
@@ -151,7 +153,7 @@ class Trajectory(eqx.Module):
         For a robot of several rods, such as the legs of a platform, `n2` is the second rod's field and `n`
         stacks all of them, (…, T, N, rods, size).
         """
-        count, known = self.system.strands, []
+        count, known = strand_count(self.system), []
         for layout, packed in self._layouts():
             if name in layout.names:
                 return layout.get(packed, name)
@@ -250,7 +252,7 @@ class Trajectory(eqx.Module):
             return []
         # a user's own system may have no positions, or fail: a text must not
         with contextlib.suppress(Exception):
-            tip = np.asarray(self.system.drawing.positions(np.asarray(self.y)[solved[-1], -1]))
+            tip = np.asarray(Drawing.of(self.system).positions(np.asarray(self.y)[solved[-1], -1]))
             return [f"tip at {float(self.time[solved[-1]]):g} s: {quantity(tip, 'm')}"]
         return []
 

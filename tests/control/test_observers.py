@@ -18,6 +18,7 @@ from knode_cosserat.estimation import (
     TipPosition,
 )
 from knode_cosserat.estimation.adapted import AdaptedParameters
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.solvers import Stepper
 
@@ -117,7 +118,7 @@ def followed(observer, still, count=60):
     for k in range(count):
         measured = np.asarray(truth.state.tip_position[-1]) + 2e-4 * rng.normal(size=3)
         observer.update(measured)
-        position = np.asarray(ROBOT.drawing.positions(observer.estimate.y))
+        position = np.asarray(Drawing.of(ROBOT).positions(observer.estimate.y))
         apart = position - np.asarray(truth.state.position[-1])
         errors.append(np.sqrt(np.mean(np.sum(apart**2, axis=-1))) / 0.635)
         inside.append(observer.covers(truth.state))

@@ -20,6 +20,7 @@ from knode_cosserat.control import (
     run_loop,
 )
 from knode_cosserat.estimation import KalmanObserver, TipPosition
+from knode_cosserat.rods.aspects import Drawing
 
 #: a soft rod that is clamped sideways and sags by a twentieth of its length
 SAGGING = kc.robots.SlenderRod(
@@ -113,7 +114,7 @@ def test_a_plant_and_its_observer_start_at_rest():
     for _ in range(10):
         plant.apply(np.zeros(1))
         observer.predict(np.zeros(1))
-    for tip in (plant.tip(), SAGGING.drawing.positions(observer.estimate.y[-1])):
+    for tip in (plant.tip(), Drawing.of(SAGGING).positions(observer.estimate.y[-1])):
         np.testing.assert_allclose(tip, still.tip_position[0], atol=1e-7)
     # the paper's start is there too, and moves
     fallen = SimulatedPlant(SAGGING, DT, sensor, initial=None)

@@ -251,7 +251,7 @@ def test_equilibria(name, space):
     robot, settings = robot_of(name), Settings(None, SCHEMES[space])
     rng = np.random.default_rng(1)
     size = 8.0 if "tension" in robot.control_layout.names else 0.05 if name == LEGS else 1.0
-    controls = rng.uniform(0.0, size, (3, 4, robot.control_size))
+    controls = rng.uniform(0.0, size, (3, 4, robot.control_layout.size))
     y, none = unloaded_shape(robot, settings.space), no_history(robot, settings.space)
     for k, own in enumerate(controls):
         done, last, rows = loops.static_one(robot, settings, own, y, (0, 4))

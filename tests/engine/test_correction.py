@@ -105,7 +105,7 @@ def dense_correction(system, settings, dt, past, control, y):
 def test_a_correction_is_that_of_a_dense_solve(name, space):
     robot, settings = ROBOTS[name](), Settings.of("bdf2", space, "paper", ONCE)
     past = standing_history(robot, settings) if name == "six legs" else resting_history(robot, settings)
-    control = np.random.default_rng(1).uniform(0.2, 0.4, robot.control_size)
+    control = np.random.default_rng(1).uniform(0.2, 0.4, robot.control_layout.size)
     control *= {"reel": 1e-3, "six legs": 1e-3}.get(name, 1.0)
     steps, y = StepCoefficients.of(settings, DT), np.asarray(past.y[0])
     _, state, rows = loops.loop_one(robot, settings, steps, control[None], past, (0, 1))

@@ -19,6 +19,7 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.structured.residual import CURVED, Structured, expansion
 from knode_cosserat.recordings.virtual import virtual_robot
+from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import unknown_count
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import LOBATTO2
@@ -181,13 +182,13 @@ SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.robots.ca
 
 def point_of(system, rng):
     """Return random arguments of the equations: parameters, c0, t, control, s, y, record, unknowns."""
-    strand = system.strand
+    strand = strand_of(system)
     ny, nz = strand.y_layout.size, strand.z_layout.size
     y, record = 0.1 * rng.normal(size=ny), 0.1 * rng.normal(size=ny + nz + (ny if strand.mixed else 0))
     for name in {"h", "n"} & set(strand.y_layout.names):
         y[strand.y_layout.slice(name)] += [1.0, 0.0, 0.0, 0.0] if name == "h" else 0.5
     leaves = [np.asarray(leaf, dtype=float) for leaf in jax.tree.leaves(system)]
-    control, s = rng.uniform(4.0, 8.0, system.control_size), 0.3 * np.max(system.length)
+    control, s = rng.uniform(4.0, 8.0, system.control_layout.size), 0.3 * np.max(system.length)
     unknowns = rng.normal(size=unknown_count(system))
     return leaves, np.array([30.0, 0.2]), control, np.array(s), y, record, unknowns
 
@@ -204,10 +205,10 @@ def test_equations_agree_with_jax(name):
         own = jax.tree.unflatten(tree, list(parameters))
         problem = StepProblem(own, times[1], control, times[0], record[None], LOBATTO2)
         f, z = problem.point_rates(s, y, record)
-        whole = jnp.concatenate([record] * system.strands)[None]
+        whole = jnp.concatenate([record] * strand_count(system))[None]
         ends = dataclasses.replace(problem, history=jnp.zeros((1, whole.shape[1])))
         base = ends.base(unknowns)
-        y_tip = jnp.concatenate([y] * system.strands)
+        y_tip = jnp.concatenate([y] * strand_count(system))
         tip = system.tip(times[1], control, y_tip, times[0] * y_tip)
         return f, z, base, tip
 

@@ -14,6 +14,8 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import OnlineModel
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
+from knode_cosserat.rods.strands import strand_count
+from knode_cosserat.rods.system import Discontinuities
 from knode_cosserat.solvers import rollout
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.evaluation import unloaded_shape
@@ -44,7 +46,7 @@ SPACES = [
 class CutLegs(kc.robots.ParallelRobot):
     """Legs with places of discontinuity, of which one lies on a node."""
 
-    cuts = (0.37, 5 / 9)
+    discontinuities = Discontinuities((0.37, 5 / 9))
 
 
 def cut_legs():
@@ -64,11 +66,11 @@ class Motion:
         robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
-        start = resting_history if robot.strands == 1 else standing_history
+        start = resting_history if strand_count(robot) == 1 else standing_history
         self.past = jax.tree.map(np.asarray, start(robot, self.settings))
         low, high = (2.0, 5.0) if name != CURVED else (0.2, 0.5)
-        self.controls = rng.uniform(low, high, (STEPS, robot.control_size))
-        if robot.strands > 1:
+        self.controls = rng.uniform(low, high, (STEPS, robot.control_layout.size))
+        if strand_count(robot) > 1:
             self.controls = displacements()[0, :STEPS]
         self.directions = jax.tree.map(lambda leaf: 0.1 * leaf * rng.normal(size=(3, *np.shape(leaf))), robot)
         self.weights = rng.normal(size=(3, COLUMNS))
@@ -147,7 +149,7 @@ def test_an_adapted_zero_is_no_constant_of_the_code():
     """Otherwise the machine code would be compiled again in the loop, as soon as the zero moves."""
     robot = kc.load_robot(PAPER).replace(loads=(AttachedMass(mass=0.0),))
     model = OnlineModel(robot, AdaptedParameters(robot, [Adapted("loads.0.mass", 0.03)]), DT)
-    cores, still = [], np.zeros(robot.control_size)
+    cores, still = [], np.zeros(robot.control_layout.size)
     for x in (0.0, 0.5):
         system, _ = model.moved(np.array([x]))
         cores.append(loops.core_of(Pattern.of(system), model.settings, robots=False))
@@ -249,7 +251,7 @@ def test_cotangents_are_those_of_the_transposed_map(name, scheme, space):
 @pytest.mark.parametrize(("name", "low", "high"), [(ROUTED, 2.0, 5.0), (LEGS, 0.0, 0.02)])
 def test_tangents_and_cotangents_of_equilibria(name, low, high):
     robot, rng, eps = kc.load_robot(name), np.random.default_rng(0), 1e-4
-    controls, y = rng.uniform(low, high, (3, robot.control_size)), unloaded_shape(robot, LOBATTO2)
+    controls, y = rng.uniform(low, high, (3, robot.control_layout.size)), unloaded_shape(robot, LOBATTO2)
     run = rollout.static_rollout(Equilibria(Settings(None), 3), Pattern.of(robot))
     along = (
         jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), robot),

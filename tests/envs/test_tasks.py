@@ -8,6 +8,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat import envs
 from knode_cosserat.envs.dynamics import clearance_of, tip_of
+from knode_cosserat.rods.aspects import Drawing
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +89,7 @@ def test_clearance_is_the_distance_of_the_surface(robot, survey):
     goal = goals(task, survey, 1)[0]._replace(centres=jnp.array([[0.1, 0.0, 0.3]]))
     system = task.placed(task.equipped(robot), goal)
     y, _ = jax.vmap(system.rest)(np.linspace(0.0, float(system.length), system.nodes))
-    nearest = np.linalg.norm(np.asarray(system.drawing.positions(y)) - [0.1, 0.0, 0.3], axis=1).min()
+    nearest = np.linalg.norm(np.asarray(Drawing.of(system).positions(y)) - [0.1, 0.0, 0.3], axis=1).min()
     assert float(clearance_of(system, y)) == pytest.approx(nearest - 0.02 - float(system.radius))
     assert np.isinf(clearance_of(robot, y))
     np.testing.assert_allclose(tip_of(system, y).position, [0.0, 0.0, float(system.length)], atol=1e-12)

@@ -312,7 +312,7 @@ def at_rest(rod, moved=0.0):
     y[:, 0] += moved
     row = np.zeros(1, dtype=int)
     return kc.Trajectory(
-        rod, None, np.zeros(1), y[None], z[None], np.zeros((1, rod.control_size)), row, 0.0 * row, row
+        rod, None, np.zeros(1), y[None], z[None], np.zeros((1, rod.control_layout.size)), row, 0.0 * row, row
     )
 
 

@@ -296,19 +296,15 @@ def test_any_output_of_a_sensor_determines_parameters(output):
 # slopes
 
 
-class GuessedRest(Ends):
-    rest_is_guess = True
-
-
 class Hanging(Bar):
     """A bar stretched by its own weight: its start is an equilibrium that has to be found."""
 
-    @property
-    def ends(self):
-        return GuessedRest(self)
-
     def balance(self, s, t, y, y_t, z, z_t, control):
         return super().balance(s, t, y, y_t, z, z_t, control).at[1].add(-9.81 * self.density)
+
+
+class GuessedRest(Ends, of=Hanging):
+    rest_is_guess = True
 
 
 def require_exact_slopes(misfit, size):

@@ -24,11 +24,11 @@ PAIR = CABLES.replace(
 
 @pytest.mark.parametrize("robot", [CABLES, PAIR])
 def test_nominal_numbers_change_nothing(robot):
-    model = Model.of_library(robot, np.ones((4, robot.control_size)))
+    model = Model.of_library(robot, np.ones((4, robot.control_layout.size)))
     assert not {"load cell gains", "early anchors", "vibration", "friction"} & set(model.names)
     assert ("tendon angles" in model.names) == (robot.routing is None)
     same = model.robot(np.zeros(model.size))
-    control = np.linspace(0.5, 1.0, robot.control_size)
+    control = np.linspace(0.5, 1.0, robot.control_layout.size)
     for s in (0.0, 0.3, 1.0):
         for each, nominal in zip(same.routes_at(s), robot.routes_at(s), strict=True):
             np.testing.assert_allclose(each, nominal, rtol=0.0, atol=1e-15)

@@ -18,6 +18,7 @@ from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.training.checkpoint import data_hash
 from knode_cosserat.learning.training.runs import FitError, WatchError
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.wrapped import Wrapped
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled
@@ -76,7 +77,7 @@ def test_a_model_is_what_its_knowledge_is():
     loose = kc.robots.SlenderRod(
         length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.robots.ends.Free()
     )
-    assert not loose.ends.held and not KNODE(loose, None).ends.held
+    assert not Ends.of(loose).held and not Ends.of(KNODE(loose, None)).held
 
 
 def test_noise_in_the_data_is_in_every_number_and_the_same_each_time(bars):

@@ -15,6 +15,7 @@ from knode_cosserat.learning.config import FitConfig, NetworkOptions, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
 from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
 from studies.recordings import _paper_motion
@@ -110,7 +111,7 @@ def test_inputs_are_those_of_the_training_with_the_same_rates():
     for point in points(3):
         z = semi_discrete.strains(ROBOT, point)
         expected = np.concatenate(
-            [point.y, point.history.y, z, point.history.z, ROBOT.observed.actuation(TENSION)]
+            [point.y, point.history.y, z, point.history.z, Observed.of(ROBOT).actuation(TENSION)]
         )
         inputs = model.residual.inputs(ROBOT, point.y, point.y_t, z, point.z_t(z), TENSION)
         np.testing.assert_allclose(inputs, expected, rtol=1e-12, atol=1e-12)

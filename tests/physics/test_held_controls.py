@@ -234,7 +234,7 @@ def test_a_base_moves_without_jumps():
 )
 def test_steps_longer_than_the_motion_are_warned_of(name, change, dt):
     robot = kc.load_robot(name).replace(**change)
-    controls = np.zeros((1, robot.control_size))
+    controls = np.zeros((1, robot.control_layout.size))
     with pytest.warns(LongStepWarning, match=f"dt is {dt:g} s, longer than .* Use dt = .* or less"):
         kc.simulate(robot, controls, dt, on_failure="return", recovery_budget=0.0)
 

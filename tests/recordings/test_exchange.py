@@ -132,7 +132,7 @@ def planar_motion():
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=6)
     rng, zero = np.random.default_rng(0), np.zeros(5)
     y, z = (rng.normal(size=(5, 6, each.size)) for each in (string.y_layout, string.z_layout))
-    control = rng.normal(size=(5, string.control_size))
+    control = rng.normal(size=(5, string.control_layout.size))
     return kc.Trajectory(
         string, None, 0.1 * np.arange(5), y, z, control, zero.astype(int), zero, zero.astype(int)
     )

@@ -285,7 +285,7 @@ def test_what_slides_is_no_base():
 def test_what_nothing_holds_is_said_to_have_no_equilibrium_under_its_weight(result):
     def cause(robot, time):
         # all that is tried before would take a minute
-        return likely_cause(result, robot, Settings(time=time), np.zeros(robot.control_size))
+        return likely_cause(result, robot, Settings(time=time), np.zeros(robot.control_layout.size))
 
     falling = LOOSE.replace(surroundings=())
     assert "nothing holds the robot" in cause(falling, None)

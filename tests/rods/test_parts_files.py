@@ -21,6 +21,7 @@ from knode_cosserat.rods.parts import kinds_of
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
 from knode_cosserat.rods.routing import FunctionRouting, Routing
 from knode_cosserat.rods.section import SectionChange
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.surroundings import Obstacle, Sphere
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.rods.virtual_robot import VirtualRobot
@@ -231,7 +232,9 @@ def test_parameters_of_parts_by_name():
         "loads.0.mass": 0.3, "loads.1.force": [1, 2, 3], "surroundings.0.radius": 0.2,
         "base_end.position": [1, 0, 0], "loads.0.at": 0.6,
     })  # fmt: skip
-    assert changed.loads[0].mass == 0.3 and changed.loads[0].at == 0.6 and 0.6 in changed.cuts
+    assert (
+        changed.loads[0].mass == 0.3 and changed.loads[0].at == 0.6 and 0.6 in changed.discontinuities.places
+    )
     np.testing.assert_array_equal(changed.loads[1].force, [1, 2, 3])
     assert changed.surroundings[0].radius == 0.2 and changed.loads[2] is LADEN.loads[2]
     np.testing.assert_array_equal(changed.base_end.position, [1, 0, 0])
@@ -272,7 +275,8 @@ def made(robots):
     return kc.Trajectory(
         system, None, np.arange(3) * 0.1, rng.normal(size=(*batch, 3, one.nodes, one.y_layout.size)),
         rng.normal(size=(*batch, 3, one.nodes, one.z_layout.size)),
-        rng.normal(size=(*batch, 3, one.control_size)), numbers.astype(int), numbers, numbers.astype(int),
+        rng.normal(size=(*batch, 3, one.control_layout.size)), numbers.astype(int), numbers,
+        numbers.astype(int),
     )  # fmt: skip
 
 
@@ -311,7 +315,9 @@ def test_a_batch_from_a_damaged_file_is_refused(tmp_path):
 @pytest.mark.parametrize("name", [name for name in kc.catalog() if name != "delrin-tendon-robot"])
 def test_models_of_robots_with_parts_come_back(tmp_path, name):
     knowledge = kc.load_robot(name)
-    model = kc.KNODE(knowledge, network(knowledge.strand, NetworkOptions(hidden=3), jax.random.PRNGKey(0)))
+    model = kc.KNODE(
+        knowledge, network(strand_of(knowledge), NetworkOptions(hidden=3), jax.random.PRNGKey(0))
+    )
     model.save(tmp_path / "model")
     found = kc.load_model(next(Path(tmp_path).glob("model*")))
     assert_equal(found.knowledge, knowledge)

@@ -28,7 +28,7 @@ def test_a_pair_is_wound_up_on_one_side_and_let_out_on_the_other():
 @pytest.mark.slow
 def test_controls_are_angles_and_the_robot_is_that_of_the_lengths():
     motors = ROBOT.replace(reels=PAIRS)
-    assert motors.control_layout.names == ("motor",) and motors.control_size == 2
+    assert motors.control_layout.names == ("motor",) and motors.control_layout.size == 2
     assert motors.control_layout.fields[0].unit == "rad"
     angles = np.array([0.6, -0.2])
     by_angle = kc.equilibrium(motors, angles).tip_position

@@ -14,6 +14,7 @@ from hypothesis import given, settings
 import knode_cosserat as kc
 from knode_cosserat.cli.arguments import modified
 from knode_cosserat.rods import robot_file
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.robot_file import (
     RobotFileError,
@@ -442,7 +443,7 @@ def test_an_offset_that_the_papers_model_ignores_is_named(tmp_path):
     # the offset is indeed ignored
     robot = load_robot(PAPER)
     one, other = (
-        robot.replace(tendon_offset=each).observed.actuation(np.arange(4.0)) for each in (0.0, 0.05)
+        Observed.of(robot.replace(tendon_offset=each)).actuation(np.arange(4.0)) for each in (0.0, 0.05)
     )
     np.testing.assert_array_equal(one, other)
     assert len(warned(lambda: modified(robot, ["tendon_offset=0.03"]))) == 1

@@ -225,7 +225,7 @@ def test_one_stretch_is_two():
 @pytest.mark.campaign
 def test_the_catalogs_robot_of_controlled_curvature():
     robot = kc.load_robot("variable-curvature-robot").replace(gravity=[0.0, 0.0, 0.0])
-    assert len(robot.sections) == robot.control_size == 3
+    assert len(robot.sections) == robot.control_layout.size == 3
     control = np.array([0.5, -0.3, 0.8])
     u = np.asarray(kc.equilibrium(robot, control).part("u"))[0]
     s = np.linspace(0.0, 1.0, robot.nodes)

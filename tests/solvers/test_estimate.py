@@ -43,7 +43,7 @@ def driven(kind, t):
 def moved(rod, controls, dt, **options):
     """Simulate from the equilibrium under zero control."""
     space = options.get("space", "lobatto2")
-    rest = kc.equilibrium(rod, np.zeros(rod.control_size), space=space)
+    rest = kc.equilibrium(rod, np.zeros(rod.control_layout.size), space=space)
     return kc.simulate(rod, controls, dt, initial=rest, **options)
 
 

@@ -17,7 +17,9 @@ STEPS = 12
 def six_legs():
     robot = kc.load_robot("six-legged-robot")
     t = np.arange(1, 61)[:, None] * DT
-    return robot, *(0.01 * np.sin(2 * np.pi * t / T + np.arange(robot.control_size)) for T in (1.0, 1.5))
+    return robot, *(
+        0.01 * np.sin(2 * np.pi * t / T + np.arange(robot.control_layout.size)) for T in (1.0, 1.5)
+    )
 
 
 KINDS = {**SYSTEMS, "six_legs": six_legs}

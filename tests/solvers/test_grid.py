@@ -164,7 +164,11 @@ def one_piece(problem):
         def rates(k, y):
             return problem.point_rates(s[k], y, history[k])[0]
 
-        far = problem.jump(acting, start, history[0]) if problem.system.jump is not None else start
+        far = (
+            problem.jump(acting, start, history[0])
+            if problem.system.discontinuities.jump is not None
+            else start
+        )
         f = [rates(0, far), rates(1, end)]
         for k, stage in enumerate(formula.stages):
             moved = sum(x * rate for x, rate in zip(stage.rates, f, strict=True))

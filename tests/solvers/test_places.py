@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.solvers.places import Places, places_at, positions_at
 
 #: a third or two thirds of the way between two nodes, on each grid below
@@ -79,7 +80,7 @@ def test_several_rods_have_a_line():
     rest = [platform.rest(s)[0] for s in np.linspace(0.0, 1.0, platform.nodes) * np.asarray(platform.length)]
     y = np.array(rest)[None]
     places = places_at(np.array([0.33]), platform.nodes)
-    p = np.asarray(platform.drawing.positions(y))
+    p = np.asarray(Drawing.of(platform).positions(y))
     part = places.part[:, None]
     expected = (1.0 - part) * p[:, places.node] + part * p[:, places.node + 1]
     np.testing.assert_allclose(positions_at(platform, y, places), expected, atol=1e-15)

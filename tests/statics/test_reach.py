@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.learning.structured.residual import Structured
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.statics.reach import _same_shape
 from knode_cosserat.statics.search import at_limits, rotation_between
 
@@ -163,7 +164,7 @@ def test_a_control_that_is_held_stays():
 
 def middle(system, y):
     """Half the tip's position: some function of the last node."""
-    return 0.5 * system.drawing.positions(y), system.drawing.quaternions(y)
+    return 0.5 * Drawing.of(system).positions(y), Drawing.of(system).quaternions(y)
 
 
 @pytest.mark.slow

@@ -6,6 +6,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Free, Pinned
 from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
 from tests.trajectories import synthetic
 
@@ -244,7 +245,7 @@ def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
     """Legs clamped at both ends of a platform that can move sideways: π² EI/L² each."""
     robot = kc.load_robot("six-legged-robot")
     even = np.arange(6) * np.pi / 3
-    stiffness, length = float(robot.strand.Kbt[0, 0]), float(robot.length)
+    stiffness, length = float(strand_of(robot).Kbt[0, 0]), float(robot.length)
     for part in (0.95, 1.05):
         mass = part * 6.0 * np.pi**2 * stiffness / length**2 / 9.81
         loaded = robot.replace(

@@ -9,6 +9,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.solvers.settings import Settings
 from studies import comparisons, data_efficiency, simulation
 from studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
@@ -35,7 +36,7 @@ def linear_motion(tensions, rank=3, seed=0):
     x, rows = np.zeros(rank), []
     for row in tensions:
         rows.append(rest + (basis @ x).reshape(rest.shape))
-        x = A @ x + B @ np.asarray(ROBOT.observed.actuation(row))[:2]
+        x = A @ x + B @ np.asarray(Observed.of(ROBOT).actuation(row))[:2]
     y = np.array(rows)
     zeros = np.zeros(len(y))
     controls = np.concatenate([np.zeros((1, 4)), tensions])[: len(y)]

@@ -180,13 +180,6 @@ def test_the_page_may_not_reach_any_network(truth, tmp_path):
     assert path.stat().st_size < 1_500_000
 
 
-class Plane(Drawing):
-    """Positions in two numbers."""
-
-    def positions(self, y):
-        return y[..., :2]
-
-
 class Flat(kc.System):
     """A system that says of its nodes where they are, in two numbers, and no more."""
 
@@ -197,10 +190,6 @@ class Flat(kc.System):
 
     length: float = 2.0
 
-    @property
-    def drawing(self):
-        return Plane(self)
-
     def rest(self, s):
         raise NotImplementedError
 
@@ -208,10 +197,18 @@ class Flat(kc.System):
         raise NotImplementedError
 
 
+class Plane(Drawing, of=Flat):
+    """Positions in two numbers."""
+
+    def positions(self, y):
+        return y[..., :2]
+
+
 class Nowhere(Flat):
     """One that does not even say that."""
 
-    drawing = kc.System.drawing
+
+Drawing.register(Nowhere, Drawing)
 
 
 def of(system, rows=4, nodes=5):
@@ -245,7 +242,7 @@ def test_every_robot_has_a_drawing_and_a_slider_for_each_control(name):
     assert len(found["radii"]) == robot.nodes and min(found["radii"]) > 0.0
     assert len(found["obstacles"]) == len(getattr(robot, "surroundings", ()))
     given = sliders(robot)
-    assert len(given) == robot.control_size
+    assert len(given) == robot.control_layout.size
     for slider in given:
         assert slider["low"] <= slider["start"] <= slider["high"] and slider["low"] < slider["high"]
 

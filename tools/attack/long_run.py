@@ -76,7 +76,7 @@ def simulations(most: int, seconds: float, every: int = 40) -> list[Sample]:
         name, space, nodes = all_shapes[k // ALIKE % len(all_shapes)]
         length, modulus = generator.uniform(0.3, 0.8), 10.0 ** generator.uniform(9.0, 10.0)
         robot = robots[name].replace(nodes=nodes, length=float(length), youngs_modulus=float(modulus))
-        controls = generator.uniform(2.0, 7.0, (2, robot.control_size))
+        controls = generator.uniform(2.0, 7.0, (2, robot.control_layout.size))
         moved = kc.simulate(robot, controls, 0.05, space=space, on_failure="return", recovery_budget=2.0)
         failed += int(np.any(np.asarray(moved.result) < 0))
         spent = time.monotonic() - began
@@ -118,7 +118,7 @@ async def _live(seconds: float, every: float) -> tuple[list[tuple[float, float, 
 
     robot = kc.load_robot(ROBOTS[0])
     began = time.monotonic()
-    page = _Sliders(began + seconds, robot.control_size)
+    page = _Sliders(began + seconds, robot.control_layout.size)
     session = asyncio.create_task(Session(kc.solvers.Stepper(robot, 0.05), page).run())
     samples = []
     while not session.done():

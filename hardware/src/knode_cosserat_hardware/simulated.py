@@ -179,7 +179,7 @@ class SimulatedRobot(TrueShape, Driver):
             )
         self.machine = machine = MachineParameters() if machine is None else machine
         self.robot, self.real_time = robot, real_time
-        self.tendon_count = robot.control_size
+        self.tendon_count = robot.control_layout.size
         self.limits = Limits() if limits is None else limits
         self._limiter = TensionLimiter(self.limits, self.tendon_count)
         count = self.tendon_count

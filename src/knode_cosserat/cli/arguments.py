@@ -16,6 +16,7 @@ import typer
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.recordings.formats import read_suffixes
+from knode_cosserat.rods.wrapped import nominal_model
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.ensemble import Ensemble
@@ -172,7 +173,7 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
     if "tendon_offset" in values:
         from knode_cosserat.rods.robot_file import warn_of_paper_tendons
 
-        warn_of_paper_tendons(changed.nominal, "--set tendon_offset")
+        warn_of_paper_tendons(nominal_model(changed), "--set tendon_offset")
     return changed
 
 

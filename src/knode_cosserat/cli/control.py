@@ -23,6 +23,7 @@ from knode_cosserat.cli.arguments import (
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.recordings.formats import written_suffixes
+from knode_cosserat.rods.wrapped import nominal_model
 
 #: distance from the nearest tip at rest at which a warning is given, as part of the length
 OUT_OF_REACH = 2e-3
@@ -139,7 +140,7 @@ def control(
     from knode_cosserat.estimation import TipPosition
 
     model = load_system(str(robot), changes)
-    count, length = model.control_size, float(model.nominal.length)
+    count, length = model.control_layout.size, float(nominal_model(model).length)
     ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
     limits = kcc.ControlLimits(*ends, rate, lag=lag)
     controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))

@@ -81,7 +81,7 @@ def reach(
     from knode_cosserat import named_controls
 
     system = load_system(robot, changes, nodes)
-    size = system.control_size
+    size = system.control_layout.size
     target = None if position is None else _target(position, float(system.length))
     orientation = (
         None if quaternion is None else parse_numbers("--quaternion", quaternion, 4, "0.98,-0.1,0.17,0")
@@ -175,7 +175,7 @@ def workspace(
     import knode_cosserat as kc
 
     system = load_system(robot, changes, nodes)
-    size = system.control_size
+    size = system.control_layout.size
     began = perf_counter()
     found = kc.workspace(
         system, parse_limits("--low", low, size), parse_limits("--high", high, size), count,

@@ -281,7 +281,7 @@ def _stability(rest: Any, space: str) -> tuple[dict[str, Any], list[str]]:
         return stability_summary(decided.kind, decided.reason)
     except ValueError:
         # with reels, or without internal force and moment
-        if not {"n", "m"} <= set(rest.system.ends.layout.names):
+        if not {"n", "m"} <= set(kc.robots.Ends.of(rest.system).layout.names):
             return stability_summary(None)
         unstable = bool(kc.statics.configuration(rest.system, rest.control[0], space=space).unstable)
         return stability_summary("divergence" if unstable else "stable")

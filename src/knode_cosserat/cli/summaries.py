@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.result import Result
 
 if TYPE_CHECKING:
@@ -96,7 +97,7 @@ def stability_summary(kind: str | None, reason: str = "") -> tuple[dict[str, Any
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:
     """Return the parameters by name, with value, unit and meaning; for a model, of its nominal robot."""
-    system = system.nominal
+    system = nominal_model(system)
     stated = {name: (getattr(system, name), it.unit, it.meaning) for name, it in system.parameters().items()}
     nodes = {"nodes": (system.nodes, "1", "nodes along the rod, base and tip included")}
     return {name: _quantity(*parts) for name, parts in (stated | nodes).items()}
@@ -107,7 +108,7 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     from knode_cosserat.rods.loads import AttachedMass
     from knode_cosserat.rods.rod import Rod
 
-    system = system.nominal
+    system = nominal_model(system)
     if not isinstance(system, Rod):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
@@ -138,7 +139,7 @@ def more_lines(system: System) -> list[str]:
     """Return the choices and parts of a robot that differ from the defaults, as lines of a robot file."""
     from knode_cosserat.rods.robot_file import KINDS, RobotFileError, more_of
 
-    system = system.nominal
+    system = nominal_model(system)
     try:
         return more_of(system) if type(system) in KINDS.values() else []
     except RobotFileError as error:

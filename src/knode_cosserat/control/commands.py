@@ -74,7 +74,7 @@ class ControlLimits:
         Raises:
             ValueError: limits that contradict each other, or of a wrong shape.
         """
-        count = robot.control_size
+        count = robot.control_layout.size
         arrays = {}
         for name in ("low", "high", "rate", "safe"):
             value = getattr(self, name)

@@ -23,7 +23,10 @@ from knode_cosserat.control.references import Reference, ReferenceFormatError
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.statics.reach import inverse_kinematics
 from knode_cosserat.trajectory import Trajectory
 
@@ -61,11 +64,11 @@ def check_within_length(robot: System, reference: Reference, seconds: float = CH
         ReferenceFormatError: a position that no rod of this length reaches, even if it stretches or its base
             moves.
     """
-    length = getattr(robot.nominal, "length", None)
-    if length is None or robot.strands > 1 or reference.size < 3:
+    length = getattr(nominal_model(robot), "length", None)
+    if length is None or strand_count(robot) > 1 or reference.size < 3:
         return
     y, _ = robot.rest(0.0)
-    base = np.asarray(robot.drawing.positions(np.asarray(y)[None]))[0]
+    base = np.asarray(Drawing.of(robot).positions(np.asarray(y)[None]))[0]
     length, times = float(length), np.arange(0.0, seconds, SAMPLING)
     apart = np.sqrt(np.nansum((reference.at(times)[:, :3] - base) ** 2, axis=1))
     k = int(np.argmax(apart))
@@ -119,7 +122,7 @@ def _coordinates(known: tuple[int, ...]) -> Any:
     """Return the pose function of some of the tip's coordinates; the same one each time, for compilation."""
 
     def pose(system: System, y: Any) -> tuple[Any, None]:
-        return system.drawing.positions(y)[np.array(known)], None
+        return Drawing.of(system).positions(y)[np.array(known)], None
 
     return pose
 

@@ -29,6 +29,7 @@ from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
 from knode_cosserat.estimation.online import Belief, OnlineModel, errors_along, split_record
 from knode_cosserat.estimation.outputs import Output, TipPosition
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
 
 #: periods in which an old plan goes on, and then the last control is held, before the robot goes safe
@@ -254,7 +255,7 @@ def _outputs(
         value, slope = errors_along(system, output, records, d_records, zero)
         values.append(value)
         moved.append(slope)
-    path = system.drawing.positions(split_record(system, records[:, -1])[0])
+    path = Drawing.of(system).positions(split_record(system, records[:, -1])[0])
     return error, slopes, jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1), path
 
 
@@ -301,7 +302,7 @@ class PlanController(Controller):
     ):  # fmt: skip
         self.observer, self.target, self.dt = observer, target, observer.dt
         self.limits = limits.of(observer.robot)
-        check_memory(observer.robot, horizon, knots * observer.robot.control_size + observer.columns)
+        check_memory(observer.robot, horizon, knots * observer.robot.control_layout.size + observer.columns)
         self.knots = Knots.spaced(horizon, knots)
         self.tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self._basis = self.knots.basis

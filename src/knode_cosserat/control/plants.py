@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.outputs import Output, final_output
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
@@ -157,4 +158,4 @@ class SimulatedPlant(Plant):
     def tip(self) -> Float[np.ndarray, "3"]:
         """Return the true position of the tip (m)."""
         y = np.asarray(self._stepper.state.y[-1, -1:])
-        return np.asarray(self.robot.drawing.positions(y))[-1]
+        return np.asarray(Drawing.of(self.robot).positions(y))[-1]

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.engine.program import LARGEST_PRODUCT, PRODUCTS, Program
+from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import grid_of
@@ -44,10 +45,10 @@ class Equations:
         leaves, tree = jax.tree.flatten(system)
         leaves = [np.asarray(leaf, dtype=float) for leaf in leaves]
         # traced, because the numbers of a pattern are no robot's
-        strand = self.strand = jax.eval_shape(lambda own: own.strand, system)
-        self.strands = system.strands
+        strand = self.strand = jax.eval_shape(strand_of, system)
+        self.strands = strand_count(system)
         self.ny, self.nz = strand.y_layout.size, strand.z_layout.size
-        self.nc, self.k = system.control_size, unknown_count(system)
+        self.nc, self.k = system.control_layout.size, unknown_count(system)
         #: numbers of a record: y, z and, if B is not zero, y_s
         self.numbers = self.ny + self.nz + (self.ny if system.mixed else 0)
         program = self.program = Program(MOST_OPERATIONS)
@@ -115,9 +116,10 @@ class Equations:
         traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(len(whole_y)), record)
         [self.tip] = program.evaluate(traced, [*known, whole_y, whole_history])
         #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
-        self.acting, self.far, self.jumping = program.inputs("acting", (len(system.cuts),), STATE), self.y, []
-        if system.jump is not None:
-            shapes = np.zeros(len(system.cuts)), np.ones(self.ny), np.zeros(self.numbers)
+        count = len(system.discontinuities.places)
+        self.acting, self.far, self.jumping = program.inputs("acting", (count,), STATE), self.y, []
+        if system.discontinuities.jump is not None:
+            shapes = np.zeros(count), np.ones(self.ny), np.zeros(self.numbers)
             traced = jax.make_jaxpr(jump)(leaves, *step, *shapes)
             [self.far] = program.evaluate(traced, [*known, self.acting, self.y, self.history])
             slopes = program.jacobian(self.far, self.y)
@@ -233,7 +235,7 @@ class TangentEquations(Equations):
         """
         super().__init__(system, moving, space)
         results = {
-            "rates": [*self.f, *self.z], "far": [*self.far] if system.jump is not None else [],
+            "rates": [*self.f, *self.z], "far": [*self.far] if system.discontinuities.jump else [],
             "tip": [*self.tip], "base": [*self.base],
         }  # fmt: skip
         self.z_by_y = self._nonzeros(self.z, self.y)

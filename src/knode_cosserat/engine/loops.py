@@ -104,7 +104,7 @@ def table_of(settings: Settings, steps: StepCoefficients, count: int, t0: float)
 
 def at_all_stages(system: System, settings: Settings, values: Any) -> np.ndarray:
     """Return controls (solves, c, ...) of all stages from (T, c, ...) or (T, stages * c, ...)."""
-    values, size = np.asarray(values, float), system.control_size
+    values, size = np.asarray(values, float), system.control_layout.size
     if values.shape[1] > size:
         return values.reshape(-1, size, *values.shape[2:])
     return np.repeat(values, settings.stages, axis=0)

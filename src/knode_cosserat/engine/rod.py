@@ -83,9 +83,9 @@ class RodCode(Memory):
         self.place_terms = a(e.size(e.place_terms), self.count)
         self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
         self.slope, self.slope_end = a(len(e.pattern), self.used), a(len(e.pattern), self.pieces)
-        self.acting, self.jump = a(len(system.cuts), self.pieces), a(len(e.jumping), self.pieces)
+        self.acting, self.jump = a(e.acting.size, self.pieces), a(len(e.jumping), self.pieces)
         #: y at the places of the ends; with jumps it differs from y at the points
-        self.far = a(ny, self.ends) if system.jump is not None else None
+        self.far = a(ny, self.ends) if system.discontinuities.jump is not None else None
         #: y at the stages between ends
         self.between = a(ny, self.count - self.ends)
         #: points of the nodes, as whole numbers

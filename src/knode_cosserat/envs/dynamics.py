@@ -19,7 +19,9 @@ from knode_cosserat.control import ControlLimits
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.envs.tasks import Randomisation, Survey, Task, TaskError, Tip
 from knode_cosserat.estimation.outputs import BodyPositions
+from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
 from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
 from knode_cosserat.solvers.initial import initial_state
@@ -174,10 +176,10 @@ def specified(
     settings = Settings()
     models = tuple(task.equipped(model) for model in randomisation.models)
     for model in models:
-        if model.control_size != equipped.control_size:
+        if model.control_layout.size != equipped.control_layout.size:
             raise TaskError(
-                f"a model has {model.control_size} controls, the robot {equipped.control_size}; "
-                "allowed are models of this robot"
+                f"a model has {model.control_layout.size} controls, the robot "
+                f"{equipped.control_layout.size}; allowed are models of this robot"
             )
     if len({jax.tree.structure(model) for model in models}) > 1:
         raise TaskError("the models must be of one class, with the same nodes and options")
@@ -191,7 +193,7 @@ def specified(
         float(randomisation.change), (randomisation.delay[0], randomisation.delay[1]), len(models),
     )  # fmt: skip
     rest = None
-    if equipped.ends.rest_is_guess:
+    if Ends.of(equipped).rest_is_guess:
         at_start = initial_state(equipped, settings)
         rest = (at_start.state.history, at_start.record)
     arrays = Arrays(
@@ -275,20 +277,20 @@ def _assembled(spec: Spec, arrays: Arrays, drawn: Any, model: Any, goal: Any) ->
 
 def tip_of(system: System, y: Float[Any, "N y"]) -> Tip:
     """Return the pose of the tip; along z for a robot without orientations."""
-    position = system.drawing.positions(y[-1])
+    position = Drawing.of(system).positions(y[-1])
     if "h" not in system.y_layout.names:
         return Tip(position, jnp.array([0.0, 0.0, 1.0]))
-    tangent = dot(rotation_matrix(system.drawing.quaternions(y[-1])), jnp.array([0.0, 0.0, 1.0]))
+    tangent = dot(rotation_matrix(Drawing.of(system).quaternions(y[-1])), jnp.array([0.0, 0.0, 1.0]))
     return Tip(position, tangent)
 
 
 def clearance_of(system: System, y: Float[Any, "N y"]) -> Float[Any, ""]:
     """Return the least distance (m) of the nodes' surface from obstacles; infinite without obstacles."""
-    obstacles = getattr(system.nominal, "surroundings", ())
-    radius = getattr(system.nominal, "radius", 0.0)
+    obstacles = getattr(nominal_model(system), "surroundings", ())
+    radius = getattr(nominal_model(system), "radius", 0.0)
     if not obstacles:
         return jnp.array(jnp.inf)
-    points = system.drawing.positions(y)
+    points = Drawing.of(system).positions(y)
     distances = [jax.vmap(lambda p, wall=wall: wall.distance(p)[0])(points) for wall in obstacles]
     return jnp.min(jnp.stack(distances)) - radius
 
@@ -303,7 +305,7 @@ def observed(spec: Spec, arrays: Arrays, state: Any) -> Float[Any, " o"]:
 
     Lengths are in lengths of the nominal robot from its tip at rest, and controls from -1 to 1.
     """
-    length, origin = arrays.robot.nominal.length, arrays.survey.origin
+    length, origin = nominal_model(arrays.robot).length, arrays.survey.origin
     bodies = state.measured.reshape(MEASURED, -1, 3)
     measured = (bodies - origin) / length
     control = scaled(arrays, state.commands[0])
@@ -388,7 +390,7 @@ def _arrived_one(
     tip = tip_of(system, y)
     tip = Tip(jnp.where(solved, tip.position, state.measured[0, -3:]), tip.tangent)
     clearance = jnp.where(solved, clearance_of(system, y), jnp.inf)
-    t, length = count * spec.dt, arrays.robot.nominal.length
+    t, length = count * spec.dt, nominal_model(arrays.robot).length
     reward, terminated, error = spec.task.outcome(state.goal, t, tip, clearance, length)
     usable = solved & ~coarse & move.valid
     terminated = terminated & usable

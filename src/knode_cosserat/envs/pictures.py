@@ -16,6 +16,8 @@ from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.policy import Policy
 from knode_cosserat.evaluation.animation import write_frames
 from knode_cosserat.evaluation.figures import require_matplotlib
+from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.wrapped import nominal_model
 
 #: size (inches) and resolution of a picture
 SIZE, DPI = (7.0, 3.5), 80
@@ -29,14 +31,14 @@ def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, 
     from matplotlib.patches import Circle
 
     system = environment.system(state)
-    points = np.asarray(system.drawing.positions(state.history.y[0]))
+    points = np.asarray(Drawing.of(system).positions(state.history.y[0]))
     goal, t = state.goal, float(state.count) * environment.dt
     target = np.asarray(environment.task.target(goal, t))[:3]
-    span = 1.1 * float(np.max(environment.robot.nominal.length))
+    span = 1.1 * float(np.max(nominal_model(environment.robot).length))
     figure = Figure(figsize=SIZE, dpi=DPI, layout="constrained")
     for axes, (a, b) in zip(figure.subplots(1, 2), ((0, 2), (0, 1)), strict=True):
         axes.plot(points[:, a], points[:, b], color="C0", lw=2.5)
-        for obstacle in getattr(system.nominal, "surroundings", ()):
+        for obstacle in getattr(nominal_model(system), "surroundings", ()):
             if (centre := getattr(obstacle, "center", None)) is not None:
                 place = float(centre[a]), float(centre[b])
                 axes.add_patch(Circle(place, float(obstacle.radius), color="0.6"))

@@ -18,11 +18,12 @@ from jaxtyping import Float
 
 from knode_cosserat.control import ControlLimits, Reference, table
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.loads import AttachedMass
-from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.paths import value_at
+from knode_cosserat.rods.parameters import ParameterError, value_at
 from knode_cosserat.rods.surroundings import Sphere
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.statics.reach import inverse_kinematics
@@ -112,7 +113,7 @@ class Randomisation:
         low: dict[str, np.ndarray] = {}
         high: dict[str, np.ndarray] = {}
         for name, distribution in self.parameters.items():
-            value = value_at(robot.nominal, name)
+            value = value_at(nominal_model(robot), name)
             if value is None:
                 raise ParameterError(
                     f"{name} is not set for this robot, so it cannot be varied; set it with replace first"
@@ -167,9 +168,9 @@ def surveyed(robot: System, limits: ControlLimits, seed: int) -> Survey:
             f"{'the safe controls' if not valid[-1] else 'any of the random controls'} "
             f"({limits.safe.tolist()}); give other limits"
         )
-    position = np.asarray(robot.drawing.positions(y))
+    position = np.asarray(Drawing.of(robot).positions(y))
     if "h" in robot.y_layout.names:
-        rotation = jax.vmap(rotation_matrix)(jnp.asarray(robot.drawing.quaternions(y)))
+        rotation = jax.vmap(rotation_matrix)(jnp.asarray(Drawing.of(robot).quaternions(y)))
         frame = np.swapaxes(np.asarray(rotation), 1, 2)
     else:
         frame = np.tile(np.eye(3), (len(y), 1, 1))
@@ -183,7 +184,7 @@ def surveyed(robot: System, limits: ControlLimits, seed: int) -> Survey:
 
 def _check_reachable(robot: System, limits: ControlLimits, position: Any) -> None:
     """Check that an equilibrium within limits has its tip at a position (m). Raises `TaskError`."""
-    wanted, length = np.asarray(position, dtype=float), float(np.max(robot.nominal.length))
+    wanted, length = np.asarray(position, dtype=float), float(np.max(nominal_model(robot).length))
     if wanted.shape != (3,) or not np.all(np.isfinite(wanted)):
         raise TaskError(f"the target is {position!r}; allowed are three finite numbers (m)")
     found = inverse_kinematics(robot, wanted, low=limits.low, high=limits.high)
@@ -302,7 +303,7 @@ class Task(abc.ABC):
 
 def _with_parts(robot: System, place: str, parts: Sequence[Any], task: str) -> Any:
     """Return the robot with more parts before its own ones. Raises `TaskError` if it has no such parts."""
-    present = getattr(robot.nominal, place, None)
+    present = getattr(nominal_model(robot), place, None)
     if present is None:
         raise TaskError(f"the task {task} needs a robot with {place}; {type(robot).__name__} has none")
     return robot.replace(**{place: (*parts, *present)})

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import ParameterError, parameters_of
-from knode_cosserat.rods.paths import value_at
+from knode_cosserat.rods.parameters import ParameterError, parameters_of, value_at
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 
 #: relative standard deviation of a positive parameter by default
 RELATIVE = 0.3
@@ -89,7 +89,7 @@ class AdaptedParameters(eqx.Module):
         if self.logarithmic[k] or self.vector[k]:
             return -WIDEST, WIDEST
         owner, _, name = self.names[k].rpartition(".")
-        known = parameters_of(type(_looked_up(robot, owner) if owner else robot.nominal))
+        known = parameters_of(type(_looked_up(robot, owner) if owner else nominal_model(robot)))
         value, deviation = float(self.values[k]), float(self.deviations[k])
         low, high = ((end - value) / deviation for end in (known[name].low, known[name].high))
         return max(-WIDEST, low), min(WIDEST, high)
@@ -171,7 +171,7 @@ def _looked_up(robot: System, name: str) -> Any:
                 f"{', '.join(f'{RESIDUAL}.{known}' for known in parts) or 'none: the model has no residual'}"
             )
         return parts[part]
-    return value_at(robot.nominal, name)
+    return value_at(nominal_model(robot), name)
 
 
 def _part(robot: System, adapted: Adapted) -> tuple[np.ndarray, float, bool]:

@@ -9,6 +9,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
 
@@ -35,13 +36,13 @@ class BoundaryObserver:
             initial: a motion or equilibrium from which it moves on; None: the unstressed robot.
         """
         base: Any = robot
-        if not hasattr(base.nominal, "loads"):
+        if not hasattr(nominal_model(base), "loads"):
             raise ValueError(f"robot is a {type(robot).__name__}; allowed is a rod with loads")
-        self._index = len(base.nominal.loads)
-        loads = (*base.nominal.loads, PointWrench())
+        self._index = len(nominal_model(base).loads)
+        loads = (*nominal_model(base).loads, PointWrench())
         self.robot = robot.replace(loads=loads)
-        length, bending = float(base.nominal.length), float(base.nominal.Kbt[0, 0])
-        mass = float(base.nominal.mass_per_length) * length
+        length, bending = float(nominal_model(base).length), float(nominal_model(base).Kbt[0, 0])
+        mass = float(nominal_model(base).mass_per_length) * length
         self.stiffness = 30.0 * bending / length**3 if stiffness is None else float(stiffness)
         self.damping = np.sqrt(self.stiffness * mass) if damping is None else float(damping)
         # the wrench acts a period late: BDF2 damps the fast modes that it would excite

@@ -22,6 +22,7 @@ from knode_cosserat.estimation.online import (
 )
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.rollback import Rollback
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import used_places
@@ -125,7 +126,9 @@ class KalmanObserver:
         robot, settings = self.robot, self.model.settings
         initial, settled = split_initial(initial)
         if initial is None:
-            at_start = initial_state(robot, settings, held=np.zeros(robot.control_size) if settled else None)
+            at_start = initial_state(
+                robot, settings, held=np.zeros(robot.control_layout.size) if settled else None
+            )
         else:
             check_initial(robot, initial, None)
             at_start = continued_state(robot, initial, settings, self.dt)
@@ -201,9 +204,10 @@ class KalmanObserver:
             ObserverError: the model's equations were not solved; the state is unchanged.
         """
         control = np.asarray(control, dtype=float)
-        if control.shape != (self.robot.control_size,) or not np.all(np.isfinite(control)):
+        if control.shape != (self.robot.control_layout.size,) or not np.all(np.isfinite(control)):
             raise ValueError(
-                f"the control is {control.tolist()}; allowed are {self.robot.control_size} finite numbers"
+                f"the control is {control.tolist()}; allowed are {self.robot.control_layout.size} finite "
+                "numbers"
             )
         self._roll_back()
         nothing = np.full((1, self.output.size), np.nan)
@@ -255,7 +259,7 @@ class KalmanObserver:
         nodes = grid_of(self.robot).nodes
         ny = len(self._scale)
         # the tip's position is linear in y
-        positions = self.robot.drawing.positions
+        positions = Drawing.of(self.robot).positions
         tips = np.array([positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.belief.spread.records)])
         apart = np.asarray(truth.tip_position[-1]) - np.asarray(positions(self.record[-1:, :ny]))[0]
         own = tips.T @ tips
@@ -371,7 +375,7 @@ def _deviations(robot: System, given: Any) -> Float[np.ndarray, " c"]:
             for field in robot.control_layout.fields
         ]
         return np.concatenate(parts)
-    found = np.broadcast_to(np.asarray(given, dtype=float), (robot.control_size,))
+    found = np.broadcast_to(np.asarray(given, dtype=float), (robot.control_layout.size,))
     if not np.all(found >= 0.0):
         raise ValueError(f"control_deviation is {given}; allowed is zero or more for each control")
     return np.array(found)

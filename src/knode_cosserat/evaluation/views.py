@@ -15,6 +15,7 @@ from knode_cosserat.evaluation.drawing import (
     one_of,
     tips_of,
 )
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.trajectory import Trajectory
 
 #: views: in space, or two axes (horizontal, vertical)
@@ -79,7 +80,7 @@ def path_of(one: Tips | ArrayLike) -> NDArray[np.float64]:
 
 def curves_of(trajectory: Trajectory) -> list[NDArray[np.float64]]:
     """Return the lines (T, points, d) of a trajectory's robot."""
-    curves = trajectory.system.drawing.curves(one_of(trajectory).y)
+    curves = Drawing.of(trajectory.system).curves(one_of(trajectory).y)
     return [np.asarray(curve, dtype=float) for curve in curves]
 
 

@@ -18,10 +18,18 @@ from typing import Any, Literal, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, unknown_parameter
-from knode_cosserat.rods.paths import owner_at, parameter_at, value_at
+from knode_cosserat.rods.parameters import (
+    Parameter,
+    ParameterError,
+    owner_at,
+    parameter_at,
+    parameters_of,
+    unknown_parameter,
+    value_at,
+)
 from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 
 #: change of a robot by the values of an effect's parameters; equal for all robots of the same parts
 Change = Callable[[Any, list[Any]], Any]
@@ -182,7 +190,7 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
         ParameterError: a name that does not exist or is given twice, a parameter without a value, or a
             matrix that is not diagonal.
     """
-    owner = robot.nominal
+    owner = nominal_model(robot)
     known = owner.parameters()
     wanted: Any = names
     if isinstance(wanted, str) and wanted == "all":

@@ -18,6 +18,7 @@ from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.steps import steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import since_first
 from knode_cosserat.solvers.boundary import NewtonOptions
@@ -195,9 +196,10 @@ def of_measurements(
     robot = model.nominal
     if len(measured.time) < 3:
         raise DataError(f"{name}: {len(measured.time)} rows; at least 3 are needed")
-    if measured.tension.shape[1] != robot.control_size:
+    if measured.tension.shape[1] != robot.control_layout.size:
         raise DataError(
-            f"{name}: {measured.tension.shape[1]} tensions in a row; the robot has {robot.control_size}"
+            f"{name}: {measured.tension.shape[1]} tensions in a row; the robot has "
+            f"{robot.control_layout.size}"
         )
     if measured.static:
         measured = _as_steps(measured)
@@ -232,7 +234,7 @@ def _poses(measured: Measurements, robot: System) -> tuple[Output, np.ndarray]:
     """Return positions, and rotations since row 0 if the robot has orientations, as numbers in rows."""
     fractions, rows = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist()), len(measured.position)
     try:
-        robot.drawing.quaternions(np.asarray(robot.rest(0.0)[0]))
+        Drawing.of(robot).quaternions(np.asarray(robot.rest(0.0)[0]))
     except AttributeError:
         return BodyPositions(fractions, 1.0), np.array(measured.position.reshape(rows, -1))
     turned = np.asarray(since_first(measured.quaternion))
@@ -274,8 +276,10 @@ def of_trajectory(trajectory: Trajectory, robot: System, name: str) -> Experimen
             f"{name} has {y.shape[1]} nodes of {y.shape[2]} numbers; "
             f"the robot has {robot.nodes} of {robot.y_layout.size}"
         )
-    if control.shape[1] != robot.control_size:
-        raise DataError(f"{name} has {control.shape[1]} controls a row; the robot has {robot.control_size}")
+    if control.shape[1] != robot.control_layout.size:
+        raise DataError(
+            f"{name} has {control.shape[1]} controls a row; the robot has {robot.control_layout.size}"
+        )
     if not np.all(np.isfinite(control)) or not np.any(np.isfinite(y[1:])):
         raise DataError(f"{name} has controls that are not finite, or no states")
     steps = np.diff(np.asarray(trajectory.time, dtype=float))
@@ -309,7 +313,7 @@ def is_unstressed(
     The robot is unstressed if the distance to that
     shape is below `ratio` times the distance to the equilibrium.
     """
-    if robot.ends.rest_is_guess:
+    if Ends.of(robot).rest_is_guess:
         return False
     try:
         settled = np.asarray(initial_state(robot, settings, held=control).record)
@@ -318,7 +322,7 @@ def is_unstressed(
     size = robot.y_layout.size
     shapes: Any = jnp.stack([rest_record(robot)[:, :size], settled[:, :size]])
     if seen.places is None:
-        shapes, target = (np.asarray(robot.drawing.positions(y)) for y in (shapes, seen.position))
+        shapes, target = (np.asarray(Drawing.of(robot).positions(y)) for y in (shapes, seen.position))
     else:
         shapes, target = np.asarray(jax.jit(positions_at)(robot, shapes, seen.places)), seen.position
     apart = np.nansum((shapes - target) ** 2, axis=(1, 2))

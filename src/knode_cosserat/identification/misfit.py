@@ -21,7 +21,9 @@ from knode_cosserat.estimation.online import errors_along, errors_of
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.model import Model, ParametrisedRobot
 from knode_cosserat.identification.steps import stepped
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.load_cells import LoadCells
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.history import (
     StateHistory,
     at_stages,
@@ -151,9 +153,11 @@ class Misfit:
     def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
         """Return the start of an experiment; None if there is no equilibrium."""
         settings, size = data.settings, system.y_layout.size + system.z_layout.size
-        if data.held is None and not (data.initial is None and system.ends.rest_is_guess):
+        if data.held is None and not (data.initial is None and Ends.of(system).rest_is_guess):
             return self._moving_start(system, x, data)
-        control = np.zeros(system.control_size) if data.held is None else np.asarray(data.held, dtype=float)
+        control = (
+            np.zeros(system.control_layout.size) if data.held is None else np.asarray(data.held, dtype=float)
+        )
         still = dataclasses.replace(settings, time=None)
         found, y, cause = static_run(Equilibria(still, 1, RECOVERY), system, control[None])
         if cause:
@@ -189,7 +193,7 @@ class Misfit:
 
 def _cells(system: Any) -> LoadCells | None:
     """Return the load cells of a robot, also of one with a residual."""
-    return getattr(system.nominal, "load_cells", None)
+    return getattr(nominal_model(system), "load_cells", None)
 
 
 def _acting(system: Any, data: Experiment) -> tuple[np.ndarray, np.ndarray | None]:

@@ -15,7 +15,9 @@ from knode_cosserat.learning.structured.residual import (
     loaded,
     material_layout,
 )
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
 
 
@@ -47,7 +49,7 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     """
     if not isinstance(model, KNODE):
         raise TypeError(f"model is a {type(model).__name__}; allowed is a KNODE, which `fit` gives")
-    residual, knowledge = model.residual, model.knowledge.strand
+    residual, knowledge = model.residual, strand_of(model.knowledge)
     if not isinstance(residual, Structured):
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")
     found = []
@@ -61,7 +63,7 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     whole = model.knowledge
     parts: list[tuple[str, System, Layout, Any]] = [
         ("load", knowledge, loaded(knowledge), residual.load),
-        ("tip", whole, whole.ends.layout, residual.tip_load),
+        ("tip", whole, Ends.of(whole).layout, residual.tip_load),
     ]
     for part, system, targets, load in parts:
         if load is not None:

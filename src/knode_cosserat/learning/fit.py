@@ -32,8 +32,10 @@ from knode_cosserat.learning.training.rollouts import (
     trajectory_batches,
 )
 from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, Run, run_all
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.segments import Dataset, samples, strand_samples
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
@@ -118,7 +120,7 @@ def fit(
                     histories[seed][run.stage] = run.report(seed)
     facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
     if verify is None:
-        verify = not type(knowledge.nominal).__module__.startswith("knode_cosserat.")
+        verify = not type(nominal_model(knowledge)).__module__.startswith("knode_cosserat.")
     models = []
     for seed, residual in learned.items():
         own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
@@ -192,7 +194,7 @@ def _initial(
     knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig, dataset: Any
 ) -> list[Residual]:
     """Return the residual of each seed before gradient training."""
-    options, strand = config.residual, knowledge.strand
+    options, strand = config.residual, strand_of(knowledge)
     if isinstance(options, NetworkOptions):
         # of a row in the midst of a motion
         c0 = dataset.tips.c0[-1] if options.history else None

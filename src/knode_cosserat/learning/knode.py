@@ -110,9 +110,9 @@ class KNODE(Wrapped):
     @property
     def corrections(self) -> tuple[Any, ...]:
         """Corrections of [y_s; z]: the nominal model's, then the residual's (paper eq. 7, KNODE model)."""
-        knowledge, correction = self.adapted, self.residual.correction
-        own = () if correction is None else (functools.partial(correction, knowledge),)
-        return (*knowledge.corrections, *own)
+        correction = self.residual.correction
+        own = () if correction is None else (functools.partial(correction, self.adapted),)
+        return (*super().corrections, *own)
 
     def coefficients(self) -> dict[str, Any]:
         """Return the numbers in which the residual is linear; `replace` knows them as "residual.NAME"."""
@@ -338,7 +338,7 @@ def _require_fit(model: KNODE) -> None:
 
     try:
         length = np.asarray(model.length)
-        results = jax.eval_shape(equations, model, np.zeros(ny), np.zeros(model.control_size), history)
+        results = jax.eval_shape(equations, model, np.zeros(ny), np.zeros(model.control_layout.size), history)
         shapes = [part.shape for part in results]
     except Exception as error:  # a residual may raise any error if arrays do not fit
         reason = re.sub(r"<function \S+ at 0x[0-9a-f]+>", "the equations", first_line(error))

@@ -39,8 +39,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.law import InternalState, MaterialLaw, StressedLaw
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
 
 #: moment of one tendon at its typical tension, for learned numbers of 1, in units of κ/L
@@ -93,7 +95,7 @@ class Passive(Residual):
         Raises:
             TypeError: the nominal law is no `MaterialLaw`.
         """
-        rest = knowledge.z_layout.get(knowledge.observed.unstressed(s, control), "u")
+        rest = knowledge.z_layout.get(Observed.of(knowledge).unstressed(s, control), "u")
         stiffness, damping, moment = self.terms(knowledge, s, y, control)
 
         def changed(law: Any) -> Any:
@@ -103,8 +105,8 @@ class Passive(Residual):
                 return InternalState(law.evolutions, lambda internal: changed(law.law(internal)))
             if not isinstance(law, MaterialLaw):
                 raise TypeError(
-                    f"{type(knowledge.nominal).__name__} states its law as a {type(law).__name__}; a passive "
-                    "residual is a term of a MaterialLaw"
+                    f"{type(nominal_model(knowledge)).__name__} states its law as a {type(law).__name__}; a "
+                    "passive residual is a term of a MaterialLaw"
                 )
             u = law.strains["u"]
             stress = u.stress + dot(stiffness, rest) - moment
@@ -123,12 +125,12 @@ class Passive(Residual):
         self, knowledge: System, s: Any, y: Float[Any, " y"], control: Any
     ) -> tuple[Float[Any, "3 3"], Float[Any, "3 3"], Float[Any, "3"]]:
         """Return the stiffness κ S (N m²), the damping D (N m² s) and the moment κ b/L (N m) at a point."""
-        L, kappa = knowledge.length, _least(knowledge.nominal.Kbt)  # type: ignore[attr-defined]
+        L, kappa = knowledge.length, _least(nominal_model(knowledge).Kbt)  # type: ignore[attr-defined]
         sigma, x = 2.0 * s / L - 1.0, jnp.asarray(control) / self.sizes.control
         S, b = self.spring(sigma, x)
         stiffness = kappa * jnp.zeros((3, 3)).at[:2, :2].set(S)
         damping = self.damped(self._seen(knowledge, y), sigma, x) * np.diag([1.0, 1.0, 0.0])
-        factors = knowledge.observed.law_factors(s, control)
+        factors = Observed.of(knowledge).law_factors(s, control)
         if factors is not None:
             # the section's, as for the rod itself
             first, second = (knowledge.z_layout.get(factor, "u") for factor in factors)
@@ -245,14 +247,15 @@ def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0
 def require_bending(knowledge: System) -> None:
     """Raise `TypeError` unless a nominal model has the parameters and states that the residual needs."""
     needed = ("bending_stiffness", "bending_damping", "h", "n", "m", "q", "w", "u")
-    has = (*knowledge.nominal.parameters(), *knowledge.y_layout.names, *knowledge.z_layout.names)
+    has = (*nominal_model(knowledge).parameters(), *knowledge.y_layout.names, *knowledge.z_layout.names)
     missing = [name for name in needed if name not in has]
-    if not missing and not hasattr(knowledge.nominal, "Kbt"):
+    if not missing and not hasattr(nominal_model(knowledge), "Kbt"):
         missing = ["Kbt"]
     if missing:
         raise TypeError(
-            f"knowledge is a {type(knowledge.nominal).__name__} without {', '.join(missing)}; a passive "
-            "residual is for a rod with bending stiffness, such as a TendonRobot or a RoutedTendonRobot"
+            f"knowledge is a {type(nominal_model(knowledge)).__name__} without {', '.join(missing)}; a "
+            "passive residual is for a rod with bending stiffness, such as a TendonRobot or a "
+            "RoutedTendonRobot"
         )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from knode_cosserat._reprs import count_of
 from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import System
@@ -142,7 +143,7 @@ class Network(Residual):
         self, knowledge: System, y: Any, y_t: Any, z: Any, z_t: Any, control: Any
     ) -> Float[Any, " inputs"]:
         """Return the inputs: y, z and the actuation; with `c0`, y, ʰy, z, ʰz and the actuation."""
-        force = knowledge.observed.actuation(control)
+        force = Observed.of(knowledge).actuation(control)
         if self.c0 is None:
             return jnp.concatenate([y, z, force])
         return jnp.concatenate([y, y_t - self.c0 * y, z, z_t - self.c0 * z, force])
@@ -212,5 +213,5 @@ def input_layout(knowledge: System, history: bool) -> Layout:
             fields += [
                 Field(f"{f.name} past", f.size, f"{f.unit}/s", f"ʰ of {f.name}") for f in layout.fields
             ]
-    size = jax.eval_shape(knowledge.observed.actuation, np.zeros(knowledge.control_size)).shape[0]
+    size = jax.eval_shape(Observed.of(knowledge).actuation, np.zeros(knowledge.control_layout.size)).shape[0]
     return Layout(*fields, Field("actuation", size, "", "part of the control that enters the equations"))

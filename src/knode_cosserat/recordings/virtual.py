@@ -111,8 +111,10 @@ def record_virtual(
         raise RecordingError(f"seconds is {seconds:g}; allowed is 1.5 to {LONGEST:g} s")
     if not 0 <= seed < 2**32:
         raise RecordingError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
-    if robot is not None and robot.control_size != 4:
-        raise RecordingError(f"the robot has {robot.control_size} controls; allowed is one with four tendons")
+    if robot is not None and robot.control_layout.size != 4:
+        raise RecordingError(
+            f"the robot has {robot.control_layout.size} controls; allowed is one with four tendons"
+        )
     sent = commands(signal, seconds)
     truth = driven(sent, sensors.lag, virtual_robot() if robot is None else robot)
     poses, tension = simulated_sensors(truth, sent, seed, sensors)

@@ -1,26 +1,48 @@
 """Aspects of a system that most systems need not state: its ends, its drawing, its observables.
 
-`System.ends`, `System.drawing` and `System.observed` return them. A system that differs from the defaults
-returns a subclass.
+`Ends.of(system)` returns the ends of a system, and so for each aspect. A system that differs from the
+defaults has a subclass, which names the system's class: `class MyEnds(Ends, of=MySystem)`.
 """
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from collections.abc import Callable
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rotation import dot, rotation_matrix
 
 
 class Aspect:
     """Aspect of a system."""
 
+    #: makers of the aspect by the class of the systems
+    _makers: ClassVar[dict[type, Callable[[Any], Any]]]
+
     def __init__(self, system: Any):
         self.system = system
+
+    def __init_subclass__(cls, of: type | None = None):
+        if Aspect in cls.__bases__:
+            cls._makers = {}
+        elif of is not None:
+            cls.register(of, cls)
+
+    @classmethod
+    def register(cls, owner: type, maker: Callable[[Any], Any]) -> None:
+        """Let a function make this aspect of all systems of a class."""
+        cls._makers[owner] = maker
+
+    @classmethod
+    def of(cls, system: Any) -> Self:
+        """Return this aspect of a system."""
+        makers = (cls._makers.get(owner) for owner in type(system).__mro__)
+        return next(filter(None, makers), cls)(system)
 
 
 class Ends(Aspect):
@@ -93,12 +115,12 @@ class Observed(Aspect):
             *((f"{name}_t", size, f"{unit}/s", f"rate of {name}") for name, size, unit, *_ in strain),
         )
 
-    def observables(
-        self, s: Any, y: Float[Any, " y"], y_t: Any, z: Float[Any, " z"], z_t: Any, control: Any
-    ) -> Float[Any, " o"]:
+    def observables(self, point: RodPoint) -> Float[Any, " o"]:
         """Return the possible arguments of an unmodelled load, beside the control, in the material frame."""
-        bent = z - self.unstressed(s, control)
-        return jnp.concatenate([self._in_material_frame(y, y), self._in_material_frame(y, y_t), bent, z_t])
+        _, s, _, y, y_t, control, *_ = point
+        bent = point.z - self.unstressed(s, control)
+        state = [self._in_material_frame(y, vectors) for vectors in (y, y_t)]
+        return jnp.concatenate([*state, bent, point.z_t])
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return the part of the control that enters the equations; the whole control by default."""

@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.wrapped import nominal_model
 
 
 class LoadCells(Part):
@@ -61,5 +62,5 @@ def undelayed(
 
     They are equal unless the robot's load cells have a delay. `before` acted before the first row.
     """
-    cells = getattr(system.nominal, "load_cells", None)
+    cells = getattr(nominal_model(system), "load_cells", None)
     return measured if cells is None else cells.undelayed(measured, dt, before)

@@ -19,6 +19,7 @@ from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
+from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.strands import Bundle, in_strands
 from knode_cosserat.rods.system import Scales, System, is_traced
@@ -147,23 +148,6 @@ class ParallelRobot(Bundle):
         """Positions of the legs' ends relative to the platform's centre, in its frame (m)."""
         return _on_circle(self.platform_radius, self.platform_angles)
 
-    # aspects
-
-    @property
-    def ends(self) -> PlatformEnds:
-        """Facts of actuators and platform."""
-        return PlatformEnds(self)
-
-    @property
-    def drawing(self) -> PlatformDrawing:
-        """Axis and legs."""
-        return PlatformDrawing(self)
-
-    @property
-    def observed(self) -> PlatformObserved:
-        """Motion of the platform; the legs' observables belong to the strand."""
-        return PlatformObserved(self)
-
     # the state of each leg
 
     def legs(self, y: Float[Any, "*n y"]) -> list[Any]:
@@ -180,11 +164,11 @@ class ParallelRobot(Bundle):
 
     def platform_position(self, y: Any) -> Any:
         """Return the platform's centre (…, 3) in m, from the robot's states y (…, nodes, y)."""
-        return self.drawing.positions(y[..., -1, :])
+        return Drawing.of(self).positions(y[..., -1, :])
 
     def platform_orientation(self, y: Any) -> Any:
         """Return the platform's orientation (…, 4), scalar first, from the robot's states y (…, nodes, y)."""
-        return self.drawing.quaternions(y[..., -1, :])
+        return Drawing.of(self).quaternions(y[..., -1, :])
 
     # the two ends, and rest
 
@@ -262,7 +246,7 @@ class ParallelRobot(Bundle):
         return Scales(jnp.tile(leg.y, self.strands), jnp.concatenate([leg.tip, rest]))
 
 
-class PlatformEnds(Ends):
+class _PlatformEnds(Ends, of=ParallelRobot):
     """Actuators at the base, and the platform at the tip."""
 
     system: ParallelRobot
@@ -292,7 +276,7 @@ class PlatformEnds(Ends):
         return jnp.concatenate([legs[:, :13], q, legs[:, 16:]], axis=1).reshape(-1)
 
 
-class PlatformDrawing(Drawing):
+class _PlatformDrawing(Drawing, of=ParallelRobot):
     """Axis of the robot, and lines of its legs and platform."""
 
     system: ParallelRobot
@@ -328,7 +312,7 @@ class PlatformDrawing(Drawing):
         return total / numeric.sqrt(numeric.sum(total * total, axis=-1, keepdims=True))
 
 
-class PlatformObserved(Observed):
+class _PlatformObserved(Observed, of=ParallelRobot):
     """Motion of the platform, in its frame."""
 
     system: ParallelRobot
@@ -344,10 +328,10 @@ class PlatformObserved(Observed):
             ("w", 3, "rad/s", "angular velocity of the platform"),
         )
 
-    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
+    def observables(self, point: RodPoint) -> Float[Any, " o"]:
         """Return the platform's acceleration, spin, q and w; see `layout`."""
-        q, w = self.system.platform_velocity(y)
-        q_t, w_t = self.system.platform_velocity(y_t)
+        q, w = self.system.platform_velocity(point.y)
+        q_t, w_t = self.system.platform_velocity(point.y_t)
         return jnp.concatenate([q_t + cross(w, q), w_t, q, w])
 
 

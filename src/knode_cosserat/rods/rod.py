@@ -24,7 +24,7 @@ from knode_cosserat.rods.parameters import ParameterError, parameter, slot
 from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
 from knode_cosserat.rods.section import INWARD, SectionChange, shape_at_rest
 from knode_cosserat.rods.surroundings import Obstacle
-from knode_cosserat.rods.system import Scales
+from knode_cosserat.rods.system import Discontinuities, Scales
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
 #: first root of cos(x) cosh(x) = -1, the frequency equation of a cantilever
@@ -36,104 +36,6 @@ WEAK_DRAG = 0.05
 NO_CONTROL = np.zeros(0)
 #: default pose of the base
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
-
-
-class RodEnds(Ends):
-    """Ends of a rod, and the conditions of its parts."""
-
-    system: Rod
-
-    @property
-    def held(self) -> bool:
-        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
-        return any(part.held for part in self.system.parts.values())
-
-    @property
-    def rest_is_guess(self) -> bool:
-        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
-        return self.system.tip_end.held
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of the tip's conditions: force and moment, or the constrained pose; then the parts'."""
-        rod = self.system
-        norm = ("norm", 1, "1", "square of the length of the quaternion, less one")
-        fields = [*rod.tip_end.conditions, *((norm,) if "h" in rod.base_unknowns else ())]
-        return Layout(*fields, *(field for part in rod.parts.values() for field in part.tip_fields(rod)))
-
-    def poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
-        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
-        rod = self.system
-        ends = (rod.base_end, AT_ORIGIN), (rod.tip_end, rod.pose(rod.rest(rod.length)[0]))
-        base, tip = (
-            end.pose(rest, own) if isinstance(end, Clamped) else None
-            for (end, rest), own in zip(ends, rod.end_controls(control), strict=True)
-        )
-        return base, tip
-
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
-        rod = self.system
-        if type(rod.base_end) is Clamped:
-            return y
-        q, w = velocities(rod.pose(y), rod.pose(y_t))
-        return jnp.concatenate([y[:13], q, w, y[19:]])
-
-
-class RodObserved(Observed):
-    """Motion and bending of a rod, in the material frame, and the controls of its parts."""
-
-    system: Rod
-    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
-
-    @property
-    def layout(self) -> Layout:
-        """Layout of `observables`."""
-        return Layout(
-            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
-            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
-            ("q", 3, "m/s", "velocity"),
-            ("w", 3, "rad/s", "angular velocity"),
-            ("u", 3, "1/m", "curvature"),
-            ("u_t", 3, "1/(m s)", "rate of the curvature"),
-        )
-
-    def observables(self, s: Any, y: Any, y_t: Any, z: Any, z_t: Any, control: Any) -> Float[Any, " o"]:
-        """Return acceleration, spin, q, w, curvature and its rate; see `layout`."""
-        layout, strains = self.system.y_layout, self.system.z_layout
-        (q, w), (q_t, w_t) = ([layout.get(given, name) for name in ("q", "w")] for given in (y, y_t))
-        J = np.diag([1.0, 1.0, 2.0])
-        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
-        bent = strains.get(z, "u") - self.system.material(s, control).u_star
-        return jnp.concatenate([acceleration, spin, q, w, bent, strains.get(z_t, "u")])
-
-    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the controls of the parts in the form in which they enter the equations."""
-        rod = self.system
-        return jnp.concatenate([part.actuation(rod, own) for part, own in rod.inputs(control)])
-
-    @property
-    def has_actuation(self) -> bool:
-        """True if a part has another form of its control."""
-        plain = Contribution.actuation
-        return any(type(part).actuation is not plain for part in self.system.parts.values())
-
-    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
-        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
-        rod = self.system
-        u_star = rod.material(s, control).u_star if rod.sections else rod.u_star
-        return rod.with_internal(jnp.concatenate([rod.v_star, u_star]))
-
-    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return the sections' factors on stiffness and damping; None without sections."""
-        rod = self.system
-        if not rod.sections:
-            return None
-        found = rod.differences(s, control)
-        area = found.radius * found.radius
-        others = jnp.ones(rod.z_layout.size - 6)
-        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
 
 
 class Rod(ElasticRod):
@@ -254,18 +156,6 @@ class Rod(ElasticRod):
         EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
         return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
-    # aspects
-
-    @property
-    def ends(self) -> RodEnds:
-        """Facts of the two ends."""
-        return RodEnds(self)
-
-    @property
-    def observed(self) -> RodObserved:
-        """Motion and bending, in the material frame."""
-        return RodObserved(self)
-
     # the equations
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
@@ -314,20 +204,21 @@ class Rod(ElasticRod):
     # discontinuities: places where something begins, ends or pulls
 
     @functools.cached_property
-    def cuts(self) -> tuple[float, ...]:  # type: ignore[override]
+    def _places(self) -> tuple[float, ...]:
         """Places before the tip where parts begin or end, or loads act."""
         return tuple(sorted({cut for part in self.parts.values() for cut in part.cuts if cut < 1.0}))
 
     @property
-    def jump(self) -> Any:
-        """Jump of n and m by the point loads before the tip; None without any."""
-        return self._jump if any(part.applied_at in self.cuts for part in self.parts.values()) else None
+    def discontinuities(self) -> Discontinuities:  # type: ignore[override]
+        """Places before the tip where parts begin or end, or loads act; n and m jump by point loads."""
+        jumps = any(part.applied_at in self._places for part in self.parts.values())
+        return Discontinuities(self._places, self._jump if jumps else None)
 
     def _jump(
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
-        wrench = self._point_wrench(dict(zip(self.cuts, acting, strict=True)), y, y_t, control)
+        wrench = self._point_wrench(dict(zip(self._places, acting, strict=True)), y, y_t, control)
         change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
         return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
 
@@ -418,7 +309,106 @@ class Rod(ElasticRod):
         def of(layout: Layout) -> Any:
             return jnp.concatenate([jnp.full(f.size, sizes.get(f.name, 1.0)) for f in layout.fields])
 
-        return Scales(of(self.y_layout), of(self.ends.layout))
+        return Scales(of(self.y_layout), of(Ends.of(self).layout))
+
+
+class _RodEnds(Ends, of=Rod):
+    """Ends of a rod, and the conditions of its parts."""
+
+    system: Rod
+
+    @property
+    def held(self) -> bool:
+        """True if an end is constrained, or there is an obstacle on which the rod may lie."""
+        return any(part.held for part in self.system.parts.values())
+
+    @property
+    def rest_is_guess(self) -> bool:
+        """True if the tip is constrained: the unloaded rod need not meet that constraint."""
+        return self.system.tip_end.held
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of the tip's conditions: force and moment, or the constrained pose; then the parts'."""
+        rod = self.system
+        norm = ("norm", 1, "1", "square of the length of the quaternion, less one")
+        fields = [*rod.tip_end.conditions, *((norm,) if "h" in rod.base_unknowns else ())]
+        return Layout(*fields, *(field for part in rod.parts.values() for field in part.tip_fields(rod)))
+
+    def poses(self, control: Any) -> tuple[Pose | None, Pose | None]:
+        """Return the clamped poses of the two ends under a control; None for an end that is not clamped."""
+        rod = self.system
+        ends = (rod.base_end, AT_ORIGIN), (rod.tip_end, rod.pose(rod.rest(rod.length)[0]))
+        base, tip = (
+            end.pose(rest, own) if isinstance(end, Clamped) else None
+            for (end, rest), own in zip(ends, rod.end_controls(control), strict=True)
+        )
+        return base, tip
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
+        rod = self.system
+        if type(rod.base_end) is Clamped:
+            return y
+        q, w = velocities(rod.pose(y), rod.pose(y_t))
+        return jnp.concatenate([y[:13], q, w, y[19:]])
+
+
+class _RodObserved(Observed, of=Rod):
+    """Motion and bending of a rod, in the material frame, and the controls of its parts."""
+
+    system: Rod
+    velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of `observables`."""
+        return Layout(
+            ("acceleration", 3, "m/s2", "acceleration of the centreline"),
+            ("spin", 3, "1/s2", "rate of the angular momentum over ρI"),
+            ("q", 3, "m/s", "velocity"),
+            ("w", 3, "rad/s", "angular velocity"),
+            ("u", 3, "1/m", "curvature"),
+            ("u_t", 3, "1/(m s)", "rate of the curvature"),
+        )
+
+    def observables(self, point: RodPoint) -> Float[Any, " o"]:
+        """Return acceleration, spin, q, w, curvature and its rate; see `layout`."""
+        _, s, _, y, y_t, control, *_ = point
+        layout, strains = self.system.y_layout, self.system.z_layout
+        (q, w), (q_t, w_t) = ([layout.get(given, name) for name in ("q", "w")] for given in (y, y_t))
+        J = np.diag([1.0, 1.0, 2.0])
+        acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
+        bent = strains.get(point.z, "u") - self.system.material(s, control).u_star
+        return jnp.concatenate([acceleration, spin, q, w, bent, strains.get(point.z_t, "u")])
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the controls of the parts in the form in which they enter the equations."""
+        rod = self.system
+        return jnp.concatenate([part.actuation(rod, own) for part, own in rod.inputs(control)])
+
+    @property
+    def has_actuation(self) -> bool:
+        """True if a part has another form of its control."""
+        plain = Contribution.actuation
+        return any(type(part).actuation is not plain for part in self.system.parts.values())
+
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
+        rod = self.system
+        u_star = rod.material(s, control).u_star if rod.sections else rod.u_star
+        return rod.with_internal(jnp.concatenate([rod.v_star, u_star]))
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Return the sections' factors on stiffness and damping; None without sections."""
+        rod = self.system
+        if not rod.sections:
+            return None
+        found = rod.differences(s, control)
+        area = found.radius * found.radius
+        others = jnp.ones(rod.z_layout.size - 6)
+        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
+        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
 
 
 def _joined(layout: Layout, fields: Iterable[tuple[Any, ...]]) -> Layout:

@@ -1,4 +1,4 @@
-"""Systems of several identical rods that are joined at their ends only."""
+"""Systems of several identical rods that are joined at their ends only, such as the legs of a platform."""
 
 from __future__ import annotations
 
@@ -6,13 +6,26 @@ import abc
 import functools
 from typing import Any, ClassVar
 
-from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
+
+
+@functools.singledispatch
+def strand_count(system: Any) -> int:
+    """Return the number of identical rods of a system, joined at their ends only; 1 but for a `Bundle`."""
+    return 1
+
+
+@functools.singledispatch
+def strand_of(system: Any) -> Any:
+    """Return the system of one strand, for its equations along the rod; it receives the whole control."""
+    return system
 
 
 def in_strands(system: System, packed: Any) -> Any:
     """Return a packed y, z or vector of unknowns (…, n) split by strand: (…, strands, n / strands)."""
-    return packed.reshape(*packed.shape[:-1], system.strands, packed.shape[-1] // system.strands)
+    count = strand_count(system)
+    return packed.reshape(*packed.shape[:-1], count, packed.shape[-1] // count)
 
 
 class Bundle(System):
@@ -24,6 +37,11 @@ class Bundle(System):
 
     #: the strand's class: a batch of robots has only this, no `strand`
     strand_class: ClassVar[type[System]]
+
+    @property
+    @abc.abstractmethod
+    def strands(self) -> int:
+        """Number of rods."""
 
     @property
     @abc.abstractmethod
@@ -52,12 +70,26 @@ class Bundle(System):
         return self.strand_class.mixed
 
 
+@strand_count.register
+def _(system: Bundle) -> int:
+    return system.strands
+
+
+@strand_of.register
+def _(system: Bundle) -> System:
+    return system.strand
+
+
 @functools.lru_cache(maxsize=64)
 def numbered(layout: Layout, count: int) -> Layout:
     """Return the fields of `count` strands with this layout."""
-
-    def field(given: Field, k: int) -> Field:
-        frame = f"{given.frame}{k}" if given.frame else ""
-        return given._replace(name=f"{given.name}{k}", meaning=f"{given.meaning}, {k}", frame=frame)
-
-    return Layout(*(field(given, k + 1) for k in range(count) for given in layout.fields))
+    return Layout(
+        *(
+            field._replace(
+                name=f"{field.name}{k}", meaning=f"{field.meaning}, {k}",
+                frame=field.frame and f"{field.frame}{k}",
+            )
+            for k in range(1, count + 1)
+            for field in layout.fields
+        )
+    )  # fmt: skip

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -19,7 +18,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.law import InternalState, MaterialLaw, StressedLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import (
@@ -28,8 +26,8 @@ from knode_cosserat.rods.parameters import (
     check_fields,
     parameters_of,
     unknown_parameter,
+    with_value,
 )
-from knode_cosserat.rods.paths import with_value
 
 #: smallest and largest number of nodes of a rod
 FEWEST_NODES, MOST_NODES = 2, 10_000
@@ -42,13 +40,23 @@ class Scales(NamedTuple):
     tip: Float[Any, " k"]
 
 
+class Discontinuities(NamedTuple):
+    """Places where the right-hand side or y is discontinuous."""
+
+    #: fractions of the length, between 0 and 1, in order
+    places: tuple[float, ...] = ()
+    #: function (acting, t, y, y_t, control) that returns y on the far side of the acting places (ones; zeros
+    #: elsewhere) from y on the near side; None if y does not jump
+    jump: Any = None
+
+
 class System(Parametrised):
     """A rod robot: A y_s + B y_st = f1, C z + D z_t = f2 (paper eq. 1, general class).
 
     A subclass defines its layouts and `base_unknowns`, its `length`, `constitutive` and `balance`, `rest` and
-    `tip`; most define `base` and `scales` too, and `mixed` where B is zero. All other members have defaults:
-    `cuts` and `jump` for discontinuities, `strand` and `strands` for several rods, `corrections` and
-    `nominal` for learned residuals, and the aspects `ends`, `drawing` and `observed`.
+    `tip`; most define `scales` too, and `mixed` where B is zero. Classes beside it state what differs from
+    the defaults: `aspects` for its ends, drawing and observables, `Bundle` for several rods, and `Wrapped`
+    for learned residuals.
 
     Its numeric parameters are leaves of a JAX pytree: one compiled program serves all their values, batches,
     and derivatives.
@@ -61,29 +69,12 @@ class System(Parametrised):
     base_unknowns: ClassVar[tuple[str, ...]]
     #: True if B is not zero: time schemes then store y_s
     mixed: ClassVar[bool] = True
-
-    #: places of discontinuity of the right-hand side or of y, as fractions of the length between 0 and 1
-    cuts: ClassVar[tuple[float, ...]] = ()
-    #: method (acting, t, y, y_t, control) that returns y on the far side of the acting cuts (ones; zeros
-    #: elsewhere) from y on the near side; None if y does not jump
-    jump: ClassVar[Any] = None
+    discontinuities: ClassVar[Discontinuities] = Discontinuities()
 
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
     #: number of nodes of the rod, both ends included
     nodes: int = eqx.field(static=True, default=10, kw_only=True)
-
-    # strands: rods that touch each other at their ends only, such as the legs of a platform
-
-    @property
-    def strands(self) -> int:
-        """Number of identical rods, joined at their ends only: y and z hold them in turn."""
-        return 1
-
-    @property
-    def strand(self) -> System:
-        """System of one strand, for its equations along the rod only; it receives the whole control."""
-        return self
 
     # the equations
 
@@ -106,14 +97,6 @@ class System(Parametrised):
         """
         raise NotImplementedError(f"{type(self).__name__} gives no `balance`")
 
-    @property
-    def corrections(self) -> tuple[Callable[..., Float[Any, " y+z"]], ...]:
-        """Functions of (s, t, y, y_t, z, z_t, control) whose values add to [y_s; z] in turn; none by default.
-
-        z is that of `constitutive`, then with the corrections before.
-        """
-        return ()
-
     # the two ends, and rest
 
     @abc.abstractmethod
@@ -132,33 +115,6 @@ class System(Parametrised):
     def scales(self) -> Scales:
         """Return the natural sizes of y and of the tip's residuals; ones by default."""
         return Scales(jnp.ones(self.y_layout.size), jnp.ones(unknown_count(self)))
-
-    # aspects
-
-    @property
-    def ends(self) -> Ends:
-        """Facts of the two ends."""
-        return Ends(self)
-
-    @property
-    def drawing(self) -> Drawing:
-        """Positions, orientations and lines of states."""
-        return Drawing(self)
-
-    @property
-    def observed(self) -> Observed:
-        """Possible arguments of a learned law or load."""
-        return Observed(self)
-
-    @property
-    def nominal(self) -> System:
-        """Robot without learned residuals, whose parameters `replace` changes; by default the system."""
-        return self
-
-    @property
-    def control_size(self) -> int:
-        """Size of a control."""
-        return self.control_layout.size
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
@@ -181,8 +137,8 @@ class System(Parametrised):
         return dataclasses.replace(self, **changes)
 
     def __check_init__(self) -> None:
-        given: Any = self.nodes
-        if not isinstance(given, int) or not FEWEST_NODES <= self.nodes <= MOST_NODES:
+        count: Any = self.nodes
+        if not isinstance(count, int) or not FEWEST_NODES <= self.nodes <= MOST_NODES:
             raise ParameterError(
                 f"nodes is {self.nodes!r}; allowed is a whole number from {FEWEST_NODES} to {MOST_NODES}"
             )
@@ -197,11 +153,6 @@ def unknowns_of(system: System, y: Float[Any, "*n y"]) -> Float[Any, "*n k"]:
 def unknown_count(system: System) -> int:
     """Return the number of unknowns at the base."""
     return len(system.y_layout.indices(system.base_unknowns))
-
-
-def with_length_factor(system: System, factor: Any) -> System:
-    """Return the system with the length of its nominal robot multiplied by a factor."""
-    return system.replace(length=system.nominal.length * factor)
 
 
 def is_traced(tree: Any) -> bool:

@@ -3,35 +3,47 @@
 from __future__ import annotations
 
 import abc
-import inspect
+import operator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Self
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.parts import eased
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.strands import strand_count, strand_of
+from knode_cosserat.rods.system import Discontinuities, System
 
-#: members of `Wrapped.knowledge`: layouts, and facts that no parameter of the equations changes
-FACTS = (
-    "y_layout", "z_layout", "control_layout", "base_unknowns", "mixed", "cuts", "strands", "nominal", "ends",
-    "drawing",
-)  # fmt: skip
-#: members of `Wrapped.adapted`: equations and other members that depend on parameters
-EQUATIONS = ("constitutive", "balance", "corrections", "base", "scales", "observed")
+
+def _member(path: str) -> Any:
+    """Return a property: a member of the wrapped system."""
+    return property(operator.attrgetter(path), doc=f"Member `{path}`.")
 
 
 class Wrapped(System):
     """System that delegates its whole interface to another system; a subclass overrides what it changes.
 
-    A subclass has the wrapped system as its field `knowledge`, and defines `around`. `FACTS` are those of
-    `knowledge`. `EQUATIONS` are those of `adapted`, which is `knowledge` unless the subclass changes its
+    A subclass has the wrapped system as its field `knowledge`, and defines `around`. Layouts are those of
+    `knowledge`. Equations are those of `adapted`, which is `knowledge` unless the subclass changes its
     parameters. `adapted` does not exist for a batch.
     """
 
     if TYPE_CHECKING:  # a field of every subclass
         knowledge: System
+
+    y_layout = _member("knowledge.y_layout")
+    z_layout = _member("knowledge.z_layout")
+    control_layout = _member("knowledge.control_layout")
+    base_unknowns = _member("knowledge.base_unknowns")
+    mixed = _member("knowledge.mixed")
+    constitutive = _member("adapted.constitutive")
+    balance = _member("adapted.balance")
+    rest = _member("adapted.rest")
+    base = _member("adapted.base")
+    tip = _member("adapted.tip")
+    scales = _member("adapted.scales")
 
     @abc.abstractmethod
     def around(self, knowledge: System) -> Self:
@@ -43,9 +55,20 @@ class Wrapped(System):
         return self.knowledge
 
     @property
-    def strand(self) -> System:
-        """Strand of the wrapped system, wrapped too."""
-        return self if self.strands == 1 else self.around(self.knowledge.strand)
+    def corrections(self) -> tuple[Callable[..., Float[Any, " y+z"]], ...]:
+        """Functions of (s, t, y, y_t, z, z_t, control) whose values add to [y_s; z] in turn.
+
+        z is that of `constitutive`, then with the corrections before.
+        """
+        return corrections_of(self.adapted)
+
+    @property
+    def discontinuities(self) -> Discontinuities:  # type: ignore[override]
+        """Places of the wrapped system, and its jump with the parameters of the equations."""
+        places, jump = self.knowledge.discontinuities
+        if jump is None:
+            return Discontinuities(places)
+        return Discontinuities(places, lambda *terms: self.adapted.discontinuities.jump(*terms))
 
     @property  # type: ignore[misc]
     def length(self) -> Any:
@@ -54,40 +77,41 @@ class Wrapped(System):
             return jax.vmap(lambda system: system.adapted.length)(self)
         return self.adapted.length
 
-    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-        """Return the state at rest of the wrapped system."""
-        return self.adapted.rest(s)
-
-    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
-        """Return the residuals of the boundary conditions at the tip, from the wrapped system."""
-        return self.adapted.tip(t, control, y, y_t)
-
-    @property
-    def jump(self) -> Any:
-        """Jump of the wrapped system; None if its y does not jump."""
-        return None if self.knowledge.jump is None else self.adapted.jump
-
     def replace(self, **changes: Any) -> Self:
         """Return a copy in which the wrapped system has other parameters (or nodes), by name."""
         return self.around(self.knowledge.replace(**changes))
 
 
-def _delegated(name: str, owner: str) -> Any:
-    """Return a method, or a property, that is that of the wrapped system."""
-    stated = inspect.getattr_static(System, name, None)
-    if not inspect.isfunction(stated):
-        return property(lambda self: getattr(getattr(self, owner), name), doc=inspect.getdoc(stated))
-
-    def method(self: Wrapped, *arguments: Any, **options: Any) -> Any:
-        return getattr(getattr(self, owner), name)(*arguments, **options)
-
-    method.__name__, method.__qualname__, method.__doc__ = name, f"Wrapped.{name}", stated.__doc__
-    return method
+def nominal_model(system: System) -> System:
+    """Return the innermost wrapped system, whose parameters `replace` changes; else the system itself."""
+    while isinstance(system, Wrapped):
+        system = system.knowledge
+    return system
 
 
-for _owner, _names in (("knowledge", FACTS), ("adapted", EQUATIONS)):
-    for _name in _names:
-        setattr(Wrapped, _name, _delegated(_name, _owner))
+def corrections_of(system: System) -> tuple[Callable[..., Float[Any, " y+z"]], ...]:
+    """Return the corrections of a wrapped system; none for others."""
+    return system.corrections if isinstance(system, Wrapped) else ()
+
+
+def with_length_factor(system: System, factor: Any) -> System:
+    """Return the system with the length of its nominal model multiplied by a factor."""
+    return system.replace(length=nominal_model(system).length * factor)
+
+
+Ends.register(Wrapped, lambda system: Ends.of(system.knowledge))
+Drawing.register(Wrapped, lambda system: Drawing.of(system.knowledge))
+Observed.register(Wrapped, lambda system: Observed.of(system.adapted))
+
+
+@strand_count.register
+def _(system: Wrapped) -> int:
+    return strand_count(system.knowledge)
+
+
+@strand_of.register
+def _(system: Wrapped) -> System:
+    return system if strand_count(system) == 1 else system.around(strand_of(system.knowledge))
 
 
 @eased.register

@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.recovery import natural_time
 
@@ -64,7 +65,7 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
     for system in _robots_of_users(robot):
         # the numbers of this robot are known, also inside a `jit` of the caller
         with jax.core.eval_context():
-            strand = system.strand
+            strand = strand_of(system)
             if not getattr(strand, "is_undamped", False):
                 continue
             frequency = float(np.min(strand.bending_frequency))  # type: ignore[attr-defined]

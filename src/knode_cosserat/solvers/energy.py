@@ -21,6 +21,7 @@ from knode_cosserat.rods.ends import Free, Pinned, Sliding
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWrench
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.guess import continuous, materials, rotations
 
 #: fewest elements; an interval between two nodes is divided for them
@@ -41,7 +42,7 @@ SOFT, SOFT_BY_FORCE = 1e4, 200.0
 
 def is_tested(system: System) -> bool:
     """True for a rod, or a model of one, without actuators and contact, with dead loads only."""
-    rod = system.nominal
+    rod = nominal_model(system)
     if not isinstance(rod, Rod) or rod.surroundings or rod.effects:
         return False
     if any(part.actuates for part in rod.parts.values()):
@@ -77,7 +78,7 @@ class RodEnergy:
         """Take material, ends and dead loads of a rod that `is_tested`, in an equilibrium y at the nodes."""
         from scipy.interpolate import CubicSpline
 
-        rod: Any = system.nominal
+        rod: Any = nominal_model(system)
         self.rod, self.length, segments = rod, float(rod.length), len(y) - 1
         self.divisions = -(-ELEMENTS // segments)
         self.count = self.divisions * segments

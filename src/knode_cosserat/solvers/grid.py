@@ -1,9 +1,9 @@
 """Points and places along a rod: nodes, discontinuities between them, and where equations are evaluated.
 
 A scheme in arclength keeps its order only where the right-hand side is smooth. A segment is therefore
-divided into pieces at every discontinuity of the system (`System.cuts`), and y jumps there if the system
-says so. Within the tolerance `ON_NODE` a discontinuity lies on a node. At a node, y
-is the value on the near side and z the value on the far side.
+divided into pieces at every discontinuity of the system (`System.discontinuities`), and y jumps there if the
+system says so. Within the tolerance `ON_NODE` a discontinuity lies on a node. At a node, y is the value on the near
+side and z the value on the far side.
 
 y is unknown at the points: the nodes and the discontinuities between them. The equations are evaluated at the
 places: at the points (on the far side of discontinuities), at the near sides of discontinuities, and at the
@@ -138,7 +138,9 @@ def _grid(cuts: tuple[float, ...], nodes: int, stages: tuple[float, ...]) -> Gri
 
 def grid_of(system: System, space: SpaceScheme = LOBATTO2) -> Grid:
     """Return the grid of a system; its points and pieces do not depend on the scheme."""
-    return _grid(tuple(system.cuts), system.nodes, tuple(stage.place for stage in space.check.stages))
+    return _grid(
+        tuple(system.discontinuities.places), system.nodes, tuple(stage.place for stage in space.check.stages)
+    )
 
 
 def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Float[Any, "places x"]:

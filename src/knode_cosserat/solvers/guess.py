@@ -10,10 +10,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.engine.places import values_along
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.section import ALONG
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import rest_record
 
@@ -61,17 +64,17 @@ def held_ends(system: System, control: Any) -> tuple[HeldEnd | None, HeldEnd | N
 @jax.jit
 def _poses(system: System, control: Any) -> Any:
     """Return the poses of clamped ends and of pinned ends."""
-    rod, pinned = system.nominal, list[Any]((None, None))
+    rod, pinned = nominal_model(system), list[Any]((None, None))
     for k, end in enumerate((rod.base_end, rod.tip_end) if isinstance(rod, Rod) else ()):
         if isinstance(end, Pinned):
             p, h = rod.y_layout.split(rod.rest(k * jnp.asarray(rod.length))[0])[:2]
             pinned[k] = Pose(end.pose(Pose(p, h), control[:0]).p, None)
-    return system.ends.poses(control), tuple(pinned)
+    return Ends.of(system).poses(control), tuple(pinned)
 
 
 def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:
     """Return the indices in a control of the rotations of base and tip about x, y, z; -1 if not driven."""
-    layout, rod, found = system.control_layout, system.nominal, np.full((2, 3), -1)
+    layout, rod, found = system.control_layout, nominal_model(system), np.full((2, 3), -1)
     for end, prefix in enumerate(("base", "tip") if isinstance(rod, Rod) else ()):
         for k, axis in enumerate(AXES[3:]):
             if f"{prefix}_{axis}" in layout.names:
@@ -81,7 +84,7 @@ def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:
 
 def are_clamped(system: System) -> bool:
     """True if the orientation of both ends is prescribed."""
-    rod = system.nominal
+    rod = nominal_model(system)
     return isinstance(rod, Rod) and all(isinstance(end, Clamped) for end in (rod.base_end, rod.tip_end))
 
 
@@ -101,7 +104,7 @@ def state_from_positions(
     """
     positions = np.asarray(positions, dtype=float)
     y_layout, z_layout = system.y_layout, system.z_layout
-    if system.strands > 1 or not {"p", "h"} <= set(y_layout.names) or "u" not in z_layout.names:
+    if strand_count(system) > 1 or not {"p", "h"} <= set(y_layout.names) or "u" not in z_layout.names:
         raise ValueError(
             f"initial holds positions, and a {type(system).__name__} is not one rod with p, h and u; "
             "give a Trajectory"
@@ -274,10 +277,10 @@ def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarra
 
 def _sagging(system: System, chord: Any, base: HeldEnd) -> Any:
     """Return a unit vector normal to the chord: along gravity, else where the rod bends easily, else any."""
-    ways = [getattr(system.nominal, "gravity", np.zeros(3))]
-    if base.h is not None and hasattr(system.nominal, "Kbt"):
+    ways = [getattr(nominal_model(system), "gravity", np.zeros(3))]
+    if base.h is not None and hasattr(nominal_model(system), "Kbt"):
         # bending about an axis moves the rod across it
-        axis = np.linalg.eigh(np.asarray(system.nominal.Kbt)[:2, :2])[1][:, 0]
+        axis = np.linalg.eigh(np.asarray(nominal_model(system).Kbt)[:2, :2])[1][:, 0]
         ways.append(rotations(base.h).apply(np.cross([*axis, 0.0], ALONG)))
     for way in (*ways, *([] if base.tangent is None else [base.tangent]), *np.eye(3)):
         way = np.asarray(way, dtype=float)

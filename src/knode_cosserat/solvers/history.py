@@ -158,7 +158,7 @@ def rest_record(system: System) -> Float[Any, "nodes x"]:
 def resting_history(system: System, settings: Settings) -> StateHistory:
     """Return the history of the robot at rest under zero control, at time 0."""
     if system.mixed:
-        return constant_history(system, settings, rest_record(system), np.zeros(system.control_size))
+        return constant_history(system, settings, rest_record(system), np.zeros(system.control_layout.size))
     _, records = unloaded(system, settings.space)
     y = records[: grid_of(system).tip + 1, : system.y_layout.size]
     return repeated_record_history(system, settings, records, y, 0.0)
@@ -220,4 +220,4 @@ def still_records(
 
 def rows_suffice(system: System, space: SpaceScheme) -> bool:
     """True if rows hold every state that steps need: no stages between nodes, no discontinuities, B zero."""
-    return not (system.mixed or space.formula.stages or system.cuts)
+    return not (system.mixed or space.formula.stages or system.discontinuities.places)

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.engine.pattern import Pattern
+from knode_cosserat.rods.aspects import Ends
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.evaluation import map_robots, unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
@@ -56,8 +58,8 @@ def initial_state(
     """
     many, made = np.ndim(system.length) > 0, history_settings(settings)
     result: Any = int(Result.CONVERGED)
-    control = np.zeros(system.control_size) if held is None else np.asarray(held, dtype=float)
-    if held is not None or system.ends.rest_is_guess:
+    control = np.zeros(system.control_layout.size) if held is None else np.asarray(held, dtype=float)
+    if held is not None or Ends.of(system).rest_is_guess:
         record, result = _settled(system, settings, recovery_budget, control)
 
         def at_record(system: System, record: Any) -> StateHistory:
@@ -74,7 +76,7 @@ def initial_state(
     if batch and not many:
         numeric: Any = jnp if is_traced(found) else np
         found = jax.tree.map(lambda x: numeric.broadcast_to(x, (batch, *np.shape(x))), found)
-    shape = (batch, system.control_size) if batch else (system.control_size,)
+    shape = (batch, system.control_layout.size) if batch else (system.control_layout.size,)
     return InitialState(found[0], np.broadcast_to(control, shape).copy(), *found[1:])
 
 
@@ -179,6 +181,6 @@ def _alike(one: System, other: System) -> bool:
     """True if two systems have the same places and records."""
 
     def grid(system: System) -> Any:
-        return system.cuts, system.nodes, system.strands, system.mixed
+        return system.discontinuities.places, system.nodes, strand_count(system), system.mixed
 
     return bool(grid(one) == grid(other))

@@ -8,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import dot, rotation_matrix
 
@@ -36,7 +38,7 @@ def positions_at(
     shear. A system without orientations, or with several rods, has no tangents: there interpolation is
     linear.
     """
-    low, high = (robot.drawing.positions(y[..., places.node + k, :]) for k in (0, 1))
+    low, high = (Drawing.of(robot).positions(y[..., places.node + k, :]) for k in (0, 1))
     part = places.part[:, None]
     line = (1.0 - part) * low + part * high
     if not _has_tangents(robot):
@@ -49,12 +51,12 @@ def positions_at(
 
 def _has_tangents(robot: System) -> bool:
     known = {"p", "h"} <= set(robot.y_layout.names) and "v" in robot.z_layout.names
-    return known and robot.strands == 1
+    return known and strand_count(robot) == 1
 
 
 def _tangents(robot: System, y: Any, z: Any, nodes: Any) -> Float[Any, "T M 3"]:
     """Return p_s = R v at nodes."""
-    h = robot.drawing.quaternions(y[..., nodes, :])
+    h = Drawing.of(robot).quaternions(y[..., nodes, :])
     if z is None:
         v = robot.z_layout.get(robot.rest(jnp.zeros(()))[1], "v")
     else:
@@ -64,7 +66,7 @@ def _tangents(robot: System, y: Any, z: Any, nodes: Any) -> Float[Any, "T M 3"]:
 
 def quaternions_at(robot: System, y: Float[Any, "T N y"], places: Places) -> Float[Any, "T M 4"]:
     """Return unit quaternions, scalar first; between nodes by normalised linear interpolation."""
-    low, high = (robot.drawing.quaternions(y[..., places.node + k, :]) for k in (0, 1))
+    low, high = (Drawing.of(robot).quaternions(y[..., places.node + k, :]) for k in (0, 1))
     same = jnp.sum(low * high, axis=-1, keepdims=True) >= 0.0
     part = places.part[:, None]
     h = (1.0 - part) * low + part * jnp.where(same, high, -high)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
@@ -39,7 +39,7 @@ def row_of(
 def _bounds(system: System) -> tuple[Any, Any]:
     """Return the arclength (m) of the start and the end of every piece."""
     grid, ds = grid_of(system), system.length / (system.nodes - 1)
-    if not system.cuts:
+    if not system.discontinuities.places:
         s = np.linspace(0.0, 1.0, system.nodes) * system.length
         return s[:-1], s[1:]
     low, high = (ds * (grid.segment + grid.bounds[:, k]) for k in (0, 1))
@@ -50,7 +50,7 @@ def places_of(system: System, space: SpaceScheme) -> Float[Any, " places"]:
     """Return the arclength (m) of all places where a step evaluates the equations (`Grid`)."""
     grid, (low, high) = grid_of(system, space), _bounds(system)
     first, last, near = low, high[-1:], high[grid.near - 1]
-    if system.cuts:
+    if system.discontinuities.places:
         first, last = inside(first, low, high), inside(last, low[-1:], high[-1:])
         near = inside(near, low[grid.near - 1], near)
     stages = [low + stage.place * (high - low) for stage in space.check.stages]
@@ -99,7 +99,7 @@ class StepProblem(eqx.Module):
 
         The history terms are one packed record.
         """
-        strand = self.system.strand
+        strand = strand_of(self.system)
         terms = unpacked_history(strand, self.c0, history)
         return semi_discrete.derivatives(strand, Point(s, self.t, y, self.control, terms))
 
@@ -124,7 +124,7 @@ class StepProblem(eqx.Module):
     def far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""
         grid = self.grid
-        if self.system.jump is None:
+        if self.system.discontinuities.jump is None:
             return y[:-1]
         return jax.vmap(self.jump)(jnp.asarray(grid.acting), y[:-1], self.history[: grid.tip])
 
@@ -254,7 +254,8 @@ class StepProblem(eqx.Module):
     # strands
 
     def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "n_strands ..."]:
-        return jnp.repeat(values, self.system.strands, axis=0) if self.system.strands > 1 else values
+        count = strand_count(self.system)
+        return jnp.repeat(values, count, axis=0) if count > 1 else values
 
     def by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
         """Return rows of y or z split by strand."""

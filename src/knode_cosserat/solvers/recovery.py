@@ -17,7 +17,9 @@ import numpy as np
 from knode_cosserat.engine import loops as engine
 from knode_cosserat.engine.places import values_along
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.parts import eased
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.history import EXTRAPOLATIONS
 from knode_cosserat.solvers.result import Result
@@ -243,7 +245,7 @@ def likely_cause(result: Result, system: System, settings: Settings, control: An
     unit = other_unit(system, np.asarray(control))
     if unit:
         return unit
-    if not system.ends.held and settings.time is None:
+    if not Ends.of(system).held and settings.time is None:
         return (
             "Likely cause: nothing holds the robot, which is at rest only where all loads on it cancel out; "
             "hold an end of it, or simulate its motion."
@@ -284,8 +286,8 @@ def _scales_at(system: System, s: Any, _: Any) -> Any:
 
 def natural_time(system: System) -> float | None:
     """Return the time (s) in which the system moves by its own length; None if its scales do not give it."""
-    layout = system.strand.y_layout
+    layout = strand_of(system).y_layout
     if "p" not in layout.names or "q" not in layout.names:
         return None
-    scale = _scales_of_y(system.strand)
+    scale = _scales_of_y(strand_of(system))
     return float(np.min(scale[..., layout.slice("p")] / scale[..., layout.slice("q")]))

@@ -120,7 +120,7 @@ def recovered_stages(
     system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget, controls: tuple[Any, Any]
 ) -> SolvedStep:
     """Recover a step of several stages: each stage, or all of them by substeps of a multistep scheme."""
-    shape = settings.stages, system.control_size
+    shape = settings.stages, system.control_layout.size
     before, now = (np.broadcast_to(np.reshape(each, (-1, shape[1])), shape) for each in controls)
     last, past, found = before[-1], step.past, []
     for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):

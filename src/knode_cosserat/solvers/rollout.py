@@ -239,7 +239,7 @@ def _push(core: TangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.ndarr
 def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.ndarray]:
     shapes = spec.moved([shape for shape, _ in spec.pattern.zeros])
     ends, steps = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1], spec.task.steps
-    held = arrays[spec.leaves].shape[2] == spec.pattern.system.control_size
+    held = arrays[spec.leaves].shape[2] == spec.pattern.system.control_layout.size
 
     def pull(*given: Any) -> tuple[Any, ...]:
         moved, controls, *states = core.solve(*given)

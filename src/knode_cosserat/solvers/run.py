@@ -18,7 +18,7 @@ from tqdm import tqdm
 from knode_cosserat.engine import loops as engine
 from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.section import INWARD
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.evaluation import map_robots
 from knode_cosserat.solvers.guess import materials
@@ -215,14 +215,14 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
     """Warn once if solved rows are bent or stretched beyond the assumptions of rod theory."""
     many, solved = np.ndim(system.length) > 0, np.asarray(rows.result) >= 0
     # a batch of robots of several rods has no `strand`
-    strand = system if system.strands == 1 or many else system.strand
+    strand = system if strand_count(system) == 1 or many else strand_of(system)
     if not solved.any() or not isinstance(strand, ElasticRod):
         return
     ny, nz = system.y_layout.size, system.z_layout.size
     z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
     radius = np.asarray(strand.radius)[..., None]
     if strand.sections:
-        still = np.zeros(system.control_size)
+        still = np.zeros(system.control_layout.size)
         # on the far side of the ends of sections, inside the rod, as z
         s = (np.arange(system.nodes) + 0.2 * INWARD) / (system.nodes - 1)
         s[-1] -= 0.4 * INWARD / (system.nodes - 1)

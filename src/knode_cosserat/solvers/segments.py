@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.strands import in_strands, strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import at_places, grid_of, inside
@@ -99,7 +99,7 @@ CORRECTIONS = 4
 def start_point(system: System, sample: Samples) -> Point:
     """Return the point at a segment's start; slightly inside if the rod has discontinuities."""
     s, ds = sample.place * system.length, system.length / (system.nodes - 1)
-    s = inside(s, s, s + ds) if system.cuts else s
+    s = inside(s, s, s + ds) if system.discontinuities.places else s
     history = unpacked_history(system, sample.c0, sample.history[0])
     return Point(s, sample.t, sample.y, sample.control, history)
 
@@ -107,7 +107,7 @@ def start_point(system: System, sample: Samples) -> Point:
 def end_point(system: System, sample: Samples) -> Point:
     """Return the point at a segment's end; slightly inside if the rod has discontinuities."""
     s, ds = sample.place * system.length, system.length / (system.nodes - 1)
-    s = inside(s + ds, s, s + ds) if system.cuts else s + ds
+    s = inside(s + ds, s, s + ds) if system.discontinuities.places else s + ds
     history = unpacked_history(system, sample.c0, sample.history[1])
     return Point(s, sample.t, sample.y_next, sample.control, history)
 
@@ -139,7 +139,7 @@ def predict_segment(
 
         def rates(place: float, y: Any, record: Any) -> Any:
             s = low + place * h
-            return derivatives(inside(s, low, high) if system.cuts else s, y, record)[0]
+            return derivatives(inside(s, low, high) if system.discontinuities.places else s, y, record)[0]
 
         found = [rates(0.0, start, records[0])]
         found.append(rates(1.0, end, records[1]) if space.implicit else jnp.zeros_like(start))
@@ -159,7 +159,7 @@ def predict_segment(
         k, own, records = piece
         low, high = (ds * (jnp.asarray(grid.segment)[own] + jnp.asarray(grid.bounds)[own, k]) for k in (0, 1))
         history = unpacked_history(system, sample.c0, records[0])
-        if system.jump is not None:
+        if system.discontinuities.jump is not None:
             acting = jnp.asarray(grid.acting)[own]
             beyond = semi_discrete.jump(system, acting, sample.t, y, sample.control, history)
             y = jnp.where(k > 0, beyond, y)
@@ -215,8 +215,8 @@ def rows_are_states(knowledge: System, trajectories: Sequence[Trajectory]) -> bo
 
 
 def strand_samples(knowledge: System, data: Dataset) -> Dataset:
-    """Return the segments strand by strand, as samples of `knowledge.strand`; the tips are unchanged."""
-    count, segments = knowledge.strands, data.segments
+    """Return the segments strand by strand, as samples of `strand_of(knowledge)`; the tips are unchanged."""
+    count, segments = strand_count(knowledge), data.segments
     if count == 1:
         return data
 
@@ -259,8 +259,8 @@ def _of_one(
         stages = np.stack([recorded(*part, slopes_of(settings, part[0])[0]) for part in parts], axis=1)
     c0, history = histories(settings, dt, record, stages)
     beyond = _far_side(knowledge, time, c0, y, control, history)
-    if knowledge.cuts:
-        slope, doubt = slopes_of(settings, y, beyond, knowledge.cuts)
+    if knowledge.discontinuities.places:
+        slope, doubt = slopes_of(settings, y, beyond, knowledge.discontinuities.places)
     # earlier rows equal the first row if that is the start of a motion, and are unknown otherwise
     first = 1 if time[0] == 0.0 or settings.stages > 1 else 2
     rows = np.arange(first, len(time))
@@ -346,7 +346,7 @@ def _far_side(
     control: Float[Any, "T c"], history: Float[Any, "T N x"],
 ) -> Float[Any, "T N y"]:  # fmt: skip
     """Return y at all nodes, on the far side of the nominal model's discontinuities."""
-    if not (knowledge.cuts and knowledge.jump):
+    if not (knowledge.discontinuities.places and knowledge.discontinuities.jump):
         return y
     # the discontinuities at the exact start of each segment
     grid = grid_of(knowledge)
@@ -372,7 +372,7 @@ def _jump(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-unt
 
 def undivided(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
     """Return 1 for each segment (by its start, a part of the length) without inner discontinuity, else 0."""
-    if not knowledge.cuts:
+    if not knowledge.discontinuities.places:
         return np.ones(len(place))
     grid = grid_of(knowledge)
     segment = np.round(np.asarray(place) * (knowledge.nodes - 1)).astype(int)
@@ -401,10 +401,11 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
                 f"the knowledge has {wanted[0]} of {wanted[1]}"
             )
         controls = np.shape(trajectory.control)[-1]
-        if controls != knowledge.control_size:
+        if controls != knowledge.control_layout.size:
             names = ", ".join(field.name for field in knowledge.control_layout.fields)
             raise DataError(
-                f"{name} has {controls} controls a row; the knowledge has {knowledge.control_size} ({names})"
+                f"{name} has {controls} controls a row; the knowledge has "
+                f"{knowledge.control_layout.size} ({names})"
             )
         _check_finite(name, trajectory)
         _check_time(name, trajectory)

@@ -17,8 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Float
 
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.aspects import Ends
+from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import corrections_of
 from knode_cosserat.solvers.discrete_law import DiscreteLaw, discrete_law
 
 
@@ -70,7 +72,7 @@ def unpacked_history(system: System, c0: Any, record: Float[Any, " x"]) -> Histo
 
 def records_in_strands(system: System, records: Any) -> Any:
     """Return packed records of history (…, x) split by strand: (…, strands, x of one)."""
-    if system.strands == 1:
+    if strand_count(system) == 1:
         return in_strands(system, records)
     ny, nz = system.y_layout.size, system.z_layout.size
     parts = jnp.split(records, [ny, ny + nz], axis=-1)
@@ -82,7 +84,7 @@ def records_in_strands(system: System, records: Any) -> Any:
 
 def derivatives(system: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
     """Return y_s and z at one point (paper eq. 4, semi-discretised general class)."""
-    if system.strands > 1:
+    if strand_count(system) > 1:
         return _of_strands(system, point)
     z = law(system, point).strains()
     added, corrected = _corrected(system, point, z)
@@ -90,7 +92,7 @@ def derivatives(system: System, point: Point) -> tuple[Float[Any, " y"], Float[A
 
 
 def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
-    strand, (s, t, y, control, history) = system.strand, point
+    strand, (s, t, y, control, history) = strand_of(system), point
     parts = [in_strands(system, part) for part in (y, history.y, history.z, history.y_s)]
 
     def of_strand(y: Any, *terms: Any) -> Any:
@@ -103,7 +105,7 @@ def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[A
 def _corrected(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
     """Return the corrections of y_s, and z with its corrections, from z of the law."""
     added: Any = 0.0
-    for correction in system.corrections:
+    for correction in corrections_of(system):
         both = correction(point.s, point.t, point.y, point.y_t, z, point.z_t(z), point.control)
         size = point.y.shape[0]
         added, z = added + both[:size], z + both[size:]
@@ -119,7 +121,7 @@ def law(system: System, point: Point) -> DiscreteLaw:
 
 def strains(system: System, point: Point) -> Float[Any, " z"]:
     """Return z at one point."""
-    if system.strands > 1:
+    if strand_count(system) > 1:
         return _of_strands(system, point)[1]
     return _corrected(system, point, law(system, point).strains())[1]
 
@@ -132,7 +134,7 @@ def law_residual(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any
 
 def rates(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
     """Return y_s at one point, for any z; with several strands, for the z of their law."""
-    if system.strands > 1:
+    if strand_count(system) > 1:
         return _of_strands(system, point)[0]
     added, z = _uncorrected(system, point, z)
     return _balanced(system, point, z) + added
@@ -140,7 +142,7 @@ def rates(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]
 
 def _uncorrected(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
     """Return the corrections of y_s at the law's z, and a given z less the corrections there."""
-    if not system.corrections:
+    if not corrections_of(system):
         return 0.0, z
     of_law = law(system, point).strains()
     added, corrected = _corrected(system, point, of_law)
@@ -178,7 +180,7 @@ def base(
 ) -> Float[Any, " y"]:
     """Return y at the base; its velocities are those of a moving base."""
     y = system.base(t, control, unknowns)
-    return system.ends.moving_base(y, history.y_t(y))
+    return Ends.of(system).moving_base(y, history.y_t(y))
 
 
 def tip(system: System, t: Any, control: Any, y: Float[Any, " y"], history: History) -> Float[Any, " k"]:
@@ -190,4 +192,4 @@ def jump(
     system: System, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
 ) -> Float[Any, " y"]:
     """Return y on the far side of the acting cuts."""
-    return system.jump(acting, t, y, history.y_t(y), control)
+    return system.discontinuities.jump(acting, t, y, history.y_t(y), control)

@@ -246,7 +246,7 @@ def checked_dt(dt: Any) -> float:
 def checked_controls(system: System, controls: Any, batch: int | None) -> tuple[Any, int | None]:
     """Return controls (steps, c) or (batch, steps, c), and the size of the batch. Raises `ValueError`."""
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
-    size = system.control_size
+    size = system.control_layout.size
     allowed = f"allowed is (steps, {size}) or (batch, steps, {size}): {names}"
     if not is_traced(controls):
         try:
@@ -300,7 +300,7 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
         ("nodes", initial.y.shape[-2], system.nodes),
         ("numbers in y", initial.y.shape[-1], system.y_layout.size),
         ("numbers in z", initial.z.shape[-1], system.z_layout.size),
-        ("controls", initial.control.shape[-1], system.control_size),
+        ("controls", initial.control.shape[-1], system.control_layout.size),
     ):
         if given != wanted:
             raise ValueError(f"the initial trajectory has {given} {what}, the robot {wanted}")
@@ -324,7 +324,7 @@ def _initial(
     """Return the initial state of a run, its time steps, and the controls of their stages."""
     if initial is None:
         batch = len(controls) if np.ndim(controls) == 3 else None
-        held = np.zeros(system.control_size) if settled else None
+        held = np.zeros(system.control_layout.size) if settled else None
         at_start = initial_state(system, settings, batch, budget, held)
     else:
         at_start = continued_state(system, initial, settings, dt)
@@ -376,7 +376,9 @@ def _trajectory(
         "result": zero.astype(int), "residual": zero, "iterations": zero.astype(int), "position_error": zero,
         "time_error": zero,
     }  # fmt: skip
-    every = rows_of(system, rows) | {"control": controls[..., np.shape(controls)[-1] - system.control_size :]}
+    every = rows_of(system, rows) | {
+        "control": controls[..., np.shape(controls)[-1] - system.control_layout.size :]
+    }
     if "stages" in every:
         first["stages"] = numeric.full(every["stages"][..., 0, :, :, :].shape, np.nan)
     t0 = numeric.asarray(at_start.state.history.t0)

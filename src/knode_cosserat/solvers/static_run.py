@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
 from knode_cosserat.solvers.evaluation import unloaded_shape
@@ -98,7 +99,7 @@ class _Walk:
     def from_rest(self, controls: np.ndarray) -> Run:
         """Start from the unloaded shape, or from a curve between ends nearer than the length; test all."""
         y, before = unloaded_shape(self.system, self.task.settings.space), np.zeros_like(controls[0])
-        if "p" in self.system.y_layout.names and self.system.strands == 1:
+        if "p" in self.system.y_layout.names and strand_count(self.system) == 1:
             p = np.asarray(y)[:, self.system.y_layout.slice("p")]
             self.chord = float(np.linalg.norm(p[-1] - p[0]))
         guess = None

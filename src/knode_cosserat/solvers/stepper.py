@@ -75,10 +75,10 @@ class Stepper:
         settings = Settings.of(time, space, start, newton)
         self.robot, self.dt = robot, checked_dt(dt)
         # layouts are put together anew in each call
-        self._layout, self._control_shape = robot.control_layout, (robot.control_size,)
+        self._layout, self._control_shape = robot.control_layout, (robot.control_layout.size,)
         initial, settled = split_initial(initial)
         if initial is None:
-            held = np.zeros(robot.control_size) if settled else None
+            held = np.zeros(robot.control_layout.size) if settled else None
             at_start = initial_state(robot, settings, recovery_budget=recovery_budget, held=held)
         else:
             check_initial(robot, initial, None)

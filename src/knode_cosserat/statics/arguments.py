@@ -41,7 +41,7 @@ def checked_vectors(name: str, given: Any, size: int, allowed: str, most: int = 
 
 def checked_control(system: System, control: Any, name: str = "control") -> np.ndarray:
     """Return one control (c,)."""
-    size = system.control_size
+    size = system.control_layout.size
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
     numbers = checked_vectors(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
     return within_limits(system, numbers, name)
@@ -57,12 +57,12 @@ def within_limits(system: System, controls: np.ndarray, name: str) -> np.ndarray
 
 def checked_limits(system: System, low: Any, high: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return limits (c,) of the controls, from numbers or (c,)."""
-    if not system.control_size:
+    if not system.control_layout.size:
         raise ValueError(f"a {type(system).__name__} without controls is given; allowed is one with controls")
     found = []
     for name, given in (("low", low), ("high", high)):
         number = isinstance(given, int | float | np.number)
-        found.append(checked_control(system, [given] * system.control_size if number else given, name))
+        found.append(checked_control(system, [given] * system.control_layout.size if number else given, name))
     if np.any(found[0] > found[1]):
         i = int(np.argmax(found[0] > found[1]))
         raise ValueError(

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.law import InternalState, MaterialLaw
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.grid import grid_of
@@ -78,12 +79,13 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
     Raises `ValueError`, with a reason, if they cannot be computed.
     """
     grids = next((pair for pair in GRIDS if system.nodes <= pair[1]), GRIDS[-1])
-    layout, scale = system.strand.y_layout, np.asarray(system.strand.scales().y)
+    layout, scale = strand_of(system).y_layout, np.asarray(strand_of(system).scales().y)
     if "q" not in layout.names:
         raise ValueError(f"a {type(system).__name__} has no velocity q in y")
     s = jnp.zeros(())
     base = in_strands(system, jnp.asarray(y[0]))[0]
-    law = system.nominal.strand.constitutive(s, s, base, jnp.zeros_like(base), jnp.asarray(control))
+    strand, still = strand_of(nominal_model(system)), jnp.zeros_like(base)
+    law = strand.constitutive(s, s, base, still, jnp.asarray(control))
     if isinstance(law, InternalState) or (isinstance(law, MaterialLaw) and law.internal is not None):
         raise ValueError("its friction has no linearisation at rest")
     time = float(scale[layout.slice("p")][0] / scale[layout.slice("q")][0])
@@ -147,7 +149,7 @@ def _step(
         d_past[0, k : k + m] = np.eye(m)
         d_past = d_past.reshape(settings.memory, *records.shape, m)
         state = TangentState(past, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
-        changes = SystemMoves(None, np.zeros((0, m))), np.zeros((1, system.control_size, m))
+        changes = SystemMoves(None, np.zeros((0, m))), np.zeros((1, system.control_layout.size, m))
         after, _ = tangent_time_loop(
             settings, steps, (found.records, found.unknowns), (system, control[None]), changes, state
         )

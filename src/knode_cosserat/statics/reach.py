@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat._reprs import packed_text, quantity, wrapped
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import rest_record
@@ -249,13 +250,13 @@ def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
     """
     states = [in_strands(system, y) for y in (one, other)]
     try:
-        p, q = (np.asarray(system.strand.drawing.positions(y)) for y in states)
+        p, q = (np.asarray(Drawing.of(strand_of(system)).positions(y)) for y in states)
     except AttributeError:
         # a system without positions: compare all of y
         return float(np.max(np.abs(one - other) / np.asarray(system.scales().y))) <= SAME_SHAPE
     off = float(np.max(np.abs(p - q))) / float(system.length)
     try:
-        g, h = (np.asarray(system.strand.drawing.quaternions(y)) for y in states)
+        g, h = (np.asarray(Drawing.of(strand_of(system)).quaternions(y)) for y in states)
     except AttributeError:
         return off <= SAME_SHAPE
     g, h = (each / np.linalg.norm(each, axis=-1, keepdims=True) for each in (g, h))

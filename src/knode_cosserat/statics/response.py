@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.evaluation import still_state, unloaded_shape
 from knode_cosserat.solvers.history import rest_record
@@ -29,10 +30,10 @@ Pose = Callable[[System, Any], tuple[Any, Any]]
 def tip_pose(system: System, y: Any) -> tuple[Any, Any]:
     """Return position and orientation of the last node; the orientation is None if the system has none."""
     try:
-        turned = system.drawing.quaternions(y)
+        turned = Drawing.of(system).quaternions(y)
     except AttributeError:
         turned = None
-    return system.drawing.positions(y), turned
+    return Drawing.of(system).positions(y), turned
 
 
 class Response(NamedTuple):
@@ -61,7 +62,7 @@ def node_values(system: System, settings: Settings, control: Any, y: Any) -> tup
 
 def wrench_fields(system: System) -> tuple[str, ...]:
     """Return the tip's conditions to which a force and a moment at the tip are added."""
-    return tuple(name for name in ("n", "m") if name in system.ends.layout.names)
+    return tuple(name for name in ("n", "m") if name in Ends.of(system).layout.names)
 
 
 def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
@@ -76,10 +77,10 @@ def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
 
 def respond(system: System, settings: Settings, pose: Pose, control: Any, guess: Any) -> Response:
     """Return the equilibrium found from a guess of y at all points, its pose, and the pose's derivatives."""
-    control, c, ny = np.asarray(control, dtype=float), system.control_size, system.y_layout.size
+    control, c, ny = np.asarray(control, dtype=float), system.control_layout.size, system.y_layout.size
     _, y, rows = Equilibria(settings, 1).solve(system, control[None], np.asarray(guess), (0, 1))
     names = wrench_fields(system)
-    wrench = np.asarray(system.ends.layout.indices(names) if names else [], dtype=int)
+    wrench = np.asarray(Ends.of(system).layout.indices(names) if names else [], dtype=int)
     d_controls, d_tip = np.eye(c, c + len(wrench))[None], np.zeros((unknown_count(system), c + len(wrench)))
     d_tip[wrench, c + np.arange(len(wrench))] = 1.0
     changes = SystemMoves(None, np.zeros((0, d_tip.shape[1]))), d_controls
@@ -126,7 +127,7 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any) -
     control = np.asarray(control, dtype=float)
     found = None
     # a rod that is held at both ends may need another guess, or be turned in parts
-    if not system.ends.rest_is_guess:
+    if not Ends.of(system).rest_is_guess:
         found = respond(system, settings, pose, control, unloaded_shape(system, settings.space))
     if found is None or not found.error <= settings.newton.acceptable:
         recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)

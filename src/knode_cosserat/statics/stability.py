@@ -22,7 +22,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from knode_cosserat._reprs import count_of
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.aspects import Observed
+from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.evaluation import still_state
@@ -154,10 +155,10 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
             )
         y = np.asarray(found.y[0])
     # the velocities of an equilibrium are rounding of the solver
-    y, layout = y.copy(), system.strand.y_layout
-    for name in set(system.strand.observed.velocities) & set(layout.names):
+    y, layout = y.copy(), strand_of(system).y_layout
+    for name in set(Observed.of(strand_of(system)).velocities) & set(layout.names):
         in_strands(system, y)[..., layout.slice(name)] = 0.0
-    by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * system.strands <= POINTS]
+    by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * strand_count(system) <= POINTS]
     return _decided(system, y, control, by)
 
 
@@ -172,7 +173,7 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
     if not isinstance(row, int | np.integer) or not -len(y) <= row < len(y):
         raise ValueError(f"row is {row!r}; allowed is {-len(y)} to {len(y) - 1}")
     system = equilibrium.system
-    names = system.strand.y_layout.names
+    names = strand_of(system).y_layout.names
     if not set(NEEDED) <= set(names):
         raise ValueError(
             f"a {type(system).__name__} has y = {', '.join(names)}; allowed are rods with p, h, n and m"
@@ -202,8 +203,8 @@ def _base(system: System, space: SpaceScheme, control: Any, y: Any) -> Any:
 
 def _require_rest(system: System, base: np.ndarray, moved: np.ndarray) -> None:
     """Raise `ValueError` if other fields of y, such as velocities, depend on poses and stresses."""
-    layout = system.strand.y_layout
-    base = base.reshape(system.strands, layout.size, -1)
+    layout = strand_of(system).y_layout
+    base = base.reshape(strand_count(system), layout.size, -1)
     for field in layout.fields:
         if field.name in NEEDED:
             continue
@@ -268,7 +269,7 @@ class _Variation:
                     f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
                 ),
             )
-        moves = (self.free @ vectors[:, 0]).reshape(-1, system.strands, 6)[self.nodes, :, :3]
+        moves = (self.free @ vectors[:, 0]).reshape(-1, strand_count(system), 6)[self.nodes, :, :3]
         return Stability(count, least, _mode(moves), self.asymmetry, None, reason, neutral)
 
     def by_motion(self, system: System, y: np.ndarray, control: np.ndarray) -> Stability:
@@ -286,7 +287,7 @@ class _Variation:
                 f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
             )
         # the phase of the largest displacement
-        p = in_strands(system, modes.first)[..., system.strand.y_layout.slice("p")]
+        p = in_strands(system, modes.first)[..., strand_of(system).y_layout.slice("p")]
         largest = p.ravel()[np.argmax(np.abs(p))]
         moves = np.real(p * np.conj(largest))
         grid, nodes = (np.linspace(0.0, 1.0, size) for size in (len(moves), system.nodes))
@@ -340,7 +341,7 @@ def _variation(system: System, pieces: Pieces) -> _Variation:
     whole, hidden = joined(np.split(elements, nodes[1:-1]))
     if system.nodes > 2 and not hidden and firm(whole):
         elements, part, nodes = whole, np.full(len(whole), 1.0 / len(whole)), np.arange(system.nodes)
-    count, points = 6 * system.strands, len(elements) + 1
+    count, points = 6 * strand_count(system), len(elements) + 1
     K = np.zeros((count * points, count * points))
     for j, element in enumerate(elements):
         for k, own in enumerate(element):
@@ -364,8 +365,8 @@ def _variation(system: System, pieces: Pieces) -> _Variation:
 
 def _at_end(system: System, y: np.ndarray, way: Any, columns: np.ndarray) -> np.ndarray:
     """Return columns of y in poses and stresses, all poses first; by `wide`, of linear forms on y."""
-    strands, moved = system.strands, columns.reshape(system.strands, -1, columns.shape[1])
-    own = np.stack([np.asarray(way(system.strand, jnp.asarray(each))) for each in in_strands(system, y)])
+    strands, moved = strand_count(system), columns.reshape(strand_count(system), -1, columns.shape[1])
+    own = np.stack([np.asarray(way(strand_of(system), jnp.asarray(each))) for each in in_strands(system, y)])
     if way is wide:
         own = np.swapaxes(own, 1, 2)
     found = (own @ moved).reshape(strands, 2, 6, -1)

@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.strands import in_strands
+from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.grid import grid_of, inside
@@ -139,7 +139,7 @@ def _along(
     system: System, y: Any, control: Any, low: Any, high: Any, acting: Any
 ) -> tuple[Any, Any, Any, Any]:
     """Return for all pieces: y at the end, the jump at the beginning, H at Gauss's places, other rates."""
-    strand = system.strand
+    strand = strand_of(system)
     layout, scale = strand.y_layout, strand.scales().y
     rest = jnp.zeros(layout.size * (2 if strand.mixed else 1) + strand.z_layout.size)
     problem = StepProblem(system, jnp.zeros(()), control, jnp.zeros(()), jnp.zeros((0, 0)), Lobatto4())
@@ -151,7 +151,7 @@ def _along(
 
     def piece(y: Any, low: Any, high: Any, acting: Any) -> Any:
         jump = jnp.eye(12)
-        if system.jump is not None:
+        if system.discontinuities.jump is not None:
             near, (y, slope) = y, (problem.jump(acting, y, rest), jax.jacfwd(problem.jump, 1))
             jump = narrow(strand, y) @ slope(acting, near, rest) @ wide(strand, near)
 
@@ -222,12 +222,12 @@ def _size(system: System, y: np.ndarray, off: np.ndarray) -> float:
 
 def _at_points(system: System, y: np.ndarray, way: Any) -> np.ndarray:
     own = jnp.asarray(in_strands(system, y))
-    return np.asarray(jax.vmap(jax.vmap(lambda each: way(system.strand, each)))(own))
+    return np.asarray(jax.vmap(jax.vmap(lambda each: way(strand_of(system), each)))(own))
 
 
 def _correction(system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, ends: Ends) -> np.ndarray:
     """Return the change of y at all points that closes the gaps; of several, the smallest."""
-    strands, to, back = system.strands, _at_points(system, y, narrow), _at_points(system, y, wide)
+    strands, to, back = strand_count(system), _at_points(system, y, narrow), _at_points(system, y, wide)
     gaps = to[1:] @ in_strands(system, off)[..., None]
     ways = to[0] @ ends.base.reshape(strands, -1, ends.base.shape[1])
     # first column: the gaps' effect with no change at the base; others: each admissible change at the base

@@ -211,7 +211,7 @@ def workspace(
             raise ValueError(f"count is {count!r}; allowed is a whole number from 1 to 2^30")
         samples = sample(*limits, int(number), seed)
     else:
-        size = system.control_size
+        size = system.control_layout.size
         samples = checked_vectors("controls", controls, size, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")

@@ -32,9 +32,10 @@ from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat._jax import machine_name
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.paths import parameter_at
+from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.robot_file import format_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.sweeps._description import STORED, SweepError
 from knode_cosserat.sweeps._plan import Plan
 from knode_cosserat.sweeps._shards import read_shard
@@ -122,7 +123,7 @@ def _columns(plan: Plan, robot: int) -> dict[str, dict[str, Any]]:
     add("word", (), "", "number of the word of controls, from 0")
     add("seed", (), "", "seed of the case")
     for name, values in sweep.vary.items():
-        stated = parameter_at(plan.systems[0].nominal, name)
+        stated = parameter_at(nominal_model(plan.systems[0]), name)
         shape = np.shape(values[0]) if isinstance(values, tuple) else ()
         add(name, shape, stated.unit if stated else "", "varied number")
     add("result", (rows,), "", "result codes of the rows; below 0: not solved")

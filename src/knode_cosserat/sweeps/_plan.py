@@ -21,9 +21,10 @@ from knode_cosserat._files.json_text import json_checksum
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.io.container import kind_of
-from knode_cosserat.rods.paths import owner_at, parameter_at
+from knode_cosserat.rods.parameters import owner_at, parameter_at
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import checked_dt
@@ -112,7 +113,7 @@ class Plan:
             "tip_position": (rows, 3), "tip_quaternion": (rows, 4), "position": (rows, system.nodes, 3),
             "y": (rows, system.nodes, system.y_layout.size),
             "z": (rows, system.nodes, system.z_layout.size),
-            "controls": (self.sweep.steps, system.control_size),
+            "controls": (self.sweep.steps, system.control_layout.size),
         }  # fmt: skip
         return {name: shapes[name] for name in self.sweep.store}
 
@@ -165,7 +166,7 @@ class Plan:
             else case_seeds(sweep.seed, span)[sample - span[0]]
         )
         numbers = {name: array for name, array in values.items() if array.ndim == 1} | {"seed": seed}
-        controls = np.zeros((len(index), sweep.steps, self.systems[robot].control_size))
+        controls = np.zeros((len(index), sweep.steps, self.systems[robot].control_layout.size))
         refused: dict[int, str] = {}
         for w, text in enumerate(sweep.controls):
             rows = np.flatnonzero(word == w)
@@ -228,18 +229,18 @@ def _loaded(entry: RobotEntry) -> System:
 
 def _check_variation(system: System, name: str, variation: Range | tuple[Any, ...], used: bool) -> None:
     """Raise `SweepError` unless a robot has a parameter and allows its values; or it is for controls only."""
-    stated = parameter_at(system.nominal, name)
+    stated = parameter_at(nominal_model(system), name)
     if used and not isinstance(variation, Range) and any(np.ndim(value) for value in variation):
         raise SweepError(f"vary: {name} is used in controls; allowed is a list of numbers")
     if stated is None and used:
         return
     try:
         if stated is None:
-            if name not in {field.name for field in dataclasses.fields(system.nominal)}:
+            if name not in {field.name for field in dataclasses.fields(nominal_model(system))}:
                 system.replace(**{name: 0.0})  # raises, with the names that there are
             static = True
         else:
-            owner, last = owner_at(system.nominal, name)
+            owner, last = owner_at(nominal_model(system), name)
             fields = {field.name: field for field in dataclasses.fields(owner)}
             static = bool(fields[last].metadata.get("static", False))
         if static:

@@ -16,9 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.paths import parameter_at
+from knode_cosserat.rods.aspects import Drawing, Ends
+from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.history import SolverState, rest_record
 from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.recovery import likely_cause
@@ -70,9 +72,9 @@ def _stored(systems, record, rows, store):  # type: ignore[no-untyped-def]
     records = jnp.where((solved < 0)[..., None, None], jnp.nan, records)
     y = records[..., :ny]
     functions = {
-        "tip_position": lambda system, y: system.drawing.positions(y[:, -1]),
-        "tip_quaternion": lambda system, y: system.drawing.quaternions(y[:, -1]),
-        "position": lambda system, y: system.drawing.positions(y),
+        "tip_position": lambda system, y: Drawing.of(system).positions(y[:, -1]),
+        "tip_quaternion": lambda system, y: Drawing.of(system).quaternions(y[:, -1]),
+        "position": lambda system, y: Drawing.of(system).positions(y),
     }
     axes = (0 if jnp.ndim(systems.length) else None, 0)
     stored = {
@@ -116,7 +118,7 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
     count = min(CHUNK, len(cases.case) - first)
     # the last chunk is filled with its last case: one shape, one program
     index = np.minimum(np.arange(first, first + CHUNK), len(cases.case) - 1)
-    nominal = plan.systems[robot].nominal
+    nominal = nominal_model(plan.systems[robot])
     values = {name: array[index] for name, array in cases.values.items() if parameter_at(nominal, name)}
     start, marks, reasons = _equilibria(plan, system, values)
     task = TimeIntegration(settings, plan.sweep.dt, steps)
@@ -152,7 +154,7 @@ def _equilibria(
     A robot such as a platform on bent legs starts from its equilibrium under zero control. All others start
     from rest (None), which the chunk's program evaluates.
     """
-    if not system.ends.rest_is_guess:
+    if not Ends.of(system).rest_is_guess:
         return None, np.full(CHUNK, int(Result.CONVERGED)), {}
     states: list[InitialState | None] = []
     reasons: dict[int, str] = {}
@@ -167,7 +169,7 @@ def _equilibria(
     solved = next((state for state in states if state is not None), None)
     if solved is None:
         # a failed case is marked as such: any state of the right shape serves
-        record, zero = rest_record(system), np.zeros(system.control_size)
+        record, zero = rest_record(system), np.zeros(system.control_layout.size)
         history = at_one_state(system, history_settings(plan.settings), record, zero)
         solved = InitialState(record, zero, SolverState(history), False)
     usable = [state or solved for state in states]

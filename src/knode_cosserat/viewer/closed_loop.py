@@ -27,7 +27,8 @@ from knode_cosserat.control import Controller, LoopLog, Plant, Status, constant
 from knode_cosserat.control.loop import Loop, Period, estimated, joined
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPositions
-from knode_cosserat.rods.paths import parameter_at
+from knode_cosserat.rods.parameters import parameter_at
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.live import PATIENCE, PageSession, require_websockets, sequence_of
@@ -78,7 +79,7 @@ class LoopFacts(NamedTuple):
         parameters: list[dict[str, str]] = []
         for name in {} if observer is None else observer.estimate.parameters:
             # such as "loads.0.mass" or "gravity[0]"
-            stated = parameter_at(observer.robot.nominal, name.partition("[")[0])
+            stated = parameter_at(nominal_model(observer.robot), name.partition("[")[0])
             parameters.append({"name": name, "unit": "" if stated is None else stated.unit})
         knots = getattr(controller, "knots", None)
         sizes = {

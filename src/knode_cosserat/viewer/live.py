@@ -415,7 +415,7 @@ def require_websockets() -> None:
 def live_page(stepper: Stepper, title: str | None = None, target: Point | None = None) -> bytes:
     """Return the page of a robot in motion; this also compiles its program."""
     robot = stepper.robot
-    if not robot.control_size:
+    if not robot.control_layout.size:
         raise ValueError(f"a {type(robot).__name__} has no controls, so that there is nothing to be moved")
     controls = sliders(robot)
     # compiled now, not while somebody waits; a start without a solution is for the page to say

@@ -20,8 +20,10 @@ import numpy as np
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.loads import AttachedMass
+from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.trajectory import Trajectory
 
@@ -179,11 +181,11 @@ def last_row(system: System, trajectory: Trajectory, names: Sequence[str]) -> np
     """Return the values of a trajectory's last row, array after array, for the live page."""
     nodes, _ = kept(np.shape(trajectory.y), system.z_layout.size)
     y = np.asarray(trajectory.y)[-1:]
-    curves = list(system.drawing.curves(y)) if any(name.startswith("curve") for name in names) else []
+    curves = list(Drawing.of(system).curves(y)) if any(name.startswith("curve") for name in names) else []
     functions = {"y": lambda: y[:, nodes], "z": lambda: np.asarray(trajectory.z)[-1:, nodes],
            "control": lambda: np.asarray(trajectory.control)[-1:],
            "position": lambda: positions_of(system, y)[:, nodes],
-           "orientation": lambda: np.asarray(system.drawing.quaternions(y))[:, nodes]}  # fmt: skip
+           "orientation": lambda: np.asarray(Drawing.of(system).quaternions(y))[:, nodes]}  # fmt: skip
     parts = []
     for name in names:
         if name in functions:
@@ -221,7 +223,7 @@ NICE = (1.0, 1.2, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 
 def physics_of(system: System) -> Any:
     """Return the robot itself; for a model, its nominal robot with the model's length."""
-    robot = system.nominal
+    robot = nominal_model(system)
     same = robot is system or float(robot.length) == float(system.length)
     return robot if same else robot.replace(length=system.length)
 
@@ -254,7 +256,7 @@ def _radii(robot: Any, s: np.ndarray) -> np.ndarray:
     if radius is None or np.ndim(radius):
         return np.full(len(s), SLIM * float(robot.length))
     if getattr(robot, "sections", ()):
-        none = np.zeros(robot.control_size)
+        none = np.zeros(robot.control_layout.size)
         return np.asarray(jax.vmap(lambda at: robot.material(at, none).radius + 0.0 * at)(s))
     return np.full(len(s), float(radius))
 
@@ -376,7 +378,7 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
         ValueError: the system does not define positions.
     """
     try:
-        points = np.asarray(system.drawing.positions(y), dtype=float)
+        points = np.asarray(Drawing.of(system).positions(y), dtype=float)
     except AttributeError as error:
         raise ValueError(f"{error}; without positions there is nothing to draw") from None
     if points.ndim == 3 and points.shape[-1] == 2:
@@ -392,18 +394,19 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
 def quaternions_of(system: System, y: np.ndarray) -> np.ndarray | None:
     """Return the orientations (T, N, 4), scalar first, or None if the system has none."""
     try:
-        return np.asarray(system.drawing.quaternions(y), dtype=float)
+        return np.asarray(Drawing.of(system).quaternions(y), dtype=float)
     except AttributeError:
         return None
 
 
 def drawn_lines(system: System, y: np.ndarray, positions: np.ndarray) -> list[dict[str, Any]]:
     """Lines to be drawn beside that of the positions, if there are others: rods, and outlines that close."""
-    flat = type(system.drawing).curves is Drawing.curves
-    curves = [] if flat else [np.asarray(curve, dtype=float) for curve in system.drawing.curves(y)]
+    flat = type(Drawing.of(system)).curves is Drawing.curves
+    curves = [] if flat else [np.asarray(curve, dtype=float) for curve in Drawing.of(system).curves(y)]
     if not curves or (len(curves) == 1 and np.array_equal(curves[0], positions, equal_nan=True)):
         return []
-    rods = system.strands if system.strands > 1 else len(curves)
+    count = strand_count(system)
+    rods = count if count > 1 else len(curves)
     return [{"shape": "rod" if k < rods else "outline", "points": curve} for k, curve in enumerate(curves)]
 
 

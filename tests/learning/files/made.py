@@ -22,6 +22,7 @@ from knode_cosserat.learning.structured.residual import (
     expansion,
     loaded,
 )
+from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.system import unknown_count
 
 # few nodes and tensions that no other test has: what is compiled here was not compiled before
@@ -54,7 +55,7 @@ def structured(knowledge=ROBOT, seed=0):
         return dataclasses.replace(found, weights=1e-4 * rng.normal(size=found.weights.shape))
 
     balanced = loaded(knowledge).size
-    load = Load(law(knowledge.observed.layout, balanced), law(ambient_layout(knowledge), balanced))
+    load = Load(law(Observed.of(knowledge).layout, balanced), law(ambient_layout(knowledge), balanced))
     tip = Load(None, law(ambient_layout(knowledge), unknown_count(knowledge)))
     assert y.size > balanced
     return Structured(np.asarray(0.01 * seed), law(z + rates, z.size, u=CURVED), load, tip)

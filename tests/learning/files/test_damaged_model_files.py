@@ -227,7 +227,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
     assert os.listdir(tmp_path) == []
     six_tendons = ROBOT.replace(tendon_angles=np.arange(6.0))
     text = KNODE(six_tendons, network(six_tendons)).to_bytes()
-    assert decoded(text).control_size == 6
+    assert decoded(text).control_layout.size == 6
 
     fewer = {"residual.input_weights": np.zeros((4, 21))}
     with fails("model: residual and knowledge do not fit together: "):

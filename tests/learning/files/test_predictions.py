@@ -118,7 +118,7 @@ def test_predictions_of_what_no_file_describes_are_saved_all_the_same(tmp_path):
         (KNODE(ROBOT, network(), About({"f": abs})), ["its system, a KNODE (a KNODE: about.f is a builtin"]),
     ):
         y, z = np.zeros((3, 5, system.y_layout.size)), np.zeros((3, 5, system.z_layout.size))
-        control = hand if system.control_size == 2 else np.zeros((3, 4))
+        control = hand if system.control_layout.size == 2 else np.zeros((3, 4))
         zeros = np.zeros(3)
         states = kc.Trajectory(system, None, np.arange(3.0), y, z, control, zeros.astype(int), zeros, zeros)
         path = tmp_path / "a.nc"

@@ -242,9 +242,9 @@ def run(
 
     system = load_system(model)
     machine = opened(port, robot, None if robot else system)
-    if system.control_size != machine.driver.tendon_count:
+    if system.control_layout.size != machine.driver.tendon_count:
         raise ValueError(
-            f"{model} has {system.control_size} controls and the robot {machine.driver.tendon_count} "
+            f"{model} has {system.control_layout.size} controls and the robot {machine.driver.tendon_count} "
             "tendons; they must be equal"
         )
     if machine.poses is None and capture is None:

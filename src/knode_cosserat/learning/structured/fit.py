@@ -50,7 +50,10 @@ from knode_cosserat.learning.structured.residual import (
     material_layout,
     tip_observables,
 )
+from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.parts import RodPoint
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
@@ -146,7 +149,7 @@ class _Regressions:
     def __init__(self, knowledge: System, data: Dataset, options: StructuredOptions):
         self.knowledge, self.data, self.options = knowledge, data, options
         #: the strand, whose law is learned along the rod
-        self.strand = knowledge.strand
+        self.strand = strand_of(knowledge)
         #: True if y at the end of a segment is linear in the rates at its ends
         self.linear = not data.space.formula.stages
         self._along: tuple[_Views, Any, _Sides] | None = None
@@ -158,7 +161,7 @@ class _Regressions:
         stress, _ = _best(offers, np.ones((len(segments.shares), 1)), targets, segments)
         residual = self._with_loads(Structured(np.zeros(()), stress, None, None), segments)
         tip, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(self.knowledge), self.data.tips))
-        sides = _sides(self.knowledge, self.knowledge.ends.layout, self.data.tips.y, views, curved=False)
+        sides = _sides(self.knowledge, Ends.of(self.knowledge).layout, self.data.tips.y, views, curved=False)
         load = _load(sides, -tip, TOLERANCE * np.asarray(self.knowledge.scales().tip), tips)
         return dataclasses.replace(residual, tip_load=load)
 
@@ -193,7 +196,7 @@ class _Regressions:
 
         The points are the starts of all segments and, if the scheme uses them, then their ends.
         """
-        if self._along is None or self.strand.cuts:
+        if self._along is None or self.strand.discontinuities.places:
             points, z = _points(self.strand, residual, self.data)
             views: _Views = jax.tree.map(np.asarray, _views(self.strand, points, z))
             rates = mean_of_ends(np.asarray(_rates(self.strand, points, z)), len(self.data.segments.t))
@@ -225,7 +228,9 @@ class _Regressions:
         load = _load(sides, missing[:, where], least[where], counting)
         residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
         # with two ends: strains on the near side of discontinuities, and the mean of A + c0 B, are not exact
-        if self.linear and not (data.space.implicit and (knowledge.cuts or knowledge.mixed)):
+        if self.linear and not (
+            data.space.implicit and (knowledge.discontinuities.places or knowledge.mixed)
+        ):
             return residual
         return _polished(knowledge, data, residual, np.sqrt(counting.shares)[:, None] / (ds * floors))
 
@@ -254,11 +259,13 @@ def _points(knowledge: System, residual: Structured, data: Dataset) -> tuple[Any
     if formula.stages or not data.space.implicit:
         return starts
     ends = jax.vmap(lambda sample: end_point(knowledge, sample))(segments), segments.z_next
-    if knowledge.cuts:
+    if knowledge.discontinuities.places:
         # z is known on the far side of a discontinuity; on the near side it is that of the corrected law
         near = _corrected_strains(KNODE(knowledge, dataclasses.replace(residual, load=None)), ends[0])
         nodes = knowledge.nodes - 1
-        away = np.abs(np.asarray(knowledge.cuts) * nodes - (segments.place[:, None] * nodes + 1.0))
+        away = np.abs(
+            np.asarray(knowledge.discontinuities.places) * nodes - (segments.place[:, None] * nodes + 1.0)
+        )
         on_cut = np.min(away, axis=1)[:, None] < ON_NODE
         ends = ends[0], np.where(on_cut, np.asarray(near), segments.z_next)
     return jax.tree.map(lambda *parts: np.concatenate(parts), starts, ends)
@@ -276,8 +283,8 @@ def _corrected_strains(model: System, points: Any) -> Any:
 @jax.jit
 def _views(knowledge: System, points: Any, z: Any) -> _Views:
     def one(point: Any, z: Any) -> Any:
-        observables = knowledge.observed.observables(
-            point.s, point.y, point.y_t, z, point.z_t(z), point.control
+        observables = Observed.of(knowledge).observables(
+            RodPoint(knowledge, point.s, point.t, point.y, point.y_t, point.control, z=z, z_t=point.z_t(z))
         )
         matrix = semi_discrete.load_matrix(knowledge, point, z) if knowledge.mixed else None
         ambient = ambient_inputs(knowledge, point.control)
@@ -311,9 +318,9 @@ _rotations = jax.jit(jax.vmap(rotation_matrix))
 
 def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
     """Return the material and ambient features of a load of this layout, and its frames."""
-    stated = system.observed.velocities or system.observed.layout.names
+    stated = Observed.of(system).velocities or Observed.of(system).layout.names
     forms: list[dict[str, Any]] = [
-        dict.fromkeys(system.observed.velocities, DRAG),
+        dict.fromkeys(Observed.of(system).velocities, DRAG),
         dict.fromkeys(stated, CURVED),
     ]
     inputs = material_layout(system)

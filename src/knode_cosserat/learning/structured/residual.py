@@ -32,9 +32,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.learning.residual import Residual
+from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.law import StressedLaw
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.system import System, with_length_factor
+from knode_cosserat.rods.parts import RodPoint
+from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import with_length_factor
 from knode_cosserat.rotation import dot, rotation_matrix
 
 LINEAR = ("linear",)
@@ -215,7 +218,9 @@ class Structured(Residual):
             return balance
         observed = None
         if self.load.material is not None:
-            observed = knowledge.observed.observables(s, y, y_t, z, z_t, control)
+            observed = Observed.of(knowledge).observables(
+                RodPoint(knowledge, s, t, y, y_t, control, z=z, z_t=z_t)
+            )
         layout, inputs = loaded(knowledge), ambient_inputs(knowledge, control)
         load = self.load(layout, knowledge.y_layout, y, observed, inputs)
         load = jnp.zeros(y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
@@ -233,12 +238,15 @@ class Structured(Residual):
             return conditions
         observed = tip_observables(knowledge, y, y_t, control)
         inputs = ambient_inputs(knowledge, control)
-        return conditions + self.tip_load(knowledge.ends.layout, knowledge.y_layout, y, observed, inputs)
+        return conditions + self.tip_load(Ends.of(knowledge).layout, knowledge.y_layout, y, observed, inputs)
 
 
 def law_inputs(knowledge: System, s: Any, control: Any) -> Any:
     """Return a function of z and z_t: the inputs of stress, scaled by the local factors of the section."""
-    rest, factors = knowledge.observed.unstressed(s, control), knowledge.observed.law_factors(s, control)
+    rest, factors = (
+        Observed.of(knowledge).unstressed(s, control),
+        Observed.of(knowledge).law_factors(s, control),
+    )
     strain, rate = (1.0, 1.0) if factors is None else factors
     return lambda z, z_t: jnp.concatenate([(z - rest) * strain, z_t * rate])
 
@@ -247,7 +255,8 @@ def tip_observables(knowledge: System, y: Float[Any, " y"], y_t: Any, control: A
     """Return the observables for a tip load, without the strains there, which it determines itself."""
     s = knowledge.length
     _, z = knowledge.rest(s)
-    return knowledge.observed.observables(s, y, y_t, z, jnp.zeros_like(z), control)
+    point = RodPoint(knowledge, s, None, y, y_t, control, z=z, z_t=jnp.zeros_like(z))
+    return Observed.of(knowledge).observables(point)
 
 
 def loaded(knowledge: System) -> Layout:
@@ -258,20 +267,20 @@ def loaded(knowledge: System) -> Layout:
 
 def material_layout(knowledge: System) -> Layout:
     """Return the input layout of a material-frame load: the observables, and the ambient inputs."""
-    return knowledge.observed.layout + ambient_layout(knowledge)
+    return Observed.of(knowledge).layout + ambient_layout(knowledge)
 
 
 def ambient_layout(knowledge: System) -> Layout:
     """Return the input layout of an ambient load: the control, and its actuation if that differs."""
-    if not knowledge.observed.has_actuation:
+    if not Observed.of(knowledge).has_actuation:
         return knowledge.control_layout
-    size = jax.eval_shape(knowledge.observed.actuation, np.zeros(knowledge.control_size)).shape[0]
+    size = jax.eval_shape(Observed.of(knowledge).actuation, np.zeros(knowledge.control_layout.size)).shape[0]
     actuation = Field("actuation", size, "", "part of the control that enters the equations")
     return knowledge.control_layout + Layout(actuation)
 
 
 def ambient_inputs(knowledge: System, control: Any) -> Any:
     """Return the numbers laid out by `ambient_layout`."""
-    if not knowledge.observed.has_actuation:
+    if not Observed.of(knowledge).has_actuation:
         return control
-    return jnp.concatenate([control, knowledge.observed.actuation(control)])
+    return jnp.concatenate([control, Observed.of(knowledge).actuation(control)])

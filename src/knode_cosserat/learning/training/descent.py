@@ -26,6 +26,7 @@ from knode_cosserat.learning.residual import Network, Residual, elu, input_layou
 from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
 from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
 from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
@@ -419,7 +420,7 @@ class SegmentRun(Run):
         state = started(residuals, training)
         super().__init__(seeds, training.epochs, state, Best(state.weights, training.stop_after))
         self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
-        self._inputs = prepared(knowledge.strand, residuals[0], dataset, training)
+        self._inputs = prepared(strand_of(knowledge), residuals[0], dataset, training)
 
     def compile(self) -> None:
         """Compile the epochs' program without running one, and run one held-out rollout."""

@@ -22,6 +22,7 @@ from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.segments import DataError, samples, settings_of
@@ -127,8 +128,8 @@ def simulated_batch(
 def _tip_errors(model: System, parts: tuple[TrajectoryBatch, ...], settings: Settings, dt: float) -> Any:
     errors = []
     for course in parts:
-        found = model.drawing.positions(simulated_batch(model, course, settings, dt)[:, :, -1])
-        distance = jnp.sum((found - model.drawing.positions(course.y[:, :, -1])) ** 2, axis=-1)
+        found = Drawing.of(model).positions(simulated_batch(model, course, settings, dt)[:, :, -1])
+        distance = jnp.sum((found - Drawing.of(model).positions(course.y[:, :, -1])) ** 2, axis=-1)
         errors.append(jnp.sqrt(jnp.mean(distance, axis=-1)))
     return jnp.concatenate(errors)
 

@@ -299,9 +299,9 @@ def _parts_of(
 
 def _check(rows: Measurements, robot: System) -> None:
     tendons = rows.tension.shape[1]
-    if tendons != robot.control_size:
+    if tendons != robot.control_layout.size:
         raise RecordingError(
-            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_size} "
+            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_layout.size} "
             "controls; allowed is the same number"
         )
     away = rows.fractions > 0.0
