@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.cases import PAPER, one_core, seconds
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import TendonFriction
 
 STEPS, DT, ROUNDS = 128, 0.05, 15
 

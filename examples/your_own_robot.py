@@ -16,7 +16,7 @@ from knode_cosserat.evaluation import figures, recording_figures
 from knode_cosserat.evaluation.metrics import rms_distance
 from knode_cosserat.recordings.virtual import lagged
 from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
-from knode_cosserat.rods.virtual_robot import VirtualRobot
+from knode_cosserat.rods.tendon_robots import VirtualRobot
 
 HERE = Path(__file__).parent
 SIGNALS = {"sine-1": "sine:1", "sine-2": "sine:2", "random-0": "random:0", "unseen": "random:7"}

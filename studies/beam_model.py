@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
-from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
+from knode_cosserat.rods.relaxation import Relaxation
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
@@ -80,7 +81,7 @@ def torsion_constant(width: float = WIDTH) -> float:
     return width**4 * (1.0 / 3.0 - 64.0 / np.pi**5 * series)
 
 
-def beam_rod(beam: Beam, load: float, nodes: int) -> ViscoelasticRod:
+def beam_rod(beam: Beam, load: float, nodes: int) -> SlenderRod:
     """Return the rod of a beam with a load (kg); its control is the vertical force of the hand (N).
 
     The rod's own section is round. Its radius gives the square's area; its rotary inertia is 4.5 % less than
@@ -92,11 +93,12 @@ def beam_rod(beam: Beam, load: float, nodes: int) -> ViscoelasticRod:
     Kse = np.diag([shear, shear, E * area])
     Kbt = np.diag([E * second_moment, E * second_moment, G * torsion_constant()])
     half = 0.5 * beam.tilt
-    return ViscoelasticRod(
+    return SlenderRod(
         length=LENGTH, radius=WIDTH / np.sqrt(np.pi), density=DENSITY, youngs_modulus=E, shear_modulus=G,
         shear_stiffness=Kse, bending_stiffness=Kbt, shear_damping=beam.damping_time * Kse,
-        bending_damping=beam.damping_time * Kbt, branch_stiffness=beam.branch_stiffness,
-        relaxation_time=beam.relaxation_time, gravity=(-GRAVITY, 0.0, 0.0), nodes=nodes,
+        bending_damping=beam.damping_time * Kbt,
+        effects=(Relaxation(beam.branch_stiffness, beam.relaxation_time, shear=True),),
+        gravity=(-GRAVITY, 0.0, 0.0), nodes=nodes,
         base_end=Clamped(orientation=(np.cos(half), 0.0, -np.sin(half), 0.0)),
         loads=(
             AttachedMass(mass=load, offset=UPPER_EDGE),
@@ -115,7 +117,7 @@ def tip_height(recording: BeamRecording) -> float:
     return float(np.mean(recording.held[:, 0] - MARKERS[:, 0]) - np.mean(recording.base[:, 0]))
 
 
-def held_beam(rod: ViscoelasticRod, load: float, deflection: float) -> Trajectory:
+def held_beam(rod: SlenderRod, load: float, deflection: float) -> Trajectory:
     """Return the equilibrium with the tip held at a height (m) over that of the unloaded beam.
 
     The height is so nearly linear in the hand's force that two forces give the third.
@@ -128,7 +130,7 @@ def held_beam(rod: ViscoelasticRod, load: float, deflection: float) -> Trajector
     return _settled(rod, forces[0] + slope * (height - heights[0]))
 
 
-def _settled(rod: ViscoelasticRod, force: float) -> Trajectory:
+def _settled(rod: SlenderRod, force: float) -> Trajectory:
     return equilibrium(rod, np.array([force]))
 
 

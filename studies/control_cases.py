@@ -21,7 +21,7 @@ from knode_cosserat.control import (
 from knode_cosserat.estimation import Adapted
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.robot_file import load_robot
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import TendonRod
 
 #: the robot, period (s) of control, and limits of the tensions (N, N/s)
 NOMINAL, DT = "delrin-tendon-robot", 0.05

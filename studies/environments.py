@@ -36,8 +36,7 @@ from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
 from knode_cosserat.rods.robot_file import load_robot
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.simulate import simulate
 from studies import stand_in

@@ -11,8 +11,8 @@ from jaxtyping import Float
 from knode_cosserat import controls
 from knode_cosserat.control import Controller, ControlLimits, controller_named, identified_lag
 from knode_cosserat.estimation.outputs import TipPosition
-from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.tendons import LoadCells
 from knode_cosserat_hardware.driver import Limits
 from knode_cosserat_hardware.emulation import ROBOT, EmulatedPort, EmulatedRobot
 from knode_cosserat_hardware.lines import GRAM_FORCE

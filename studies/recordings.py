@@ -25,9 +25,9 @@ from knode_cosserat.recordings.estimation.estimate import estimate_states
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
-from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendons import undelayed
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.segments import DataError

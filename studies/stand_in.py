@@ -30,9 +30,9 @@ from knode_cosserat.control.planning import PlanController
 from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.outputs import TipPosition
 from knode_cosserat.identification import identify
-from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.robot_file import load_robot
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import TendonRod
+from knode_cosserat.rods.tendons import LoadCells
 from studies.elastica.plant import ElasticaPlant, Recorded, record_elastica, sine_commands
 from studies.elastica.rod import ElasticaRod, Imperfections
 

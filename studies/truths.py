@@ -19,7 +19,7 @@ from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.law import MaterialLaw
 from knode_cosserat.rods.loads import square_law_drag
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.tendon_robot import TendonRobot
+from knode_cosserat.rods.tendon_robots import TendonRobot
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 Robot = TypeVar("Robot", bound=TendonRobot)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import knode_cosserat as kc
 from knode_cosserat.rods import ends, loads, routing, section, surroundings
-from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.robot_file import KINDS, parse_robot
 
 PAGE = (Path(__file__).parent.parent / "docs" / "robots.md").read_text(encoding="utf-8")

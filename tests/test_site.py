@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from knode_cosserat.rods import ends, loads, routing, section, surroundings
-from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
 from knode_cosserat.solvers.time import BDFAlpha
 from tools.site import api, changelog, examples, robot_file, source
@@ -23,7 +23,7 @@ def test_a_source_is_that_of_the_object():
     lines, first = inspect.getsourcelines(BDFAlpha.coefficients)
     assert (file.name, line) == ("time.py", first)
     assert code == textwrap.dedent("".join(lines)).rstrip()
-    decorated = source.found("knode_cosserat.rods.elastic_rod.ElasticRod.section")[2]
+    decorated = source.found("knode_cosserat.rods.rod.Rod.section")[2]
     assert decorated.startswith("@property\ndef section") and decorated.endswith("(self.radius)")
 
 

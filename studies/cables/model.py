@@ -20,8 +20,8 @@ from knode_cosserat.rods.ends import AXES, Driven
 from knode_cosserat.rods.loads import Body, Motion, SpreadLoad
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.parts import Wrench
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import Stretch
-from knode_cosserat.rods.slender_rod import SlenderRod
 from knode_cosserat.trajectory import Trajectory
 from studies.cables import frames
 from studies.cables.shapes import CableGrid, CableShape, Fitter

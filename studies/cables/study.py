@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
-from knode_cosserat.rods.slender_rod import SlenderRod
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer import export_scene
 from studies.cables.correction import Correction, learned_correction

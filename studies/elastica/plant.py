@@ -17,7 +17,7 @@ from knode_cosserat.cli.arguments import load_system, parse_limits
 from knode_cosserat.control.plants import Plant, Readings, Sensor
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import TendonRod
 from studies.elastica.rod import ElasticaRod, Imperfections
 
 #: time from row to row of a recording, and the rest before its first row (s)

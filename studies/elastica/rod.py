@@ -11,7 +11,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import TendonRod
 
 #: elements: a static tip is 0.05 % of the length from that of our equations (tests/studies/test_elastica.py)
 ELEMENTS = 12

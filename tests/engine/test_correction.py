@@ -10,7 +10,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.rods.system import unknowns_of
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import TendonFriction
 from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem

@@ -145,7 +145,7 @@ STRING = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, no
 
 
 def with_friction():
-    from knode_cosserat.rods.tendon_friction import TendonFriction
+    from knode_cosserat.rods.tendons import TendonFriction
 
     return kc.robots.RoutedTendonRobot.like(PAPER, friction=TendonFriction(wobble=0.6, curvature=0.1))
 

@@ -10,12 +10,9 @@ from hypothesis import strategies as st
 import knode_cosserat as kc
 from knode_cosserat.identification.effects import Number
 from knode_cosserat.identification.model import Model
-from knode_cosserat.rods.anchors import EarlyAnchors
-from knode_cosserat.rods.load_cells import LoadCells
-from knode_cosserat.rods.rib_spacing import RibSpacing, pressed
 from knode_cosserat.rods.routing import Helical, Straight
 from knode_cosserat.rods.section import Sleeve
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import EarlyAnchors, LoadCells, RibSpacing, TendonFriction, pressed
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(tendon_offset=0.02)
 ROUTED = kc.robots.RoutedTendonRobot.like(NOMINAL)

@@ -10,11 +10,9 @@ from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
-from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.rib_spacing import RibSpacing
 from knode_cosserat.rods.section import Sleeve, Stretch
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import LoadCells, RibSpacing, TendonFriction
 from knode_cosserat.solvers.segments import DataError
 from tests.identification.recorded import DT, measured, tensions
 

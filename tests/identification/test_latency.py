@@ -10,7 +10,7 @@ from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.model import Model
-from knode_cosserat.rods.load_cells import LoadCells, undelayed
+from knode_cosserat.rods.tendons import LoadCells, undelayed
 from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(

@@ -6,9 +6,9 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.model import Model
-from knode_cosserat.rods.reels import Reels
 from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.section import Stretch
+from knode_cosserat.rods.tendons import Reels
 
 #: three cables in a soft rod that hangs; a control of 1 takes in 0.1 mm
 CABLES = kc.robots.RoutedTendonRobot(

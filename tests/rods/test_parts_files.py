@@ -16,15 +16,14 @@ from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.learning.residual import network
 from knode_cosserat.rods.ends import Driven, End
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Load, PointWrench
-from knode_cosserat.rods.parameters import choices_of, parameters_of
-from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.parameters import Choice, kinds_of, parameters_of, stated_of
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
 from knode_cosserat.rods.routing import FunctionRouting, Routing
 from knode_cosserat.rods.section import SectionChange
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.surroundings import Obstacle, Sphere
-from knode_cosserat.rods.tendon_friction import TendonFriction
-from knode_cosserat.rods.virtual_robot import VirtualRobot
+from knode_cosserat.rods.tendon_robots import VirtualRobot
+from knode_cosserat.rods.tendons import TendonFriction
 from tests.trajectories import edited
 
 BODY = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6}
@@ -68,7 +67,7 @@ def parts(draw, family):
         # what is nearer to an end than rounding is at it
         places = st.lists(st.floats(0.0, 1.0).map(lambda s: round(s, 6)), min_size=2, max_size=2, unique=True)
         given["begin"], given["end"] = sorted(draw(places))
-    for name, stated in choices_of(cls).items():
+    for name, stated in stated_of(cls, Choice).items():
         words = st.sampled_from(stated.allowed)
         given[name] = draw(st.lists(words, min_size=1, unique=True) if stated.many else words)
     return cls(**given)

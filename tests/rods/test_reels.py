@@ -6,7 +6,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.reels import Reels
+from knode_cosserat.rods.tendons import Reels
 
 PAIRS = Reels(motors=(1, -1, 2, -2), radius=(0.02, 0.03), zero=(0.1, 0.0), taken_in=(1e-3, 1e-3, 0.0, 2e-3))
 ROBOT = kc.robots.RoutedTendonRobot.like(

@@ -24,7 +24,7 @@ from knode_cosserat.rods.robot_file import (
     parse_robot,
     save_robot,
 )
-from knode_cosserat.rods.tendon_robot import TendonRobot
+from knode_cosserat.rods.tendon_robots import TendonRobot
 
 PAPER = "delrin-tendon-robot"
 HEAD = "format: 1\nkind: tendon-robot\n"

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.rods.robot_file import format_robot, parse_robot
 from knode_cosserat.rods.section import Sleeve
-from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from knode_cosserat.rods.tendons import TendonFriction, Vibration
 from knode_cosserat.solvers.result import Result
 
 KNOWLEDGE = kc.load_robot("delrin-tendon-robot")

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.rods.routing import Helical, Polynomial, Straight, Tapered
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import TendonFriction
 from tests.rods import rucker_webster as oracle
 
 DELRIN = kc.load_robot("delrin-tendon-robot")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.parts import kinds_of
+from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.routing import (
     FunctionRouting,
     Helical,

@@ -5,7 +5,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from knode_cosserat.rods.tendon_friction import STRAIGHT, TendonFriction, Vibration
+from knode_cosserat.rods.tendons import STRAIGHT, TendonFriction, Vibration
 from knode_cosserat.solvers.discrete_law import evolved
 
 REACH = 0.1

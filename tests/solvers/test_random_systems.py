@@ -17,7 +17,7 @@ from knode_cosserat.rods.ends import Clamped, Driven, Pinned
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWrench
 from knode_cosserat.rods.routing import Helical, Polynomial, Straight, Tapered
 from knode_cosserat.rods.surroundings import Cylinder, Plane, Sphere
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import TendonFriction
 from tests.solvers.test_random_cases import Case, worst_result
 
 STEPS = 40

@@ -11,7 +11,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.surroundings import Plane
-from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from knode_cosserat.rods.tendons import TendonFriction, Vibration
 from knode_cosserat.solvers.grid import at_places
 from knode_cosserat.solvers.history import advanced, history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem

@@ -7,7 +7,7 @@ import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Free, Pinned
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.rods.strands import strand_of
-from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from knode_cosserat.rods.tendons import TendonFriction, Vibration
 from tests.trajectories import synthetic
 
 L, RADIUS, E = 0.5, 2e-3, 2e9

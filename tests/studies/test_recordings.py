@@ -12,7 +12,7 @@ from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
 from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
 from knode_cosserat.rods.section import Sleeve
-from knode_cosserat.rods.tendon_friction import TendonFriction
+from knode_cosserat.rods.tendons import TendonFriction
 from knode_cosserat.solvers.result import Result, SimulationError
 from studies import recordings as study
 from studies.__main__ import app

@@ -7,10 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.rods.parameters import Parameter, choices_of, parameters_of, slots_of
-from knode_cosserat.rods.parts import kinds_of
-from knode_cosserat.rods.robot_file import KINDS
-from knode_cosserat.rods.robot_schema import NODES
+from knode_cosserat.rods.parameters import Choice, Parameter, kinds_of, parameters_of, slots_of, stated_of
+from knode_cosserat.rods.robot_file import KINDS, NODES
 from knode_cosserat.rods.rod import Rod
 
 SHAPES = {
@@ -42,7 +40,7 @@ FAMILIES = {
 
 def page() -> str:
     """Return the reference: kinds of robots, then the families of their parts."""
-    rod = set(parameters_of(Rod)) | set(slots_of(Rod)) | set(choices_of(Rod))
+    rod = set(parameters_of(Rod)) | set(slots_of(Rod)) | set(stated_of(Rod, Choice))
     of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, Rod)]
     shared = [
         "[Download the schema](robot.schema.json)",
@@ -77,7 +75,7 @@ def _rows(cls: type, only: set[str] | None, without: Any = ()) -> list[str]:
         name: _row(name, each.meaning, SHAPES[each.shape], each.unit, _range(each), _default(defaults[name]))
         for name, each in parameters_of(cls).items()
     }
-    for name, each in choices_of(cls).items():
+    for name, each in stated_of(cls, Choice).items():
         words = ", ".join(f"`{str(word).lower()}`" for word in each.allowed)
         kind = "list of different words" if each.many else "word"
         rows[name] = _row(name, each.meaning, kind, "", words, _default(defaults[name]))

@@ -24,9 +24,9 @@ from typing import Any, Literal, NamedTuple, Self, get_args
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.reels import Reels
 from knode_cosserat.rods.robot_file import load_robot
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
+from knode_cosserat.rods.tendons import Reels
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat_hardware.board_link import Transport

@@ -27,8 +27,8 @@ from knode_cosserat.rods.parameters import (
     unknown_parameter,
     value_at,
 )
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rods.wrapped import nominal_model
 
 #: change of a robot by the values of an effect's parameters; equal for all robots of the same parts

@@ -13,8 +13,7 @@ from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.virtual import commands
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.robot_file import load_robot
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 
 #: probability that a robot has an effect
 SHARE = 1.0 / 3.0

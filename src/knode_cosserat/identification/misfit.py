@@ -22,7 +22,7 @@ from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.model import Model, ParametrisedRobot
 from knode_cosserat.identification.steps import stepped
 from knode_cosserat.rods.aspects import Ends
-from knode_cosserat.rods.load_cells import LoadCells
+from knode_cosserat.rods.tendons import LoadCells
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.history import (
     StateHistory,

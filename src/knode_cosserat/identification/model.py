@@ -12,9 +12,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.identification.effects import Change, Effect, Number, Usual, effects_of
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendon_rod import TendonRod
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 
 #: tendon offset of a robot that states none, over its radius
 OFFSET = 5.0

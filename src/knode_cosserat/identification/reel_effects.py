@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.identification.effects import Effect, Number, ReplaceInPart, Usual, register
-from knode_cosserat.rods.reels import Reels
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.routing import Straight
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
+from knode_cosserat.rods.tendons import Reels
 
 #: uncertainty of the wound-up length, as a fraction of the rod's length, and of tendon angles (rad)
 TAKEN_IN, TURN = 0.01, 0.1

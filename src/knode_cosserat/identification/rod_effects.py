@@ -20,8 +20,8 @@ from knode_cosserat.identification.effects import (
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.relaxation import Relaxation
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
 from knode_cosserat.rods.section import Sleeve, Stretch
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rotation import quaternion_of, quaternion_product
 
 #: first natural frequency of a clamped rod: β² with β = 1.8751

@@ -14,8 +14,8 @@ import math
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendons import undelayed
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import BDF2, LIGHTLY_DAMPED, TWO_STAGES, TimeScheme

@@ -8,12 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.identification.effects import Effect, Number, Replace, ReplaceInPart, Usual, register
-from knode_cosserat.rods.anchors import EarlyAnchors
-from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.rods.loads import AttachedMass
-from knode_cosserat.rods.rib_spacing import RibSpacing
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.tendon_friction import TendonFriction, Vibration
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
+from knode_cosserat.rods.tendons import EarlyAnchors, LoadCells, RibSpacing, TendonFriction, Vibration
 
 #: place of the last rib before the tip, if the robot states none
 LAST_RIB = 8.0 / 9.0

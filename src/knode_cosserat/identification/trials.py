@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import simulated_rows
-from knode_cosserat.rods.load_cells import undelayed
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendons import undelayed
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.result import Result, SimulationError

@@ -18,8 +18,7 @@ from knode_cosserat import controls
 from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording, writer_of
-from knode_cosserat.rods.tendon_rod import TendonRod
-from knode_cosserat.rods.virtual_robot import VirtualRobot
+from knode_cosserat.rods.tendon_robots import TendonRod, VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.time import LIGHTLY_DAMPED

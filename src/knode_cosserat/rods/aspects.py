@@ -18,7 +18,7 @@ from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rotation import dot, rotation_matrix
 
 
-class Aspect:
+class _Aspect:
     """Aspect of a system."""
 
     #: makers of the aspect by the class of the systems
@@ -28,7 +28,7 @@ class Aspect:
         self.system = system
 
     def __init_subclass__(cls, of: type | None = None):
-        if Aspect in cls.__bases__:
+        if _Aspect in cls.__bases__:
             cls._makers = {}
         elif of is not None:
             cls.register(of, cls)
@@ -45,7 +45,7 @@ class Aspect:
         return next(filter(None, makers), cls)(system)
 
 
-class Ends(Aspect):
+class Ends(_Aspect):
     """Facts of a system's two ends, beside their conditions (`System.base`, `System.tip`)."""
 
     @property
@@ -73,7 +73,7 @@ class Ends(Aspect):
         return y
 
 
-class Drawing(Aspect):
+class Drawing(_Aspect):
     """Positions, orientations and lines of a system's states."""
 
     def positions(self, y: Any) -> Any:
@@ -98,7 +98,7 @@ class Drawing(Aspect):
         return layout.get(y, name)
 
 
-class Observed(Aspect):
+class Observed(_Aspect):
     """Possible arguments of a learned law or load of a system, beside its control."""
 
     #: velocities among the observables, on which drag and friction depend; empty: not specified

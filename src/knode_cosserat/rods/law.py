@@ -11,7 +11,7 @@ A system states its law in one of these forms (`System.constitutive`):
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 from jaxtyping import Float
 
@@ -93,21 +93,13 @@ class Elastic(NamedTuple):
         return dot(self.softened, strain) - self.stress
 
 
-class Coupling(Protocol):
-    """Nonlinear elastic part that couples the strains, such as tendons beside the rod."""
-
-    def strains(self, elastic: dict[str, Elastic]) -> Fields:
-        """Return the strains of the elastic laws with this part."""
-
-    def stresses(self, strains: Fields) -> Fields:
-        """Return this part's stress for each strain."""
-
-
 class MaterialLaw(NamedTuple):
     """Laws of the strains of z, with their coupling, and of internal variables that depend on them."""
 
     strains: dict[str, Viscoelastic]
-    coupling: Coupling | None = None
+    #: nonlinear elastic part that couples the strains, such as `tendon_law.Tendons`: `strains` of the elastic
+    #: laws with it, and its `stresses` for strains
+    coupling: Any = None
     #: evolutions by field of z, from the strains and their rates
     internal: Callable[[Fields, Fields], dict[str, Evolution]] | None = None
 

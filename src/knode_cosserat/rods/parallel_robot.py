@@ -1,7 +1,7 @@
 """A parallel continuum robot: elastic legs from linear actuators to one rigid platform.
 
 With six legs in pairs the layout is that of Stewart and Gough (Black, Till & Rucker 2018; Till, Aloi & Rucker
-2019). Symbols as in `elastic_rod`, for each leg.
+2019). Symbols as in `rod`, for each leg.
 """
 
 from __future__ import annotations
@@ -16,11 +16,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
-from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.parts import RodPoint
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, Rod
 from knode_cosserat.rods.strands import Bundle, in_strands
 from knode_cosserat.rods.system import Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
@@ -37,8 +36,8 @@ FIELDS = (3, 7, 10, 13, 16)
 class Leg(Rod):
     """The rod between base and platform. Its control is the control of the whole robot."""
 
-    y_layout: ClassVar[Layout] = ElasticRod.y_layout
-    z_layout: ClassVar[Layout] = ElasticRod.z_layout
+    y_layout: ClassVar[Layout] = Y_LAYOUT
+    z_layout: ClassVar[Layout] = Z_LAYOUT
     base_unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
 
     legs: int = eqx.field(static=True, default=6)

@@ -1,7 +1,8 @@
-"""Physical parameters: units, meaning and allowed range, stated once beside each parameter.
+"""Parameters, choices and parts of robots: each is stated once, beside its field.
 
-`System.replace`, robot files and `knode-cosserat info` use the same statement. A robot may also have choices
-(words), and parts: tendons' routings, loads, ends, obstacles, each with its own parameters.
+A statement has the meaning, the unit and the allowed values. `System.replace`, robot files, their JSON Schema
+and `knode-cosserat info` use the same statement: it checks values, reads them from a file, writes them, and
+describes them in the schema.
 """
 
 from __future__ import annotations
@@ -10,14 +11,14 @@ import dataclasses
 import inspect
 import math
 import re
-from collections.abc import Callable, Iterable
-from typing import Any, Literal, Self
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, ClassVar, Literal, Self
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._files.yaml_text import did_you_mean, shown
+from knode_cosserat._files.yaml_text import did_you_mean, flow, shown
 from knode_cosserat._reprs import object_text
 from knode_cosserat.errors import KnodeCosseratError
 
@@ -35,8 +36,6 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
 #: fraction of the rod's length: a place nearer to an end than this is at the end
 AT_END = 1e-9
-
-
 #: largest number of elements of a list in an error message
 MOST_SHOWN = 12
 #: by unit: the typical range
@@ -55,6 +54,9 @@ _OTHER_UNITS: dict[str, dict[str, float]] = {
     "m/s2": {"mm/s2": 1e-3},
     "rad": {"degrees": np.pi / 180.0},
 }
+_SIZES = {"scalar": (), "vector": (3,), "direction": (3,), "quaternion": (4,), "matrix": (3, 3)}
+#: constraint of the schema on an array
+_NOT_ALL_ZERO = {"contains": {"not": {"const": 0}}}
 
 
 def numbers_text(value: Any) -> str:
@@ -79,7 +81,7 @@ def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, 
 
 @dataclasses.dataclass(frozen=True)
 class Parameter:
-    """Specification of one parameter. `low` and `high` bound each number (of a matrix, each eigenvalue)."""
+    """Statement of numbers. `low` and `high` bound each number (of a matrix, each eigenvalue)."""
 
     unit: str
     meaning: str
@@ -106,38 +108,252 @@ class Parameter:
         }[self.shape]
         return f"{kind} {self.bounds}"
 
-    def refusal(self, name: str, given: str, value: Any = None) -> str:
-        """Return the error message for a value: the allowed ones, the given one, and the likely value.
+    def check(self, name: str, value: Any, text: str | None = None) -> None:
+        """Raise `ParameterError` unless a value is allowed; `text` is the value as the user wrote it.
 
-        Args:
-            name: the parameter's name.
-            given: the given value as text.
-            value: the given numbers (an array), if there are any.
+        Tracers have no values and are not checked.
         """
-        size = np.shape(value)
-        if self.shape == "matrix" and size == (3, 3) and not _is_symmetric(value):
-            given = f"{given}, not symmetric"
-        scalar = value is not None and self.shape == "scalar" and size == ()
-        message = f"{name} must be {self.bounds if scalar else self.allowed} (got {given})"
-        if value is None or self.shape == "matrix" or (size == ()) != (self.shape == "scalar"):
-            return message
-        beyond = np.any((value < self.low) | (value > self.high))
-        meant = self._in_other_unit(value) if beyond else None
-        return f"{message}. Did you mean {numbers_text(meant[1])} ({given} {meant[0]})?" if meant else message
+        if (value is None and self.optional) or isinstance(value, jax.core.Tracer):
+            return
+        try:
+            array = np.asarray(value) if not np.ma.is_masked(value) else np.array("masked")
+        except (TypeError, ValueError):
+            array = np.array("ragged")
+        if array.dtype.kind not in "fiu":
+            hint = self._hint_of_text(value) if isinstance(value, str) else ""
+            raise ParameterError(f"{name} must be {self.allowed} (got {text or shown(value)}){hint}")
+        text, size = text or numbers_text(array.tolist()), _SIZES.get(self.shape)
+        if (array.ndim != 1 or array.size == 0) if size is None else array.shape != size:
+            raise ParameterError(f"{name} must be {self.allowed} (got {text})")
+        if self._contains(array):
+            return
+        allowed, hint = self.allowed if array.ndim else self.bounds, ""
+        if self.shape == "matrix":
+            text += "" if _is_symmetric(array) else ", not symmetric"
+        elif np.any((array < self.low) | (array > self.high)):
+            low, high = TYPICAL.get(self.unit, (np.inf, -np.inf))
+            meant = in_other_unit(array, self.unit, max(low, self.low), min(high, self.high))
+            hint = f". Did you mean {numbers_text(meant[1])} ({text} {meant[0]})?" if meant else ""
+        raise ParameterError(f"{name} must be {allowed} (got {text}){hint}")
 
-    def refusal_of_text(self, name: str, text: str) -> str:
-        """Return the error message for a text, such as a number with its unit."""
-        message = f"{name} must be {self.allowed} (got {shown(text)})"
-        found = re.fullmatch(r"([-+.\deE]*\d\.?) *([a-zA-Z][\w/]*)", text.strip())
-        factor = {self.unit: 1.0, **_OTHER_UNITS.get(self.unit, {})}.get(found[2]) if found else None
-        if found is None or factor is None or self.shape != "scalar":
-            return message
-        return f"{message}. Did you mean {numbers_text(float(found[1]) * factor)}?"
+    def _contains(self, array: np.ndarray) -> bool:
+        """True if finite numbers of the right shape are within the bounds."""
+        if not np.all(np.isfinite(array)):
+            return False
+        if self.shape in ("direction", "quaternion") and not math.hypot(*array) > SHORTEST:
+            return False
+        if self.shape == "matrix":
+            if not _is_symmetric(array):
+                return False
+            array = np.linalg.eigvalsh(array)
+        return bool(np.all((self.low <= array) & (array <= self.high)))
 
-    def _in_other_unit(self, value: Any) -> tuple[str, Any] | None:
-        """Return the likely unit of a value and its conversion; None if no conversion would be typical."""
-        low, high = TYPICAL.get(self.unit, (np.inf, -np.inf))
-        return in_other_unit(value, self.unit, max(low, self.low), min(high, self.high))
+    def _hint_of_text(self, text: str) -> str:
+        """Return the hint for a text that is a number with its unit; else an empty string."""
+        match = re.fullmatch(r"([-+.\deE]*\d\.?) *([a-zA-Z][\w/]*)", text.strip())
+        factor = {self.unit: 1.0, **_OTHER_UNITS.get(self.unit, {})}.get(match[2]) if match else None
+        if match is None or factor is None or self.shape != "scalar":
+            return ""
+        return f". Did you mean {numbers_text(float(match[1]) * factor)}?"
+
+    def read(self, name: str, value: Any) -> Any:
+        """Return a value of a file. Raises `ParameterError`."""
+        array = _array(value)
+        if array is not None and self.shape == "matrix" and array.shape in ((), (3,)):
+            array = np.diag(np.broadcast_to(array, 3))
+        if array is None and not isinstance(value, str):
+            array = np.asarray(None)
+        self.check(name, value if array is None else array, shown(value))
+        return value
+
+    def written(self, value: Any) -> str:
+        """Return numbers in the shortest form that reads back equal: one for a multiple of the identity."""
+        array = np.asarray(value, dtype=float)
+        if array.shape == (3, 3) and np.array_equal(array, np.diag(np.diag(array))):
+            array = np.diag(array)
+            array = array[0] if np.all(array == array[0]) else array
+        return flow(array.tolist())
+
+    def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
+        """Return the JSON Schema of the values."""
+        one: Any = {"type": "number", "minimum": self.low, "maximum": self.high}
+        shape: Any = {
+            "scalar": one,
+            "list": {"type": "array", "items": one, "minItems": 1},
+            "matrix": {"anyOf": [one, _tuple([one] * 3), _square(one, self.high)]},
+        }.get(self.shape)
+        if shape is None:
+            shape = {"type": "array", "items": one, **_count(_SIZES[self.shape][0])}
+            shape |= {} if self.shape == "vector" else _NOT_ALL_ZERO
+        unit = f" ({self.unit})" if self.unit else ""
+        stated = {**_or_null(shape, self.optional), "description": f"{self.meaning}{unit}"}
+        if default is not dataclasses.MISSING and default is not None:
+            stated["default"] = np.asarray(default, dtype=float).tolist()
+        return stated
+
+
+def _is_symmetric(array: np.ndarray) -> bool:
+    return np.allclose(array, array.T, rtol=1e-9, atol=0.0)
+
+
+def _array(value: Any) -> np.ndarray | None:
+    """Return a number, a list of numbers or a list of lists as an array; None for anything else."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        try:
+            return np.asarray(float(value))
+        except OverflowError:
+            return np.asarray(np.inf)
+    if not isinstance(value, list) or not value:
+        return None
+    # no allowed value is deeper than a list of lists; a file could nest without end
+    if any(isinstance(inner, list) for row in value if isinstance(row, list) for inner in row):
+        return None
+    rows = [_array(row) for row in value]
+    if any(row is None for row in rows) or len({row.shape for row in rows if row is not None}) > 1:
+        return None
+    return np.array(rows, dtype=float)
+
+
+def _count(count: int) -> dict[str, int]:
+    return {"minItems": count, "maxItems": count}
+
+
+def _tuple(items: list[Any]) -> dict[str, Any]:
+    return {"type": "array", "prefixItems": items, **_count(len(items))}
+
+
+def _square(one: Any, high: float) -> dict[str, Any]:
+    """Schema of a 3x3 matrix: diagonal within the eigenvalues' bounds, entries within the upper one."""
+    other = {"type": "number", "minimum": -high, "maximum": high}
+    return _tuple([_tuple([one if row == column else other for column in range(3)]) for row in range(3)])
+
+
+def _or_null(shape: dict[str, Any], optional: bool) -> dict[str, Any]:
+    return {"anyOf": [shape, {"type": "null"}]} if optional else shape
+
+
+@dataclasses.dataclass(frozen=True)
+class Choice:
+    """Statement of a field that holds one or several of a set of words."""
+
+    meaning: str
+    allowed: tuple[Any, ...]
+    many: bool
+
+    optional: ClassVar[bool] = False
+
+    @property
+    def words(self) -> str:
+        """Description of the allowed values."""
+        listed = ", ".join(str(value).lower() for value in self.allowed)
+        return f"a list of different ones of {listed}" if self.many else listed
+
+    def check(self, name: str, value: Any, text: str | None = None) -> None:
+        """Raise `ParameterError` unless a value is one of the words, or a collection of different ones."""
+        several = [value] if not self.many else list(value) if isinstance(value, tuple | list) else [None]
+        # also compare the class: 1 is not True
+        known = [any(type(one) is type(word) and one == word for word in self.allowed) for one in several]
+        if not all(known) or len({str(one) for one in several}) < len(several):
+            raise ParameterError(f"{name} is {text or repr(value)}; allowed is {self.words}")
+
+    def read(self, name: str, value: Any) -> Any:
+        """Return a value of a file. Raises `ParameterError`."""
+        self.check(name, value, shown(value))
+        return value
+
+    def written(self, value: Any) -> str:
+        """Return the text of a value in a file."""
+        return flow(list(value) if isinstance(value, tuple) else value)
+
+    def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
+        """Return the JSON Schema of the values."""
+        one: dict[str, Any] = {"enum": list(self.allowed)}
+        if self.many:
+            one, default = {"type": "array", "items": one, "uniqueItems": True}, list(default)
+        return {**one, "description": self.meaning, "default": default}
+
+
+@dataclasses.dataclass(frozen=True)
+class Slot:
+    """Statement of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
+
+    meaning: str
+    family: Any
+    many: bool
+    optional: bool
+
+    def check(self, name: str, value: Any, text: str | None = None) -> None:
+        """Raise `ParameterError` unless a value is a part of the family, or parts."""
+        if value is None and self.optional:
+            return
+        for part in value if self.many and isinstance(value, tuple) else (value,):
+            if not isinstance(part, self.family):
+                family = self.family.__name__.lower()
+                raise ParameterError(f"{name} holds a {type(part).__name__}; allowed is a {family}")
+
+    def read(self, name: str, value: Any) -> Any:
+        """Return a part from a mapping with its kind, or parts from a list. Raises `ParameterError`."""
+        if not self.many:
+            return self._part(name, value)
+        if not isinstance(value, list):
+            known = ", ".join(kinds_of(self.family))
+            raise ParameterError(
+                f"{name} is {shown(value)}; allowed is a list of mappings, each with a kind: {known}"
+            )
+        return tuple(self._part(f"{name}.{k}", one) for k, one in enumerate(value))
+
+    def _part(self, name: str, value: Any) -> Any:
+        known = kinds_of(self.family)
+        names = ", ".join(known)
+        if not isinstance(value, dict) or "kind" not in value:
+            raise ParameterError(f"{name} is {shown(value)}; allowed is a mapping with a kind: {names}")
+        kind = value["kind"]
+        if not isinstance(kind, str) or kind not in known:
+            hint = did_you_mean(kind, known)
+            raise ParameterError(f"{name}.kind is {shown(kind)}; allowed is {names}{hint}")
+        return read_object(known[kind], {key: value[key] for key in value if key != "kind"}, name)
+
+    def written(self, value: Any) -> str:
+        """Return the text of a part in a file, or lines of several."""
+        if not self.many:
+            return _part_text(value)
+        return "".join(f"\n    - {_part_text(part)}" for part in value)
+
+    def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
+        """Return the JSON Schema of the values; the family's is added to `families`."""
+        family = self.family.__name__.lower()
+        if family not in families:
+            kinds = kinds_of(self.family)
+            families[family] = {}  # before its members, which may hold parts of the same family
+            for kind, cls in kinds.items():
+                made = object_schema(cls, families, kind={"const": kind, "description": "what it is"})
+                families[f"{family}.{kind}"] = {**made, "required": ["kind", *made["required"]]}
+            families[family] = {
+                "type": "object",
+                "required": ["kind"],
+                "properties": {"kind": {"enum": list(kinds)}},
+                "allOf": [schema_if_kind(kind, {"$ref": f"#/$defs/{family}.{kind}"}) for kind in kinds],
+            }
+        one: dict[str, Any] = {"$ref": f"#/$defs/{family}"}
+        if self.many:
+            one = {"type": "array", "items": one}
+            # an absent key means none, so an empty list is refused
+            one |= {"minItems": 1} if self.optional else {}
+        return {**_or_null(one, self.optional), "description": self.meaning}
+
+
+def schema_if_kind(kind: str, schema: dict[str, Any]) -> dict[str, Any]:
+    """Return a schema that applies to mappings of a kind."""
+    return {"if": {"properties": {"kind": {"const": kind}}, "required": ["kind"]}, "then": schema}
+
+
+# fields with statements
+
+
+def _field(stated: Any, default: Any, convert: Callable[[Any], Any] | None = None, **options: Any) -> Any:
+    options |= {} if default is dataclasses.MISSING else {"default": default}
+    options |= {} if convert is None else {"converter": convert}
+    return eqx.field(metadata={"stated": stated}, **options)
 
 
 def parameter(
@@ -151,8 +367,7 @@ def parameter(
 ) -> Any:
     """Return a dataclass field for a physical parameter (see `Parameter`); default None makes it optional."""
     stated = Parameter(unit, meaning, shape, low, high, optional=default is None)
-    extra = {} if default is dataclasses.MISSING else {"default": default}
-    return eqx.field(converter=_converter(stated), metadata={"parameter": stated}, **extra)
+    return _field(stated, default, _as_matrix if shape == "matrix" else _as_array)
 
 
 def place(
@@ -160,74 +375,98 @@ def place(
 ) -> Any:
     """Return a field for a place on the rod, as a fraction of its length. It is static, not traced."""
     stated = Parameter("", f"{meaning}, as a part of the length", "scalar", low, 1.0, optional=False)
-    extra: dict[str, Any] = {} if default is dataclasses.MISSING else {"default": default}
-    return eqx.field(
-        static=True, kw_only=kw_only, converter=_place_number, metadata={"parameter": stated}, **extra
-    )
+    return _field(stated, default, _as_place, static=True, kw_only=kw_only)
 
 
 def places(meaning: str) -> Any:
     """Return an optional field for several places on the rod, as fractions of its length; static."""
     stated = Parameter("", f"{meaning}, as parts of the length", "list", 0.0, 1.0, optional=True)
-    return eqx.field(static=True, default=None, converter=_place_numbers, metadata={"parameter": stated})
-
-
-@dataclasses.dataclass(frozen=True)
-class Choice:
-    """Specification of a field that holds one or several of a set of words."""
-
-    meaning: str
-    allowed: tuple[Any, ...]
-    many: bool
-
-    def allows(self, value: Any) -> bool:
-        """True if a value is one of the allowed words, or a collection of different ones."""
-        if self.many and not isinstance(value, tuple | list):
-            return False
-        several = list(value) if self.many else [value]
-        # also compare the class: 1 is not True
-        known = all(
-            any(type(each) is type(word) and each == word for word in self.allowed) for each in several
-        )
-        return known and len({str(each) for each in several}) == len(several)
-
-    @property
-    def words(self) -> str:
-        """Description of the allowed values."""
-        listed = ", ".join(str(value).lower() for value in self.allowed)
-        return f"a list of different ones of {listed}" if self.many else listed
+    return _field(
+        stated, None, lambda value: _as_tuple(value, (tuple, list, np.ndarray), _as_place), static=True
+    )
 
 
 def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
     """Return a dataclass field with one of the allowed words, or several if the default is a tuple."""
     stated = Choice(meaning, allowed, isinstance(default, tuple))
-    convert = (lambda given: tuple(given) if isinstance(given, list) else given) if stated.many else None
-    extra: dict[str, Any] = {} if convert is None else {"converter": convert}
-    return eqx.field(static=True, default=default, metadata={"choice": stated}, **extra)
-
-
-@dataclasses.dataclass(frozen=True)
-class Slot:
-    """Specification of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
-
-    meaning: str
-    family: type
-    many: bool
-    optional: bool
+    return _field(stated, default, _as_tuple if stated.many else None, static=True)
 
 
 def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
     """Return a dataclass field for a part, or parts (see `parts.Part`); default None makes it optional."""
-    stated = Slot(meaning, family, many, optional=default is None)
 
-    def several(given: Any) -> Any:
-        if isinstance(given, family):
-            return (given,)
-        return tuple(given) if isinstance(given, list) else given
+    def several(value: Any) -> Any:
+        return (value,) if isinstance(value, family) else _as_tuple(value)
 
-    convert = several if many else None
-    extra: dict[str, Any] = {} if convert is None else {"converter": convert}
-    return eqx.field(default=default, metadata={"part": stated}, **extra)
+    return _field(Slot(meaning, family, many, optional=default is None), default, several if many else None)
+
+
+# Converters do not know the name of their field: a value that they cannot convert stays for `check`.
+
+
+def _as_array(value: Any) -> Any:
+    """Return numbers as an array of floats."""
+    if value is None or isinstance(value, jax.core.Tracer):
+        return value
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError):  # a ragged list
+        return value
+    return array.astype(float) if array.dtype.kind in "fiu" else value
+
+
+def _as_matrix(value: Any) -> Any:
+    """Return one number or three as a diagonal matrix."""
+    value = _as_array(value)
+    if not isinstance(value, np.ndarray | jax.Array) or value.dtype.kind not in "fiu":
+        return value
+    if value.shape == ():
+        return value * np.eye(3)
+    numeric = np if isinstance(value, np.ndarray) else jax.numpy
+    return numeric.diag(value) if value.shape == (3,) else value
+
+
+def _as_place(value: Any) -> Any:
+    """Return a place as a float, which can be compared and hashed; exactly at an end if within `AT_END`."""
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return value
+    return next((end for end in (0.0, 1.0) if abs(value - end) < AT_END), float(value))
+
+
+def _as_tuple(value: Any, kinds: Any = list, convert: Callable[[Any], Any] = lambda one: one) -> Any:
+    return tuple(map(convert, value)) if isinstance(value, kinds) else value
+
+
+# classes with statements
+
+
+def stated_of(cls: type, kind: Any = object) -> dict[str, Any]:
+    """Return the statements of a class's fields by name, or those of one kind."""
+    stated = {field.name: field.metadata.get("stated") for field in dataclasses.fields(cls)}
+    return {name: one for name, one in stated.items() if one is not None and isinstance(one, kind)}
+
+
+def parameters_of(cls: type) -> dict[str, Parameter]:
+    """Return the parameters of a class, by name."""
+    return stated_of(cls, Parameter)
+
+
+def slots_of(cls: type) -> dict[str, Slot]:
+    """Return the slots for parts of a class, by name."""
+    return stated_of(cls, Slot)
+
+
+def kinds_of(family: type) -> dict[str, type]:
+    """Return the classes of a family that robot files can name: the family and its subclasses."""
+    kinds = {} if inspect.isabstract(family) or not family.kind else {family.kind: family}  # type: ignore[attr-defined]
+    for cls in family.__subclasses__():
+        kinds |= kinds_of(cls)
+    return dict(sorted(kinds.items()))
+
+
+def in_order(cls: type) -> dict[str, Any]:
+    """Return the statements of a class by name: parameters, then choices, then parts."""
+    return parameters_of(cls) | stated_of(cls, Choice) | slots_of(cls)
 
 
 class Parametrised(eqx.Module):
@@ -238,9 +477,9 @@ class Parametrised(eqx.Module):
         for name in given.keys() - {field.name for field in dataclasses.fields(cls)}:
             # a class may define its own constructor
             stated = inspect.signature(cls.__init__).parameters
-            if name in stated or any(each.kind is each.VAR_KEYWORD for each in stated.values()):
+            if name in stated or any(one.kind is one.VAR_KEYWORD for one in stated.values()):
                 continue
-            raise ParameterError(unknown_parameter(cls, name, [each for each in stated if each != "self"]))
+            raise ParameterError(unknown_parameter(cls, name, [one for one in stated if one != "self"]))
         return super().__new__(cls, *args, **given)
 
     @classmethod
@@ -261,126 +500,85 @@ def unknown_parameter(cls: type, name: Any, known: Iterable[str]) -> str:
     )
 
 
-def choices_of(cls: type) -> dict[str, Choice]:
-    """Return the choices of a class, by name."""
-    return _stated(cls, "choice")
-
-
-def slots_of(cls: type) -> dict[str, Slot]:
-    """Return the slots for parts of a class, by name."""
-    return _stated(cls, "part")
-
-
 def check_fields(owner: Any) -> None:
     """Raise `ParameterError` unless all parameters, choices and parts of an object are allowed."""
-    for name, parameter in parameters_of(type(owner)).items():
-        checked(name, getattr(owner, name), parameter)
-    for name, stated in choices_of(type(owner)).items():
-        given = getattr(owner, name)
-        if not stated.allows(given):
-            raise ParameterError(f"{name} is {given!r}; allowed is {stated.words}")
-    for name, slot in slots_of(type(owner)).items():
-        given = getattr(owner, name)
-        several = given if slot.many and isinstance(given, tuple) else (given,)
-        if given is None and slot.optional:
-            continue
-        for each in several:
-            if not isinstance(each, slot.family):
-                found = type(each).__name__
-                raise ParameterError(f"{name} holds a {found}; allowed is a {slot.family.__name__.lower()}")
+    for name, stated in in_order(type(owner)).items():
+        stated.check(name, getattr(owner, name))
 
 
-def parameters_of(cls: type) -> dict[str, Parameter]:
-    """Return the parameters of a class, by name."""
-    return _stated(cls, "parameter")
+# mappings of files
 
 
-def _stated(cls: type, what: str) -> dict[str, Any]:
-    stated = {field.name: field.metadata.get(what) for field in dataclasses.fields(cls)}
-    return {name: each for name, each in stated.items() if each is not None}
+def require_keys(mapping: Mapping[Any, Any], known: Iterable[str], required: Iterable[str]) -> None:
+    """Raise `ParameterError` for a key of a mapping that is unknown, or missing."""
+    known, required = list(known), list(required)
+    for key in mapping:
+        if key not in known:
+            raise ParameterError(
+                f"the key {shown(key)} is unknown; allowed is {', '.join(known)}{did_you_mean(key, known)}"
+            )
+    for key in required:
+        if key not in mapping:
+            raise ParameterError(f"the key {key!r} is missing; required is {', '.join(required)}")
 
 
-def checked(name: str, value: Any, parameter: Parameter) -> None:
-    """Raise `ParameterError` unless the value is allowed. Tracers have no values and are not checked."""
-    if value is None and parameter.optional:
-        return
-    if isinstance(value, jax.core.Tracer):
-        return
-    expected = {"scalar": (), "vector": (3,), "direction": (3,), "quaternion": (4,), "matrix": (3, 3)}.get(
-        parameter.shape
-    )
+def read_object(cls: type, values: Mapping[Any, Any], name: str) -> Any:
+    """Return an object from the mapping of its parameters, choices and parts in a file.
+
+    `name` is that of its field, such as `loads.0`; empty for the robot itself. Raises `ParameterError`.
+    """
+    stated = in_order(cls)
+    # an empty optional value counts as absent
+    values = {k: v for k, v in values.items() if v is not None or k not in stated or not stated[k].optional}
+    defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+    required = [key for key in parameters_of(cls) if defaults[key] is dataclasses.MISSING]
     try:
-        array = np.asarray(value) if not np.ma.is_masked(value) else np.array("masked")
-    except (TypeError, ValueError):
-        array = np.array("ragged")
-    if array.dtype.kind not in "fiu":
-        if isinstance(value, str):
-            raise ParameterError(parameter.refusal_of_text(name, value))
-        raise ParameterError(parameter.refusal(name, shown(value)))
-    if (array.ndim != 1 or array.size == 0) if expected is None else array.shape != expected:
-        raise ParameterError(parameter.refusal(name, numbers_text(array.tolist())))
-    if not _is_within(array, parameter):
-        raise ParameterError(parameter.refusal(name, numbers_text(array.tolist()), array))
+        require_keys(values, [*stated, *(() if name else ("nodes",))], required)
+    except ParameterError as error:
+        raise ParameterError(f"{name or 'parameters'}: {error}") from None
+    inner, fields = f"{name}." if name else "", {}
+    for key, value in values.items():
+        if key in stated:
+            fields[key] = stated[key].read(inner + key, value)
+        elif isinstance(value, int) and not isinstance(value, bool):
+            fields[key] = value
+        else:
+            raise ParameterError(f"{key} is {shown(value)}; allowed is a whole number, 2 or more")
+    try:
+        return cls(**fields)
+    except ParameterError as error:
+        raise ParameterError(f"{name}: {error}" if name else str(error)) from None
 
 
-def _is_symmetric(array: np.ndarray) -> bool:
-    return np.allclose(array, array.T, rtol=1e-9, atol=0.0)
+def _part_text(part: Any) -> str:
+    """Return a part's text on one line."""
+    if not part.kind:
+        raise ParameterError(
+            f"a {type(part).__name__} cannot be written to a robot file: it is made of code, not of numbers"
+        )
+    defaults = {field.name: field.default for field in dataclasses.fields(part)}
+    entries = [f"kind: {part.kind}"]
+    for name, stated in in_order(type(part)).items():
+        value = getattr(part, name)
+        if value is not None and not np.array_equal(value, defaults[name]):
+            entries.append(f"{name}: {stated.written(value)}")
+    return "{" + ", ".join(entries) + "}"
 
 
-def _is_within(array: np.ndarray, parameter: Parameter) -> bool:
-    """True if numbers of the right shape are allowed."""
-    if not np.all(np.isfinite(array)):
-        return False
-    if parameter.shape in ("direction", "quaternion") and not math.hypot(*array) > SHORTEST:
-        return False
-    if parameter.shape == "matrix":
-        if not _is_symmetric(array):
-            return False
-        array = np.linalg.eigvalsh(array)
-    return bool(np.all((parameter.low <= array) & (array <= parameter.high)))
-
-
-def _converter(parameter: Parameter) -> Callable[[Any], Any]:
-    def convert(value: Any) -> Any:
-        if value is None or isinstance(value, jax.core.Tracer):
-            return _as_matrix(value) if parameter.shape == "matrix" and value is not None else value
-        try:
-            array = np.asarray(value)
-        except (TypeError, ValueError):  # a ragged list
-            return value  # `checked` names it: a converter does not know the parameter's name
-        if array.dtype.kind not in "fiu":
-            return value
-        array = array.astype(float)
-        return _as_matrix(array) if parameter.shape == "matrix" else array
-
-    return convert
-
-
-def _plain_number(value: Any) -> Any:
-    """Return a number as a Python float, which can be compared and hashed; `checked` judges anything else."""
-    return (
-        float(value) if isinstance(value, int | float | np.number) and not isinstance(value, bool) else value
-    )
-
-
-def _place_number(value: Any) -> Any:
-    """Return a place as a Python float, rounded to an end of the rod if it is within `AT_END` of it."""
-    number = _plain_number(value)
-    near = [end for end in (0.0, 1.0) if isinstance(number, float) and abs(number - end) < AT_END]
-    return near[0] if near else number
-
-
-def _place_numbers(value: Any) -> Any:
-    """Return places as a tuple, which can be compared and hashed; `checked` judges anything else."""
-    return tuple(map(_place_number, value)) if isinstance(value, tuple | list | np.ndarray) else value
-
-
-def _as_matrix(value: Any) -> Any:
-    """Return one number or three as a diagonal matrix; `checked` judges anything else."""
-    numeric = np if isinstance(value, np.ndarray) else jax.numpy
-    if value.shape == ():
-        return value * np.eye(3)
-    return numeric.diag(value) if value.shape == (3,) else value
+def object_schema(cls: type, families: dict[str, Any], **more: Any) -> dict[str, Any]:
+    """Return the JSON Schema of a class's mapping; the families of its parts are added to `families`."""
+    defaults = {field.name: field.default for field in dataclasses.fields(cls)}
+    known = {name: one.schema(defaults[name], families) for name, one in in_order(cls).items()}
+    if {"begin", "end"} <= known.keys():
+        # begin < end leaves no room for these values
+        known["begin"]["exclusiveMaximum"], known["end"]["exclusiveMinimum"] = 1.0, 0.0
+    return {
+        "type": "object",
+        "description": (cls.__doc__ or cls.__name__).splitlines()[0],
+        "properties": known | more,
+        "required": [name for name in parameters_of(cls) if defaults[name] is dataclasses.MISSING],
+        "additionalProperties": False,
+    }
 
 
 # names with dots, such as `loads.0.mass`

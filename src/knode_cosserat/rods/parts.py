@@ -10,7 +10,6 @@ class: an `Effect` for any rod, or a load, a section, an obstacle.
 from __future__ import annotations
 
 import functools
-import inspect
 from typing import Any, ClassVar, NamedTuple, Self
 
 from jaxtyping import Float
@@ -183,15 +182,3 @@ def require_stretch(begin: Any, end: Any, who: str) -> None:
     """Raise `ParameterError` unless a section of the rod ends beyond its beginning."""
     if not end > begin:
         raise ParameterError(f"{who}: end is {end:g}; allowed is a place beyond begin, {begin:g}")
-
-
-def kinds_of(family: type) -> dict[str, type[Part]]:
-    """Return the classes of a family that robot files can name: the family and its subclasses."""
-    found: dict[str, type[Part]] = {}
-    cls: Any = family
-    each: Any
-    if getattr(cls, "kind", "") and not inspect.isabstract(cls):
-        found[cls.kind] = cls
-    for each in family.__subclasses__():
-        found |= kinds_of(each)
-    return dict(sorted(found.items()))

@@ -15,20 +15,27 @@ from typing import Any, ClassVar
 from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw, MaxwellBranch
-from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.parts import Contribution, Effect, RodPoint
+from knode_cosserat.rods.parameters import choice, parameter
+from knode_cosserat.rods.parts import Effect, RodPoint
 
 MEANINGS = {"v": ("1", "v of the dashpot"), "u": ("1/m", "curvature of the dashpot")}
 
 
-class Branches(Contribution):
-    """Maxwell branches beside the laws of strains; z then has the strains of their dashpots."""
+class Relaxation(Effect):
+    """Relaxation of bending and twisting, or of all strains; z then has the strains of the dashpots."""
 
-    #: strains with a branch
-    strains: ClassVar[tuple[str, ...]]
-    #: r and T (s)
-    stiffness: Any
-    time: Any
+    kind: ClassVar[str] = "relaxation"
+
+    stiffness: Any = parameter(
+        "", "r, stiffness of the Maxwell branch over the stiffness at rest", low=0.0, high=1e3
+    )
+    time: Any = parameter("s", "T, relaxation time of the branch", low=1e-6, high=1e6, default=1.0)
+    shear: bool = choice("whether shear and extension relax too", (False, True), False)
+
+    @property
+    def strains(self) -> tuple[str, ...]:
+        """Names of the strains with a branch."""
+        return ("v", "u") if self.shear else ("u",)
 
     def z_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
         """Return the dashpots' strains."""
@@ -48,15 +55,3 @@ class Branches(Contribution):
             branch = MaxwellBranch(f"{name}_branch", self.stiffness * strain.stiffness, self.time)
             law = law.with_strain(name, strain._replace(branch=branch))
         return law
-
-
-class Relaxation(Branches, Effect):
-    """Relaxation of bending and twisting; z then has the curvature of the branch's dashpot."""
-
-    kind: ClassVar[str] = "relaxation"
-    strains: ClassVar[tuple[str, ...]] = ("u",)
-
-    stiffness: Any = parameter(
-        "", "r, stiffness of the Maxwell branch over the stiffness at rest", low=0.0, high=1e3
-    )
-    time: Any = parameter("s", "T, relaxation time of the branch", low=1e-6, high=1e6, default=1.0)

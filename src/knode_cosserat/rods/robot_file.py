@@ -1,4 +1,4 @@
-"""Robots as YAML files, and the catalog of robots in the package.
+"""Robots as YAML files, their JSON Schema, and the catalog of robots in the package.
 
     format: 1
     kind: tendon-robot
@@ -7,13 +7,12 @@
       length: 0.635  # m
       …
 
-The kind's class states names, units and allowed values (`System.parameters`). Reading runs no code. Numbers
-follow YAML 1.2: `2.7e9` is a number and `1:30` is not.
+The kind's class states names, units and allowed values (`parameters`). Reading runs no code. Numbers follow
+YAML 1.2: `2.7e9` is a number and `1:30` is not.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import difflib
 import importlib.resources
 import os
@@ -23,31 +22,33 @@ from pathlib import Path
 from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.rods.ends import End
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
-    Parameter,
     ParameterError,
-    Slot,
-    checked,
-    choices_of,
+    in_order,
+    kinds_of,
+    object_schema,
     parameters_of,
-    slots_of,
+    read_object,
+    require_keys,
+    schema_if_kind,
 )
-from knode_cosserat.rods.parts import kinds_of
-from knode_cosserat.rods.routed_robot import RoutedTendonRobot
-from knode_cosserat.rods.slender_rod import SlenderRod
-from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendon_robot import TendonRobot
-from knode_cosserat.rods.virtual_robot import VirtualRobot
+from knode_cosserat.rods.rod import SlenderRod
+from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES, System, is_traced
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot, VirtualRobot
 
 #: formats of files. The first had numbers only; a robot without choices and parts is still written in it
 FORMATS = (1, 2)
+
+#: keys of a file, and those that it must have
+KEYS = ("format", "kind", "description", "parameters", "hardware")
+REQUIRED = ("format", "kind", "parameters")
 
 #: classes that a file can name as its kind
 KINDS: dict[str, type[System]] = {
@@ -158,138 +159,47 @@ def _text(file: Traversable, source: str) -> str:
 def parse_robot(text: str, source: str) -> System:
     """Return the robot of a file's text; `source` names the file in errors. Raises `RobotFileError`."""
     file = _mapping(text, source)
+    try:
+        return _robot(file)
+    except ParameterError as error:
+        raise RobotFileError(f"{source}: {error}") from None
+
+
+def _robot(file: dict[Any, Any]) -> System:
     number = file.get("format", FORMATS[0])
     if isinstance(number, bool) or number not in FORMATS:
-        raise RobotFileError(
-            f"{source}: format is {shown(number)}; allowed is {' or '.join(map(str, FORMATS))}, "
+        raise ParameterError(
+            f"format is {shown(number)}; allowed is {' or '.join(map(str, FORMATS))}, "
             "the formats that this version reads"
         )
-    known = ("format", "kind", "description", "parameters", "hardware")
-    _require_keys(file, source, known=known, required=("format", "kind", "parameters"))
+    for key in file:
+        if key not in KEYS and any(key in parameters_of(kind) for kind in KINDS.values()):
+            raise ParameterError(
+                f"the key {shown(key)} is unknown; allowed is {', '.join(KEYS)}; "
+                "a robot's parameters belong under the key parameters"
+            )
+    require_keys(file, KEYS, REQUIRED)
     for key in ("kind", "description"):
         if not isinstance(file.get(key, ""), str):
-            raise RobotFileError(f"{source}: {key} is {shown(file[key])}; allowed is text")
+            raise ParameterError(f"{key} is {shown(file[key])}; allowed is text")
     # the machine around the rod, which drivers read
     if not isinstance(file.get("hardware", {}), dict | None):
-        raise RobotFileError(f"{source}: hardware is {shown(file['hardware'])}; allowed is a mapping")
+        raise ParameterError(f"hardware is {shown(file['hardware'])}; allowed is a mapping")
     kind, values = file["kind"], file["parameters"]
     if kind not in KINDS:
-        raise RobotFileError(
-            f"{source}: kind is {kind!r}; allowed is {', '.join(KINDS)}{did_you_mean(kind, KINDS)}"
-        )
+        raise ParameterError(f"kind is {kind!r}; allowed is {', '.join(KINDS)}{did_you_mean(kind, KINDS)}")
     if not isinstance(values, dict):
-        raise RobotFileError(
-            f"{source}: parameters is {shown(values)}; allowed is a mapping from names to values"
-        )
-    return _robot(KINDS[kind], values, source)
+        raise ParameterError(f"parameters is {shown(values)}; allowed is a mapping from names to values")
+    robot: System = read_object(KINDS[kind], values, "")
+    return robot
 
 
-def _robot(cls: type[System], values: dict[Any, Any], source: str) -> System:
-    made = _made(cls, values, source, "parameters", more=("nodes",))
-    assert isinstance(made, System)
-    return made
-
-
-def _made(cls: type, values: dict[Any, Any], source: str, where: str, more: tuple[str, ...] = ()) -> Any:
-    """Return an object of a class from a mapping of its parameters, choices and parts."""
-    numbers, words, parts = parameters_of(cls), choices_of(cls), slots_of(cls)
-    # an empty optional value counts as absent
-    optional = {name for name, each in (numbers | parts).items() if each.optional}
-    values = {key: value for key, value in values.items() if value is not None or key not in optional}
-    fields = {field.name: field for field in dataclasses.fields(cls)}
-    required = [key for key in numbers if fields[key].default is dataclasses.MISSING]
-    _require_keys(values, f"{source}: {where}", known=(*numbers, *words, *parts, *more), required=required)
-    given: dict[str, Any] = {}
-    inner = "" if where == "parameters" else f"{where}."
-    for key, value in values.items():
-        if key in numbers:
-            _require_allowed(inner + key, value, numbers[key], source)
-        elif key in parts:
-            value = _parts(value, parts[key], source, inner + key)
-        elif key not in words and (not isinstance(value, int) or isinstance(value, bool)):
-            raise RobotFileError(f"{source}: {key} is {shown(value)}; allowed is a whole number, 2 or more")
-        elif key in words and not words[key].allows(value):
-            raise RobotFileError(f"{source}: {inner}{key} is {shown(value)}; allowed is {words[key].words}")
-        given[key] = value
+def _mapping(text: str, source: str) -> dict[Any, Any]:
+    """Return the file's outermost mapping."""
     try:
-        return cls(**given)
-    except ParameterError as error:
-        raise RobotFileError(f"{source}: {inner and where + ': '}{error}") from None
-
-
-def _parts(value: Any, slot: Slot, source: str, where: str) -> Any:
-    """Return a part from a mapping with its kind, or parts from a list of such mappings."""
-    known = kinds_of(slot.family)
-    names = ", ".join(known)
-    if slot.many:
-        if not isinstance(value, list):
-            raise RobotFileError(
-                f"{source}: {where} is {shown(value)}; "
-                f"allowed is a list of mappings, each with a kind: {names}"
-            )
-        one = dataclasses.replace(slot, many=False)
-        return tuple(_parts(each, one, source, f"{where}.{k}") for k, each in enumerate(value))
-    if not isinstance(value, dict) or "kind" not in value:
-        raise RobotFileError(
-            f"{source}: {where} is {shown(value)}; allowed is a mapping with a kind: {names}"
-        )
-    kind = value["kind"]
-    if not isinstance(kind, str) or kind not in known:
-        raise RobotFileError(
-            f"{source}: {where}.kind is {shown(kind)}; allowed is {names}{did_you_mean(kind, known)}"
-        )
-    return _made(known[kind], {key: each for key, each in value.items() if key != "kind"}, source, where)
-
-
-def _require_keys(mapping: dict[Any, Any], source: str, *, known: Any, required: Any) -> None:
-    for key in mapping:
-        if key not in known:
-            hint = did_you_mean(key, known)
-            if "parameters" in known and any(key in parameters_of(kind) for kind in KINDS.values()):
-                hint = "; a robot's parameters belong under the key parameters"
-            raise RobotFileError(
-                f"{source}: the key {shown(key)} is unknown; allowed is {', '.join(known)}{hint}"
-            )
-    missing = [key for key in required if key not in mapping]
-    if missing:
-        raise RobotFileError(
-            f"{source}: the key {missing[0]!r} is missing; required is {', '.join(required)}"
-        )
-
-
-# values
-
-
-def _require_allowed(key: str, value: Any, parameter: Parameter, source: str) -> None:
-    array = _array(value)
-    if array is not None and parameter.shape == "matrix" and array.shape in ((), (3,)):
-        array = np.diag(np.broadcast_to(array, 3))
-    try:
-        checked(key, np.asarray(None) if array is None else array, parameter)
-    except ParameterError:
-        text = isinstance(value, str)
-        message = (
-            parameter.refusal_of_text(key, value) if text else parameter.refusal(key, shown(value), array)
-        )
-        raise RobotFileError(f"{source}: {message}") from None
-
-
-def _array(value: Any) -> np.ndarray | None:
-    """Return a number, a list of numbers or a list of lists as an array; None for anything else."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
-            return np.asarray(float(value))
-        except OverflowError:
-            return np.asarray(np.inf)
-    if not isinstance(value, list) or not value:
-        return None
-    # no allowed value is deeper than a list of lists; a file could nest without end
-    if any(isinstance(inner, list) for row in value if isinstance(row, list) for inner in row):
-        return None
-    rows = [_array(row) for row in value]
-    if any(row is None for row in rows) or len({row.shape for row in rows if row is not None}) > 1:
-        return None
-    return np.array(rows, dtype=float)
+        return mapping_of(text, "format, kind and parameters")
+    except YAMLTextError as error:
+        raise RobotFileError(f"{source}: {error}") from None
 
 
 # robot to text
@@ -305,7 +215,7 @@ def format_robot(robot: System, description: str = "") -> str:
         )
     if np.ndim(robot.length):
         raise RobotFileError("a batch of robots cannot be written to one robot file; write them one by one")
-    if any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(robot)):
+    if is_traced(robot):
         raise RobotFileError("a robot cannot be written to a file inside jit, grad or vmap")
     more = more_of(robot)
     head = {"format": FORMATS[1 if more else 0], "kind": kind, "description": description}
@@ -314,7 +224,7 @@ def format_robot(robot: System, description: str = "") -> str:
     for name, parameter in robot.parameters().items():
         value = getattr(robot, name)
         if value is not None:
-            lines.append(f"  {name}: {flow(_plain(value))}  # {parameter.unit}, {parameter.meaning}")
+            lines.append(f"  {name}: {parameter.written(value)}  # {parameter.unit}, {parameter.meaning}")
     lines.append(f"  nodes: {robot.nodes}  # base and tip included")
     return "\n".join(lines + more) + "\n"
 
@@ -322,62 +232,66 @@ def format_robot(robot: System, description: str = "") -> str:
 def more_of(robot: System) -> list[str]:
     """Return lines for the choices and parts of a robot that differ from their defaults."""
     lines = []
-    defaults = {field.name: field.default for field in dataclasses.fields(robot)}
-    for name, choice in choices_of(type(robot)).items():
+    defaults = {name: field.default for name, field in type(robot).__dataclass_fields__.items()}
+    for name, stated in in_order(type(robot)).items():
         value = getattr(robot, name)
-        if value != defaults[name]:
-            lines.append(f"  {name}: {_word(value)}  # {choice.meaning}")
-    for name, slot in slots_of(type(robot)).items():
-        value = getattr(robot, name)
-        if value is None or eqx.tree_equal(value, defaults[name]) is True:
+        if name in robot.parameters() or value is None or eqx.tree_equal(value, defaults[name]) is True:
             continue
-        if not slot.many:
-            lines.append(f"  {name}: {_part_text(value)}  # {slot.meaning}")
-            continue
-        lines.append(f"  {name}:  # {slot.meaning}")
-        lines += [f"    - {_part_text(each)}" for each in value]
+        try:
+            text = stated.written(value)
+        except ParameterError as error:
+            raise RobotFileError(str(error)) from None
+        first, *others = text.split("\n")
+        lines += [f"  {name}: {first}".rstrip() + f"  # {stated.meaning}", *others]
     return lines
 
 
-def _part_text(each: Any) -> str:
-    """Return a part's text on one line."""
-    if not each.kind:
-        raise RobotFileError(
-            f"a {type(each).__name__} cannot be written to a robot file: it is made of code, not of numbers"
-        )
-    entries = [f"kind: {each.kind}"]
-    defaults: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(each)}
-    for name in parameters_of(type(each)):
-        value = getattr(each, name)
-        if value is not None and not np.array_equal(value, defaults[name]):
-            entries.append(f"{name}: {flow(_plain(value))}")
-    entries += [
-        f"{name}: {_word(getattr(each, name))}"
-        for name in choices_of(type(each))
-        if getattr(each, name) != defaults[name]
-    ]
-    return "{" + ", ".join(entries) + "}"
+# schema
+
+DIALECT = "https://json-schema.org/draft/2020-12/schema"
+NODES = {
+    "type": "integer",
+    "minimum": FEWEST_NODES,
+    "maximum": MOST_NODES,
+    "default": 10,
+    "description": "nodes along the rod, base and tip included",
+}
 
 
-def _word(value: Any) -> str:
-    return flow(list(value) if isinstance(value, tuple) else value)
+def robot_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of robot files, as a mapping that `json.dumps` writes.
 
-
-def _plain(value: Any) -> Any:
-    """Return numbers in the shortest form that reads back equal: one for a multiple of the identity."""
-    array = np.asarray(value, dtype=float)
-    if array.shape == (3, 3) and np.array_equal(array, np.diag(np.diag(array))):
-        array = np.diag(array)
-        array = array[0] if np.all(array == array[0]) else array
-    return array.tolist()
-
-
-# YAML
-
-
-def _mapping(text: str, source: str) -> dict[Any, Any]:
-    """Return the file's outermost mapping."""
-    try:
-        return mapping_of(text, "format, kind and parameters")
-    except YAMLTextError as error:
-        raise RobotFileError(f"{source}: {error}") from None
+    It completes names and marks errors in an editor. It is weaker than the loader, which refuses every file
+    that the schema refuses: it does not check the eigenvalues of a matrix, for example.
+    `knode-cosserat schema` prints it. A robot file names it in a comment for the editor:
+    `# yaml-language-server: $schema=robot.schema.json`.
+    """
+    parts: dict[str, Any] = {}
+    robots = {name: object_schema(cls, parts, nodes=NODES) for name, cls in KINDS.items()}
+    tip_only = [kind for kind, end in kinds_of(End).items() if not end.anywhere]  # type: ignore[attr-defined]
+    for robot in robots.values():
+        if "base_end" in robot["properties"]:
+            kind = {"properties": {"kind": {"enum": tip_only}}, "required": ["kind"]}
+            robot["properties"]["base_end"]["not"] = kind
+    return {
+        "$schema": DIALECT,
+        "title": "robot file of KNODE-Cosserat",
+        "type": "object",
+        "required": list(REQUIRED),
+        "additionalProperties": False,
+        "properties": {
+            "format": {"enum": list(FORMATS), "description": "2 if there are choices or parts, else 1"},
+            "kind": {"enum": list(KINDS), "description": "what robot it is"},
+            "description": {"type": "string", "description": "what it is, in one line"},
+            "parameters": {"type": "object", "description": "names and values, in SI units and radians"},
+            "hardware": {
+                "type": ["object", "null"],
+                "description": "limits of tensions and dimensions of parts, in SI units, for drivers and CAD",
+            },
+        },
+        "allOf": [
+            schema_if_kind(name, {"properties": {"parameters": {"$ref": f"#/$defs/{name}"}}})
+            for name in robots
+        ],
+        "$defs": robots | parts,
+    }

@@ -1,7 +1,11 @@
 """A Cosserat rod with loads, boundary conditions and contact: the base of all single-rod robots.
 
-`elastic_rod` has the material and the symbols. `slender_rod` is a rod without actuators. `tendon_robot` and
-`routed_robot` add tendons.
+    p  position (m)            h  orientation, quaternion, scalar first     R  its rotation matrix
+    n  internal force (N)      m  internal moment (N·m), both in the global frame
+    q  velocity (m/s)          w  angular velocity ω (1/s), both in the material frame
+    v  rate of p along s       u  curvature (1/m), both in the material frame
+
+as in the paper's table of notations. `tendon_robots` adds tendons.
 """
 
 from __future__ import annotations
@@ -15,17 +19,40 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Ends, Observed
-from knode_cosserat.rods.elastic_rod import ElasticRod
 from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
-from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw
+from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import Load, Motion, point_wrench, square_law_drag
 from knode_cosserat.rods.parameters import ParameterError, parameter, slot
 from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
-from knode_cosserat.rods.section import INWARD, SectionChange, shape_at_rest
+from knode_cosserat.rods.section import (
+    ALONG,
+    INWARD,
+    CircularSection,
+    Differences,
+    Material,
+    SectionChange,
+    differences_at,
+    shape_at_rest,
+    shear_modulus,
+)
 from knode_cosserat.rods.surroundings import Obstacle
-from knode_cosserat.rods.system import Discontinuities, Scales
+from knode_cosserat.rods.system import Discontinuities, Scales, System
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
+
+#: layouts of a rod without further parts
+Y_LAYOUT = Layout(
+    ("p", 3, "m", "position, global frame"),
+    ("h", 4, "1", "orientation, quaternion, scalar first"),
+    ("n", 3, "N", "internal force, global frame", "h", "N/m"),
+    ("m", 3, "N m", "internal moment, global frame", "h", "N"),
+    ("q", 3, "m/s", "velocity, material frame"),
+    ("w", 3, "rad/s", "angular velocity, material frame"),
+)
+Z_LAYOUT = Layout(
+    ("v", 3, "1", "rate of position along the rod, material frame", "", "N"),
+    ("u", 3, "1/m", "curvature, material frame", "", "N m"),
+)
 
 #: first root of cos(x) cosh(x) = -1, the frequency equation of a cantilever
 FIRST_ROOT = 1.875104068711961
@@ -38,7 +65,7 @@ NO_CONTROL = np.zeros(0)
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class Rod(ElasticRod):
+class Rod(System):
     """A round rod with gravity, drag, loads, ends, surroundings and further effects.
 
     All other terms of its equations are contributions of its `parts`. A subclass adds parts of its own, such
@@ -46,6 +73,29 @@ class Rod(ElasticRod):
     """
 
     mixed: ClassVar[bool] = False
+
+    length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
+    radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5)
+    density: Any = parameter("kg/m3", "density of the rod, ribs spread over it included", low=1.0, high=100e3)
+    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
+    shear_modulus: Any = parameter(
+        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
+    )
+    shear_damping: Any = parameter(
+        "N s", "Bse, damping of shear and extension", shape="matrix", low=0.0, high=1e6, default=0.0
+    )
+    bending_damping: Any = parameter(
+        "N m2 s", "Bbt, damping of bending and twisting", shape="matrix", low=0.0, high=1e4, default=0.0
+    )
+    shear_stiffness: Any = parameter(
+        "N", "Kse; by default diag(GA, GA, EA)", shape="matrix", low=1e-9, high=1e15, default=None
+    )
+    bending_stiffness: Any = parameter(
+        "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
+    )
+    sections: tuple[SectionChange, ...] = slot(
+        "where the section differs", SectionChange, many=True, default=()
+    )
 
     drag: Any = parameter("kg/m2", "C, square-law drag", shape="matrix", low=0.0, high=1e3, default=0.0)
     linear_drag: Any = parameter(
@@ -91,16 +141,12 @@ class Rod(ElasticRod):
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]
         """Layout of y: that of the rod, then the parts' fields."""
-        return _joined(
-            ElasticRod.y_layout, (field for part in self.parts.values() for field in part.y_fields(self))
-        )
+        return _joined(Y_LAYOUT, (field for part in self.parts.values() for field in part.y_fields(self)))
 
     @functools.cached_property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """Layout of z: that of the rod, then the parts' fields."""
-        return _joined(
-            ElasticRod.z_layout, (field for part in self.parts.values() for field in part.z_fields(self))
-        )
+        return _joined(Z_LAYOUT, (field for part in self.parts.values() for field in part.z_fields(self)))
 
     @functools.cached_property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -140,6 +186,72 @@ class Rod(ElasticRod):
     # derived quantities
 
     @property
+    def section(self) -> CircularSection:
+        """The rod's cross-section outside `sections`."""
+        return CircularSection(self.radius)
+
+    @property
+    def mass_per_length(self) -> Any:
+        """ρA (kg/m)."""
+        return self.density * self.section.area
+
+    @property
+    def G(self) -> Any:
+        """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
+        return shear_modulus(self.youngs_modulus) if self.shear_modulus is None else self.shear_modulus
+
+    @property
+    def Kse(self) -> Float[Any, "3 3"]:
+        """Stiffness of shear and extension (N): the parameter, or by default from moduli and section."""
+        if self.shear_stiffness is not None:
+            return self.shear_stiffness
+        return self.section.shear_stiffness(self.youngs_modulus, self.G)
+
+    @property
+    def Kbt(self) -> Float[Any, "3 3"]:
+        """Stiffness of bending and twisting (N·m²): the parameter, or by default from moduli and section."""
+        if self.bending_stiffness is not None:
+            return self.bending_stiffness
+        return self.section.bending_stiffness(self.youngs_modulus, self.G)
+
+    @property
+    def v_star(self) -> np.ndarray:
+        """v of the unloaded rod: along z, unstretched."""
+        return ALONG
+
+    @property
+    def u_star(self) -> np.ndarray:
+        """u of the unloaded rod (1/m) outside `sections`: straight."""
+        return np.zeros(3)
+
+    def material(self, s: Any, control: Any) -> Material:
+        """Return section and material at arclength s (m)."""
+        plain = Material(
+            self.Kse, self.shear_damping, self.Kbt, self.bending_damping, self.u_star,
+            self.mass_per_length, self.density * self.section.inertia, self.radius,
+        )  # fmt: skip
+        if not self.sections:
+            return plain
+        found = self.differences(s, control)
+        area = found.radius * found.radius
+        return Material(
+            plain.Kse * (area * found.stiffness), plain.Bse * area,
+            plain.Kbt * (area * area * found.stiffness), plain.Bbt * (area * area), found.curvature,
+            plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
+        )  # fmt: skip
+
+    def differences(self, s: Any, control: Any) -> Differences:
+        """Return the sections' changes at s (m)."""
+        return differences_at(self.sections, s / self.length, self.section_controls(control))
+
+    # the law of the strains
+
+    def stresses(self, y: Float[Any, " y"]) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
+        """Return Rᵀn (N) and Rᵀm (N·m)."""
+        R = rotation_matrix(self.y_layout.get(y, "h"))
+        return dot(R.T, self.y_layout.get(y, "n")), dot(R.T, self.y_layout.get(y, "m"))
+
+    @property
     def is_undamped(self) -> bool:
         """True if no parameter, part or internal variable damps a motion; weak drag does not count."""
         values = (self.bending_damping, self.shear_damping, self.linear_drag)
@@ -157,6 +269,17 @@ class Rod(ElasticRod):
         return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
     # the equations
+
+    def linear_law(self, s: Any, y: Float[Any, " y"], control: Any) -> MaterialLaw:
+        """Return the linear law of v and u (paper eq. 12, constitutive law of the rod).
+
+        K (z - z*) + B z_t = Rᵀ (n, m), for each of shear and extension, bending and twisting.
+        """
+        material = self.material(s, control)
+        n, m = self.stresses(y)
+        bent = m if not self.sections else m + dot(material.Kbt, material.u_star)
+        v = Viscoelastic(material.Kse, material.Bse, n + material.Kse @ self.v_star)
+        return MaterialLaw({"v": v, "u": Viscoelastic(material.Kbt, material.Bbt, bent)})
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u, linear but for the parts, and of internal variables."""
@@ -310,6 +433,14 @@ class Rod(ElasticRod):
             return jnp.concatenate([jnp.full(f.size, sizes.get(f.name, 1.0)) for f in layout.fields])
 
         return Scales(of(self.y_layout), of(Ends.of(self).layout))
+
+
+class SlenderRod(Rod):
+    """A rod that is pushed, pulled and turned at its ends, loaded, and in contact with its surroundings.
+
+    With controlled curvature or stiffness of its `sections` it is a variable-curvature robot. With a driven
+    base and obstacles it is the soft slender robot of Xun, Zheng & Kruszewski (2024).
+    """
 
 
 class _RodEnds(Ends, of=Rod):

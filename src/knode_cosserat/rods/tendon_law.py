@@ -119,7 +119,7 @@ def tendon_strains(
 
 
 class Tendons(NamedTuple):
-    """Tendons beside the rod at one point: they couple its strains v and u (`law.Coupling`)."""
+    """Tendons beside the rod at one point: they couple its strains v and u (`MaterialLaw.coupling`)."""
 
     r: Float[Any, "c 3"]
     r_s: Float[Any, "c 3"]

@@ -2,8 +2,8 @@
 
 A scheme in arclength keeps its order only where the right-hand side is smooth. A segment is therefore
 divided into pieces at every discontinuity of the system (`System.discontinuities`), and y jumps there if the
-system says so. Within the tolerance `ON_NODE` a discontinuity lies on a node. At a node, y is the value on the near
-side and z the value on the far side.
+system says so. Within the tolerance `ON_NODE` a discontinuity lies on a node. At a node, y is the value on
+the near side and z the value on the far side.
 
 y is unknown at the points: the nodes and the discontinuities between them. The equations are evaluated at the
 places: at the points (on the far side of discontinuities), at the near sides of discontinuities, and at the

@@ -5,7 +5,6 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.relaxation import Relaxation
-from knode_cosserat.rods.viscoelastic_rod import ViscoelasticRod
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.semi_discrete import History, Point
 
@@ -16,6 +15,10 @@ BODY = {
 }  # fmt: skip
 
 
+def relaxing(stiffness, time=1.0, **body):
+    return kc.robots.SlenderRod(**{**BODY, **body}, effects=(Relaxation(stiffness, time, shear=True),))
+
+
 def bent(rod, force=0.05):
     return kc.equilibrium(rod, [force]).tip_position[0, 0]
 
@@ -23,20 +26,20 @@ def bent(rod, force=0.05):
 @pytest.mark.slow
 def test_at_rest_it_is_elastic():
     elastic = bent(kc.robots.SlenderRod(**BODY))
-    assert bent(ViscoelasticRod(**BODY, branch_stiffness=2.0)) == pytest.approx(elastic, rel=1e-9)
+    assert bent(relaxing(2.0)) == pytest.approx(elastic, rel=1e-9)
 
 
 @pytest.mark.slow
 def test_without_its_branch_it_is_a_slender_rod():
     control = np.full((20, 1), 0.05)
     plain = kc.simulate(kc.robots.SlenderRod(**BODY), control, 5e-3)
-    rod = kc.simulate(ViscoelasticRod(**BODY, branch_stiffness=0.0), control, 5e-3)
+    rod = kc.simulate(relaxing(0.0), control, 5e-3)
     np.testing.assert_allclose(rod.tip_position, plain.tip_position, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_under_a_lasting_force_it_creeps_from_the_stiff_shape_to_that_at_rest():
-    rod = ViscoelasticRod(**BODY, branch_stiffness=1.0, relaxation_time=5.0)
+    rod = relaxing(1.0, 5.0)
     stiff = bent(kc.robots.SlenderRod(**{**BODY, "youngs_modulus": 2 * BODY["youngs_modulus"]}))
     # the vibration has died out after a second; the branch is a fifth of the way
     x = kc.simulate(rod, np.full((2000, 1), 0.05), 0.02).tip_position[:, 0]
@@ -47,7 +50,7 @@ def test_under_a_lasting_force_it_creeps_from_the_stiff_shape_to_that_at_rest():
 
 
 def test_its_strains_satisfy_the_law_with_its_branch():
-    rod = ViscoelasticRod(**BODY, branch_stiffness=0.7, relaxation_time=0.3, shear_damping=0.2)
+    rod = relaxing(0.7, 0.3, shear_damping=0.2)
     rng = np.random.default_rng(0)
     y = np.asarray(rod.rest(0.05)[0]) + 0.01 * rng.normal(size=19)
     history = History(100.0, rng.normal(size=19), rng.normal(size=12), np.zeros(19))
@@ -68,7 +71,7 @@ def test_relaxation_of_a_tendon_robot_is_that_of_the_rod():
     """A robot whose tendons pull with nothing moves under its weight as a rod of the same material."""
     body = {name: value for name, value in BODY.items() if name != "loads"} | {"gravity": (9.81, 0.0, 0.0)}
     stiff = 1e9 * np.eye(3)
-    rod = ViscoelasticRod(**body, shear_stiffness=stiff, branch_stiffness=1.5, relaxation_time=0.2)
+    rod = relaxing(1.5, 0.2, gravity=body["gravity"], loads=(), shear_stiffness=stiff)
     robot = kc.robots.RoutedTendonRobot(
         **body, shear_stiffness=stiff, tendon_offset=0.01, relaxation=Relaxation(stiffness=1.5, time=0.2)
     )
