@@ -118,7 +118,7 @@ def test_a_users_system_is_asked_for(tmp_path, batch):
 @pytest.mark.parametrize("part", ["FunctionRouting", "FunctionSection"])
 def test_a_robot_with_a_part_made_of_code_is_asked_for(tmp_path, part, batch):
     body = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6, "nodes": 5}
-    robot = kc.robots.SlenderRod(**body, sections=(kc.robots.FunctionSection(),))
+    robot = kc.robots.SlenderRod(**body, sections=(kc.robots.section.FunctionSection(),))
     if part == "FunctionRouting":
         routing = (kc.robots.routing.FunctionRouting(lambda s: (0.01 * s, 0.0 * s)),)
         robot = kc.robots.RoutedTendonRobot(**body, tendon_offset=0.01, tendon_angles=[0.0], routing=routing)

@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from knode_cosserat.learning import KNODE, FitConfig, load_model
     from knode_cosserat.loading import load_trajectory
     from knode_cosserat.recordings import estimate_states, load_recording
-    from knode_cosserat.robots import System, catalog, load_robot, save_robot
+    from knode_cosserat.rods.robot_file import catalog, load_robot, save_robot
+    from knode_cosserat.rods.system import System
     from knode_cosserat.solvers import Result, SimulationError, equilibrium, simulate
     from knode_cosserat.statics.reach import inverse_kinematics
     from knode_cosserat.statics.workspace import workspace

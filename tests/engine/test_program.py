@@ -172,7 +172,7 @@ def with_passive_residual():
     return KNODE(PAPER, empty.with_numbers(0.1 * np.random.default_rng(0).normal(size=empty.size)).clamped())
 
 
-SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.robots.catalog()} | {
+SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.catalog()} | {
     "HangingString": lambda: STRING, "virtual robot": virtual_robot, "friction": with_friction,
     "reel and slack": with_reel, "curved law": with_curved_law, "passive": with_passive_residual,
     "network": lambda: with_network(3), "large network": lambda: with_network(64, history=True),

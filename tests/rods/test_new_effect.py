@@ -10,13 +10,13 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.robots import (
     Effect,
-    Evolution,
     RoutedTendonRobot,
     SlenderRod,
-    TendonFriction,
     Wrench,
+    law,
     loads,
     parameter,
+    tendons,
 )
 from knode_cosserat.rotation import cross, dot
 
@@ -44,7 +44,7 @@ class FrictionLayer(Effect):
 
     def evolutions(self, point):
         velocity = dot(point.motion.R, point.motion.q)
-        return {"bristle": Evolution(velocity, jnp.zeros(3), -self.reach, self.reach)}
+        return {"bristle": law.Evolution(velocity, jnp.zeros(3), -self.reach, self.reach)}
 
     def load(self, point):
         return Wrench(-self.stiffness * point.get("bristle"), jnp.zeros(3))
@@ -105,7 +105,7 @@ def test_added_mass_slows_the_rod_down():
 
 def test_effects_join_those_of_a_tendon_robot():
     robot = RoutedTendonRobot(
-        **ROD, tendon_offset=0.01, friction=TendonFriction(wobble=0.5), effects=(FrictionLayer(2.0),)
+        **ROD, tendon_offset=0.01, friction=tendons.TendonFriction(wobble=0.5), effects=(FrictionLayer(2.0),)
     )
     assert robot.z_layout.names == ("v", "u", "f", "bristle") and robot.y_layout.names[-1] == "loss"
     found = kc.simulate(robot, np.tile([1.0, 0.0, 0.0, 0.0], (10, 1)), DT)

@@ -202,7 +202,7 @@ def test_errors_name_file_place_value_and_what_is_allowed(more, words):
 
 
 def test_code_cannot_be_saved(tmp_path):
-    rod = kc.robots.SlenderRod(**BODY, sections=(kc.robots.FunctionSection(),))
+    rod = kc.robots.SlenderRod(**BODY, sections=(kc.robots.section.FunctionSection(),))
     with pytest.raises(RobotFileError, match=r"^a FunctionSection cannot be written .* made of code"):
         kc.save_robot(rod, tmp_path / "rod.yaml")
     routed = kc.robots.RoutedTendonRobot(

@@ -205,11 +205,13 @@ def test_one_stretch_is_two():
     """A function over all of the rod is the polynomials in its two parts."""
 
     def function(part, control):
-        return kc.robots.Differences(
+        return kc.robots.section.Differences(
             radius=1.0 - 0.3 * part, curvature=np.array([1.0, 0.0, 2.0]) * control[0]
         )
 
-    whole = dataclasses.replace(CHANGED, sections=(kc.robots.FunctionSection(function=function, inputs=1),))
+    whole = dataclasses.replace(
+        CHANGED, sections=(kc.robots.section.FunctionSection(function=function, inputs=1),)
+    )
     parts = changed(
         {"curvature_gain": [1.0, 0.0, 2.0]}, radius_0=[1.0, -0.141], radius_1=[0.859, -0.159]
     )  # fmt: skip

@@ -62,7 +62,7 @@ def _of_robots() -> dict[str, Sample]:
     return {
         "trajectory.nc": Sample(lambda path, version: motion(version).save(path), read_trajectory),
         "robot.yaml": Sample(
-            lambda path, version: kc.robots.save_robot(robot(version), path), lambda path: kc.load_robot(path)
+            lambda path, version: kc.save_robot(robot(version), path), lambda path: kc.load_robot(path)
         ),
         "recording.yaml": Sample(
             lambda path, version: config(version).save(path),
