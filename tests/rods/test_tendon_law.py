@@ -9,32 +9,33 @@ from hypothesis import strategies as st
 
 from knode_cosserat.rods import tendon_law
 from knode_cosserat.rods.tendon_law import (
-    path_rates,
+    TendonLaw,
     stretches,
-    tangents,
     tendon_strains,
     tendon_wrench,
     unbent_flexibility,
 )
 
 COUNT = 3
+
+
+def strains(K_v, K_u, a, b, *tendons, factor=None):
+    """v and u; with so many times the matrix that it is solved by otherwise."""
+    law = TendonLaw(K_v, K_u, jnp.concatenate([a, b]), *tendons)
+    return tendon_strains(law, None if factor is None else factor * unbent_flexibility(law))
+
+
 #: of many lanes at once, so that hypothesis runs one program
-solve = jax.jit(jax.vmap(lambda given: tendon_strains(*given)))
+solve = jax.jit(jax.vmap(lambda given: strains(*given)))
 
 
 @jax.jit
 def solve_by(factor, rods):
-    """With so many times the matrix that it is solved by otherwise."""
-
-    def one(K_v, K_u, a, b, *way):
-        flexibility = factor * unbent_flexibility(K_v, K_u, *way)
-        return tendon_strains(K_v, K_u, a, b, *way, flexibility=flexibility)
-
-    return jax.vmap(one)(*rods)
+    return jax.vmap(lambda *one: strains(*one, factor=factor))(*rods)
 
 
-slopes = jax.jit(jax.jacfwd(lambda given: jnp.concatenate(tendon_strains(*given))))
-slopes_backward = jax.jit(jax.jacrev(lambda given: jnp.concatenate(tendon_strains(*given))))
+slopes = jax.jit(jax.jacfwd(lambda given: jnp.concatenate(strains(*given))))
+slopes_backward = jax.jit(jax.jacrev(lambda given: jnp.concatenate(strains(*given))))
 LANES = 8
 
 
@@ -115,7 +116,7 @@ def test_slopes_have_slopes():
     one = rod(np.random.default_rng(0), *KINDS["silicone"])
 
     def along(h):
-        return jnp.sum(jnp.concatenate(tendon_strains(*one[:6], one[6] * (1.0 + h))))
+        return jnp.sum(jnp.concatenate(strains(*one[:6], one[6] * (1.0 + h))))
 
     second = jax.jit(jax.grad(jax.grad(along)))(0.1)
     first = jax.jit(jax.grad(along))
@@ -136,10 +137,8 @@ def test_helpers_agree_with_each_other():
     v, u, tension = rng.standard_normal(3), rng.standard_normal(3), np.array([1.0, 2.0, 3.0])
     r, r_s = (np.column_stack([rng.standard_normal((COUNT, 2)), np.zeros(COUNT)]) for _ in range(2))
     p_s = v + np.cross(u, r) + r_s
-    np.testing.assert_allclose(path_rates(v, u, r, r_s), p_s, rtol=1e-14, atol=1e-14)
     np.testing.assert_allclose(stretches(v, u, r, r_s), np.linalg.norm(p_s, axis=1), rtol=1e-14)
-    t = np.asarray(tangents(v, u, r, r_s))
-    np.testing.assert_allclose(t * np.linalg.norm(p_s, axis=1)[:, None], p_s, rtol=1e-13, atol=1e-13)
+    t = p_s / np.linalg.norm(p_s, axis=1, keepdims=True)
     force, moment = tendon_wrench(v, u, r, r_s, tension)
     np.testing.assert_allclose(force, tension @ t, rtol=1e-12, atol=1e-13)
     np.testing.assert_allclose(moment, tension @ np.cross(r, t), rtol=1e-12, atol=1e-13)
@@ -199,7 +198,7 @@ def test_whatever_has_a_solution_is_solved(seed):
 def test_rods_that_are_hardly_bent_need_no_newton(monkeypatch):
     # what is solved exactly is solved, too: what is left of it is rounding, and does not get less
     monkeypatch.setattr(tendon_law, "ROUNDS", 0)
-    rng, given, strains = np.random.default_rng(0), [], []
+    rng, given, expected = np.random.default_rng(0), [], []
     for bent in np.repeat([0.0, 1e-14, 1e-10, 1e-6, 1e-3], 100):
         K_v, K_u, _, _, r, r_s, tension = rod(rng, *KINDS["Delrin"][:2], 1e-4, 0.0, 0.02)
         v, u = np.array([0.0, 0.0, 1.0]), bent / 0.0032 * rng.standard_normal(3)
@@ -207,7 +206,7 @@ def test_rods_that_are_hardly_bent_need_no_newton(monkeypatch):
         t = p_s / np.linalg.norm(p_s, axis=1, keepdims=True)
         a, b = K_v @ v + tension @ t, K_u @ u + tension @ np.cross(r, t)
         given.append((K_v, K_u, a, b, r, r_s, tension))
-        strains.append(np.concatenate([v, u]))
-    one_by_one = jax.jit(lambda rods: jax.lax.map(lambda each: jnp.concatenate(tendon_strains(*each)), rods))
+        expected.append(np.concatenate([v, u]))
+    one_by_one = jax.jit(lambda rods: jax.lax.map(lambda each: jnp.concatenate(strains(*each)), rods))
     found = one_by_one(jax.tree.map(lambda *each: np.stack(each), *given))
-    assert np.allclose(found, strains, rtol=0.0, atol=1e-10)
+    assert np.allclose(found, expected, rtol=0.0, atol=1e-10)

@@ -17,7 +17,7 @@ from knode_cosserat.rods.routing import (
     Tapered,
     routes,
 )
-from knode_cosserat.rods.tendon_law import tendon_strains
+from knode_cosserat.rods.tendon_law import TendonLaw, tendon_strains
 from tests.rods import rucker_webster as oracle
 
 DELRIN = kc.load_robot("delrin-tendon-robot")
@@ -49,8 +49,8 @@ def shape(rod, routings, tensions, tolerance=1e-11):
         R, m = x[3:12].reshape(3, 3), x[12:]
         n = rod.weight * (rod.length - s)
         r, r_s = routes(routings, s / rod.length, rod.length)
-        a = R.T @ n + rod.Kse @ oracle.V_STAR
-        v, u = tendon_strains(rod.Kse, rod.Kbt, a, R.T @ m, r, r_s, tension)
+        load = jnp.concatenate([R.T @ n + rod.Kse @ oracle.V_STAR, R.T @ m])
+        v, u = tendon_strains(TendonLaw(rod.Kse, rod.Kbt, load, r, r_s, tension))
         R_s = jnp.stack([jnp.cross(row, u) for row in R])
         return jnp.concatenate([R @ v, R_s.ravel(), -jnp.cross(R @ v, n)]), jnp.concatenate([v, u])
 

@@ -61,7 +61,7 @@ class End(Part):
         return Pose(jnp.asarray(p), jnp.asarray(h) / jnp.sqrt(jnp.sum(jnp.asarray(h) ** 2)))
 
     @abc.abstractmethod
-    def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+    def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions, from poses, and n and m less the loads at the tip."""
 
 
@@ -73,7 +73,7 @@ class Free(End):
     held: ClassVar[bool] = False
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_FORCE, _MOMENT)
 
-    def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+    def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the residual of zero force and zero moment."""
         return jnp.concatenate([-n, -m])
 
@@ -85,7 +85,7 @@ class Clamped(End):
     unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_POSITION, _TURN)
 
-    def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+    def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the position error, and twice the vector part of the rotation error."""
         turned = quaternion_product(conjugate(held.h), y.h)
         turned = turned * jnp.where(turned[0] < 0.0, -1.0, 1.0) / jnp.sqrt(jnp.sum(turned * turned))
@@ -99,7 +99,7 @@ class Pinned(End):
     unknowns: ClassVar[tuple[str, ...]] = ("h", "n")
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_POSITION, _MOMENT)
 
-    def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+    def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the position error, and the residual of zero moment."""
         return jnp.concatenate([y.p - held.p, -m])
 
@@ -143,11 +143,11 @@ class Sliding(Driven):
 
     along: str = choice("the global axis that it slides along", AXES[:3], "z")
 
-    def left(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+    def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the clamped residual, with zero force along the axis instead of the position along it."""
-        left, k = super().left(held, y, n, m), AXES.index(self.along)
+        rows, k = super().residual(held, y, n, m), AXES.index(self.along)
         across = [i for i in range(3) if i != k]
-        return jnp.concatenate([jnp.stack([left[i] for i in across]), -n[k : k + 1], left[3:]])
+        return jnp.concatenate([jnp.stack([rows[i] for i in across]), -n[k : k + 1], rows[3:]])
 
 
 def velocities(pose: Pose, pose_t: Pose) -> tuple[Any, Any]:

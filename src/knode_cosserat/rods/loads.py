@@ -65,12 +65,12 @@ class Body(NamedTuple):
     @classmethod
     def of(cls, bodies: list[tuple[Body, Any]]) -> Body:
         """Return the weighted sum of several bodies."""
-        found = []
+        sums = []
         for moments in zip(*(body for body, _ in bodies), strict=True):
-            weighed = zip(moments, (weight for _, weight in bodies), strict=True)
-            own = [weight * moment for moment, weight in weighed if moment is not None]
-            found.append(sum(own) if own else None)
-        return cls(*found)
+            weights = (weight for _, weight in bodies)
+            parts = [w * moment for moment, w in zip(moments, weights, strict=True) if moment is not None]
+            sums.append(sum(parts) if parts else None)
+        return cls(*sums)
 
     def wrench(self, motion: Motion, gravity: Any) -> Wrench:
         """Return weight less inertia: F = m a - ω_t × S - ω × (ω × S), M = S × a - (J ω_t + ω × J ω).
@@ -147,31 +147,40 @@ class SpreadLoad(Load):
         """Return the load on the rod per length (N/m, N) within its stretch."""
 
 
-_FOLLOWS = "whether it turns with the rod"
-_CONTROLLED = "whether a control multiplies it"
+class _Prescribed(Load):
+    """A force and a moment: constant in the global frame, or following the material frame."""
 
-
-class PointWrench(PointLoad):
-    """A force and a moment at a place: constant in the global frame, or following the material frame."""
-
-    kind: ClassVar[str] = "point-wrench"
-
-    force: Any = parameter("N", "force", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
-    moment: Any = parameter("N m", "moment", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
-    follows: bool = choice(_FOLLOWS, (False, True), False)
-    controlled: bool = choice(_CONTROLLED, (False, True), False)
+    force: Any
+    moment: Any
+    follows: bool = choice("whether it turns with the rod", (False, True), False)
+    controlled: bool = choice("whether a control multiplies it", (False, True), False)
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """The factor on the load, if it is controlled."""
         return (Field("scale", 1, "1", "multiple of the load that acts"),) if self.controlled else ()
 
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+    def prescribed(self, motion: Motion, control: Any) -> Wrench:
         """Return the force and the moment, rotated with the rod if they follow it."""
-        return _given(self, motion, control)
+        factor = control[0] if self.controlled else 1.0
+        force, moment = factor * jnp.asarray(self.force), factor * jnp.asarray(self.moment)
+        return Wrench(dot(motion.R, force), dot(motion.R, moment)) if self.follows else Wrench(force, moment)
 
 
-class DistributedWrench(SpreadLoad):
+class PointWrench(_Prescribed, PointLoad):
+    """A force and a moment at a place: constant in the global frame, or following the material frame."""
+
+    kind: ClassVar[str] = "point-wrench"
+
+    force: Any = parameter("N", "force", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
+    moment: Any = parameter("N m", "moment", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
+
+    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+        """Return the force and the moment."""
+        return self.prescribed(motion, control)
+
+
+class DistributedWrench(_Prescribed, SpreadLoad):
     """A force and a moment per length: constant in the global frame, or following the material frame."""
 
     kind: ClassVar[str] = "distributed-wrench"
@@ -182,23 +191,10 @@ class DistributedWrench(SpreadLoad):
     moment: Any = parameter(
         "N", "moment per length", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0)
     )
-    follows: bool = choice(_FOLLOWS, (False, True), False)
-    controlled: bool = choice(_CONTROLLED, (False, True), False)
-
-    @property
-    def control_fields(self) -> tuple[Field, ...]:
-        """The factor on the load, if it is controlled."""
-        return (Field("scale", 1, "1", "multiple of the load that acts"),) if self.controlled else ()
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """Return the force and the moment, rotated with the rod if they follow it."""
-        return _given(self, motion, control)
-
-
-def _given(load: Any, motion: Motion, control: Any) -> Wrench:
-    factor = control[0] if load.controlled else 1.0
-    force, moment = factor * jnp.asarray(load.force), factor * jnp.asarray(load.moment)
-    return Wrench(dot(motion.R, force), dot(motion.R, moment)) if load.follows else Wrench(force, moment)
+        """Return the force and the moment."""
+        return self.prescribed(motion, control)
 
 
 class AttachedMass(PointLoad):
@@ -237,12 +233,11 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
     """Return the sum of the loads at one place: each with its weight (0 if it acts elsewhere) and control."""
     total, bodies = Wrench(jnp.zeros(3), jnp.zeros(3)), []
     for load, weight, control in acting:
-        body = load.body
-        if body is not None:
-            bodies.append((body, weight))
+        if load.body is not None:
+            bodies.append((load.body, weight))
             continue
-        own = load.wrench(motion, gravity, control)
-        total = total + Wrench(weight * own.force, weight * own.moment)
+        wrench = load.wrench(motion, gravity, control)
+        total = total + Wrench(weight * wrench.force, weight * wrench.moment)
     if bodies:
         # summed before the wrench: their equations are compiled once for any number of bodies
         total = total + Body.of(bodies).wrench(motion, gravity)

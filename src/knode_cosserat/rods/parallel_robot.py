@@ -24,13 +24,8 @@ from knode_cosserat.rods.strands import Bundle, in_strands
 from knode_cosserat.rods.system import Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
-#: rod parameters that a leg takes from the robot
-LEG = (
-    "length", "radius", "density", "youngs_modulus", "shear_modulus", "shear_damping", "bending_damping",
-    "drag", "linear_drag", "gravity", "shear_stiffness", "bending_stiffness",
-)  # fmt: skip
-#: indices in a leg's y at which the fields after p begin: h, n, m, q, w
-FIELDS = (3, 7, 10, 13, 16)
+#: indices in a leg's y at which the fields after p begin
+FIELDS = np.cumsum([field.size for field in Y_LAYOUT.fields])[:-1]
 
 
 class Leg(Rod):
@@ -44,13 +39,8 @@ class Leg(Rod):
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """Layout of the robot's control."""
-        return displacements(self.legs)
-
-
-def displacements(count: int) -> Layout:
-    """Return the control layout of a robot with `count` legs."""
-    return Layout(("displacement", count, "m", "displacement of each leg's base along z"))
+        """One displacement per leg."""
+        return Layout(("displacement", self.legs, "m", "displacement of each leg's base along z"))
 
 
 def _of_rod(name: str) -> Any:
@@ -132,8 +122,8 @@ class ParallelRobot(Bundle):
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
-        """One displacement per leg."""
-        return displacements(self.strands)
+        """Layout of the legs' control."""
+        return Layout(("displacement", self.strands, "m", "displacement of each leg's base along z"))
 
     @property
     def inertia(self) -> Float[Any, "3 3"]:
@@ -151,15 +141,12 @@ class ParallelRobot(Bundle):
 
     def legs(self, y: Float[Any, "*n y"]) -> list[Any]:
         """Return p, h, n, m, q and w (…, legs, size) of states y."""
-        return _split(in_strands(self, y))
+        numeric: Any = jnp if is_traced(y) else np
+        return numeric.split(in_strands(self, y), FIELDS, axis=-1)
 
     def leg_positions(self, y: Any) -> Any:
         """Return the positions (…, legs, 3) in m of the legs' points, from states y (…, y)."""
         return self.legs(y)[0]
-
-    def leg_quaternions(self, y: Any) -> Any:
-        """Return the orientations (…, legs, 4) of the legs' points, scalar first, from states y (…, y)."""
-        return self.legs(y)[1]
 
     def platform_position(self, y: Any) -> Any:
         """Return the platform's centre (…, 3) in m, from the robot's states y (…, nodes, y)."""
@@ -243,6 +230,10 @@ class ParallelRobot(Bundle):
         gaps = jnp.concatenate([jnp.full(3, self.length), jnp.ones(3)])
         rest = jnp.tile(gaps, self.strands - 1)
         return Scales(jnp.tile(leg.y, self.strands), jnp.concatenate([leg.tip, rest]))
+
+
+#: rod parameters that a leg takes from the robot
+LEG = tuple(name for name in ParallelRobot.parameters() if name in Leg.parameters())
 
 
 class _PlatformEnds(Ends, of=ParallelRobot):
@@ -332,12 +323,6 @@ class _PlatformObserved(Observed, of=ParallelRobot):
         q, w = self.system.platform_velocity(point.y)
         q_t, w_t = self.system.platform_velocity(point.y_t)
         return jnp.concatenate([q_t + cross(w, q), w_t, q, w])
-
-
-def _split(own: Any) -> list[Any]:
-    """Return p, h, n, m, q and w of states (…, legs, 19)."""
-    numeric: Any = jnp if is_traced(own) else np
-    return numeric.split(own, FIELDS, axis=-1)
 
 
 def _on_circle(radius: Any, angles: Any) -> Float[Any, "legs 3"]:

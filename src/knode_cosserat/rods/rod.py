@@ -11,7 +11,6 @@ as in the paper's table of notations. `tendon_robots` adds tendons.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterable
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -28,13 +27,13 @@ from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
 from knode_cosserat.rods.section import (
     ALONG,
     INWARD,
+    POISSON_RATIO,
     CircularSection,
     Differences,
     Material,
     SectionChange,
     differences_at,
     shape_at_rest,
-    shear_modulus,
 )
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import Discontinuities, Scales, System
@@ -102,13 +101,9 @@ class Rod(System):
         "kg/(m s)", "drag in proportion to velocity", shape="matrix", low=0.0, high=1e4, default=None
     )
     gravity: Any = parameter(
-        "m/s2",
-        "gravitational acceleration, global frame",
-        shape="vector",
-        low=-100.0,
-        high=100.0,
+        "m/s2", "gravitational acceleration, global frame", shape="vector", low=-100.0, high=100.0,
         default=(0.0, 0.0, -9.81),
-    )
+    )  # fmt: skip
     loads: tuple[Load, ...] = slot("what loads it beside gravity and drag", Load, many=True, default=())
     surroundings: tuple[Obstacle, ...] = slot("what it may touch", Obstacle, many=True, default=())
     effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
@@ -141,12 +136,12 @@ class Rod(System):
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]
         """Layout of y: that of the rod, then the parts' fields."""
-        return _joined(Y_LAYOUT, (field for part in self.parts.values() for field in part.y_fields(self)))
+        return _joined(Y_LAYOUT, *(part.y_fields(self) for part in self.parts.values()))
 
     @functools.cached_property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """Layout of z: that of the rod, then the parts' fields."""
-        return _joined(Z_LAYOUT, (field for part in self.parts.values() for field in part.z_fields(self)))
+        return _joined(Z_LAYOUT, *(part.z_fields(self) for part in self.parts.values()))
 
     @functools.cached_property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -198,7 +193,11 @@ class Rod(System):
     @property
     def G(self) -> Any:
         """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
-        return shear_modulus(self.youngs_modulus) if self.shear_modulus is None else self.shear_modulus
+        return (
+            self.youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
+            if self.shear_modulus is None
+            else self.shear_modulus
+        )
 
     @property
     def Kse(self) -> Float[Any, "3 3"]:
@@ -232,12 +231,12 @@ class Rod(System):
         )  # fmt: skip
         if not self.sections:
             return plain
-        found = self.differences(s, control)
-        area = found.radius * found.radius
+        radius, stiffness, curvature = self.differences(s, control)
+        area = radius * radius
         return Material(
-            plain.Kse * (area * found.stiffness), plain.Bse * area,
-            plain.Kbt * (area * area * found.stiffness), plain.Bbt * (area * area), found.curvature,
-            plain.rhoA * area, plain.rhoJ * (area * area), plain.radius * found.radius,
+            plain.Kse * (area * stiffness), plain.Bse * area, plain.Kbt * (area * area * stiffness),
+            plain.Bbt * (area * area), curvature, plain.rhoA * area, plain.rhoJ * (area * area),
+            plain.radius * radius,
         )  # fmt: skip
 
     def differences(self, s: Any, control: Any) -> Differences:
@@ -289,10 +288,10 @@ class Rod(System):
         evolutions = {name: law for part, own in parts for name, law in part.evolutions(own).items()}
 
         def law(internal: Fields) -> MaterialLaw:
-            found = self.linear_law(s, y, control)
+            total = self.linear_law(s, y, control)
             for part, own in parts:
-                found = part.law(own, found, internal)
-            return found
+                total = part.law(own, total, internal)
+            return total
 
         return InternalState(evolutions, law) if evolutions else law({})
 
@@ -390,7 +389,7 @@ class Rod(System):
         # less than the distance that moves places away from that side
         margin = 0.2 * INWARD * self.length / (self.nodes - 1)
         beyond = jnp.minimum(s + margin, self.length - margin)
-        return *shape_at_rest(base.p, base.h, s, curvature, self.length, edges), curvature(beyond)
+        return *shape_at_rest(base, s, curvature, self.length, edges), curvature(beyond)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
@@ -413,7 +412,7 @@ class Rod(System):
         else:
             rest = self.pose(self.rest(self.length)[0])
             held = self.tip_end.pose(rest, self.end_controls(control)[1])
-            rows = [self.tip_end.left(held, self.pose(y), n, m)]
+            rows = [self.tip_end.residual(held, self.pose(y), n, m)]
         if "h" in self.base_unknowns:
             h = self.y_layout.get(y, "h")
             rows.append(jnp.sum(h * h)[None] - 1.0)
@@ -535,16 +534,16 @@ class _RodObserved(Observed, of=Rod):
         rod = self.system
         if not rod.sections:
             return None
-        found = rod.differences(s, control)
-        area = found.radius * found.radius
+        radius, stiffness, _ = rod.differences(s, control)
+        area = radius * radius
         others = jnp.ones(rod.z_layout.size - 6)
         damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        return jnp.concatenate([damping * found.stiffness, others]), jnp.concatenate([damping, others])
+        return jnp.concatenate([damping * stiffness, others]), jnp.concatenate([damping, others])
 
 
-def _joined(layout: Layout, fields: Iterable[tuple[Any, ...]]) -> Layout:
+def _joined(layout: Layout, *parts: tuple[Any, ...]) -> Layout:
     """Return a layout with the fields of the parts. Raises `ParameterError` if two have the same name."""
-    joined = layout + Layout(*fields)
+    joined = Layout(*layout.fields, *(field for fields in parts for field in fields))
     for name in joined.names:
         if joined.names.count(name) > 1:
             raise ParameterError(f"two parts have a field {name!r}; allowed is one part of its kind")

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.ends import Pose
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, place
 from knode_cosserat.rods.parts import Part, require_stretch
@@ -56,11 +57,6 @@ class CircularSection(NamedTuple):
     def bending_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
         """Return Kbt = diag(EI, EI, 2GI): bending and twisting (N·m²)."""
         return self.second_moment * (youngs_modulus * ACROSS + 2.0 * shear_modulus * AXIAL)
-
-
-def shear_modulus(youngs_modulus: Any) -> Any:
-    """Return the shear modulus G = E / (2 (1 + ν)) of an isotropic material (Pa)."""
-    return youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
 
 
 class Material(NamedTuple):
@@ -123,13 +119,9 @@ class Stretch(SectionChange):
         "", "factor of the stiffness, coefficients in ξ", shape="list", low=-1e6, high=1e6, default=(1.0,)
     )
     curvature: Any = parameter(
-        "1/m",
-        "curvature at rest, material frame",
-        shape="vector",
-        low=-1e4,
-        high=1e4,
+        "1/m", "curvature at rest, material frame", shape="vector", low=-1e4, high=1e4,
         default=(0.0, 0.0, 0.0),
-    )
+    )  # fmt: skip
     curvature_slope: Any = parameter(
         "1/m", "how much more of it there is where the stretch ends", shape="vector", low=-1e4, high=1e4,
         default=(0.0, 0.0, 0.0),
@@ -160,19 +152,13 @@ class Stretch(SectionChange):
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """One control, if the section is controlled; its limit leaves some stiffness."""
-        input = Field("input", 1, "1", "what acts on the section")._replace(**self._range)
-        return (input,) if self.controlled else ()
-
-    @property
-    def _range(self) -> dict[str, Any]:
-        """Limits of the control, if the stiffness gain is one known number."""
-        gain = self.stiffness_gain
-        if isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0:
-            return {}
-        none_left = float(-1.0 / gain)
-        # at the limit itself the stiffness is zero
-        name, inside = ("low", np.inf) if gain > 0.0 else ("high", -np.inf)
-        return {name: float(np.nextafter(none_left, inside))}
+        field, gain = Field("input", 1, "1", "what acts on the section"), self.stiffness_gain
+        # the gain of a batch, or of a traced robot, gives no limit
+        if not (isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0):
+            # at the limit itself the stiffness is zero
+            name, inside = ("low", np.inf) if gain > 0.0 else ("high", -np.inf)
+            field = field._replace(**{name: float(np.nextafter(-1.0 / float(gain), inside))})
+        return (field,) if self.controlled else ()
 
     def differences(self, part: Any, control: Any) -> Differences:
         """Return the polynomial factors, with the control's changes."""
@@ -195,11 +181,7 @@ class Sleeve(SectionChange):
     kind: ClassVar[str] = "sleeve"
 
     stiffening: Any = parameter(
-        "",
-        "a, how much stiffer the rod is where the stretch begins, as a part",
-        low=0.0,
-        high=1e4,
-        default=0.0,
+        "", "a, relative increase of stiffness where the stretch begins", low=0.0, high=1e4, default=0.0
     )
     length: Any = parameter(
         "", "ℓ, where the sleeve ends, as a part of the stretch", low=1e-3, high=10.0, default=0.1
@@ -250,27 +232,24 @@ def _polynomial(coefficients: Any, at: Any) -> Any:
 
 def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list[Any]) -> Differences:
     """Return the changes at a fraction of the rod's length: factors multiplied, curvatures added."""
-    found = Differences(1.0, 1.0, jnp.zeros(3))
+    total = Differences(1.0, 1.0, jnp.zeros(3))
     for change, control in zip(changes, controls, strict=True):
-        own = change.differences((part - change.begin) / (change.end - change.begin), control)
-        within = (part >= change.begin) & (part <= change.end)
-        found = Differences(
-            found.radius * jnp.where(within, own.radius, 1.0),
-            found.stiffness * jnp.where(within, own.stiffness, 1.0),
-            found.curvature + jnp.where(within, own.curvature, 0.0),
+        radius, stiffness, curvature = change.differences(
+            (part - change.begin) / (change.end - change.begin), control
         )
-    return found
+        within = (part >= change.begin) & (part <= change.end)
+        total = Differences(
+            total.radius * jnp.where(within, radius, 1.0),
+            total.stiffness * jnp.where(within, stiffness, 1.0),
+            total.curvature + jnp.where(within, curvature, 0.0),
+        )
+    return total
 
 
 def shape_at_rest(
-    p: Float[Any, "3"],
-    h: Float[Any, "4"],
-    s: Any,
-    curvature: Callable[[Any], Any],
-    length: Any,
-    edges: Float[np.ndarray, " edges"],
-) -> tuple[Float[Any, "3"], Float[Any, "4"]]:
-    """Return position (m) and orientation at s of a rod without strain, from its base pose and its curvature.
+    base: Pose, s: Any, curvature: Callable[[Any], Any], length: Any, edges: Float[np.ndarray, " edges"]
+) -> Pose:
+    """Return the pose at s of a rod without strain, from its base's and its curvature.
 
     `edges` are parts of the length, from 0 to 1, with a smooth curvature (1/m) between them. The
     integration is Magnus' series of order 4 on poses: a constant curvature gives an exact helix for any step.
@@ -290,9 +269,8 @@ def shape_at_rest(
         along = ds * ALONG + more * cross(u - v, ALONG)
         return quaternion_of(turn), mean_turned(turn, along)
 
-    def on(pose: tuple[Any, Any], step: tuple[Any, Any]) -> tuple[tuple[Any, Any], None]:
-        (p, h), (turn, way) = pose, step
-        return (p + turned(h, way), quaternion_product(h, turn)), None
+    def advance(pose: Pose, step: tuple[Any, Any]) -> tuple[Pose, None]:
+        turn, way = step
+        return Pose(pose.p + turned(pose.h, way), quaternion_product(pose.h, turn)), None
 
-    pose, _ = jax.lax.scan(on, (p, h), jax.vmap(step)(ds, *seen.reshape(2, -1, 3)))
-    return pose
+    return jax.lax.scan(advance, base, jax.vmap(step)(ds, *seen.reshape(2, -1, 3)))[0]

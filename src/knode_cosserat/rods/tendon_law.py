@@ -42,11 +42,20 @@ MISSING = 1e-14
 UNBENT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
 
 
-def path_rates(
-    v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
-) -> Float[Any, "c 3"]:
-    """Return ṗᵢ = v + u × rᵢ + rᵢ′, along the tendons per metre of rod, material frame."""
-    return jnp.stack(_rates(jnp.concatenate([v, u]), r, r_s), axis=1)
+class TendonLaw(NamedTuple):
+    """The law in the module's docstring at one point of a rod."""
+
+    #: stiffness of shear and extension (N), symmetric and positive definite
+    K_v: Float[Any, "3 3"]
+    #: stiffness of bending and twisting (N·m²), likewise
+    K_u: Float[Any, "3 3"]
+    #: a (N) and b (N·m)
+    load: Float[Any, "6"]
+    #: the tendons' places (m) and their derivative along the rod; the third components are not used
+    r: Float[Any, "c 3"]
+    r_s: Float[Any, "c 3"]
+    #: T (N), not negative; 0 for a tendon that has ended
+    tension: Float[Any, " c"]
 
 
 def stretches(
@@ -57,13 +66,6 @@ def stretches(
     return jnp.sqrt(x * x + y * y + z * z)
 
 
-def tangents(
-    v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]
-) -> Float[Any, "c 3"]:
-    """Return tᵢ, unit tangents of the tendons, material frame."""
-    return _units(jnp.concatenate([v, u]), r, r_s)[0].T
-
-
 def tendon_wrench(
     v: Float[Any, "3"], u: Float[Any, "3"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"], tension: Any
 ) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
@@ -72,49 +74,22 @@ def tendon_wrench(
     return loads[:3], loads[3:]
 
 
-def unbent_flexibility(
-    K_v: Float[Any, "3 3"],
-    K_u: Float[Any, "3 3"],
-    r: Float[Any, "c 3"],
-    r_s: Float[Any, "c 3"],
-    tension: Float[Any, " c"],
-) -> Float[Any, "6 6"]:
-    """Return J⁻¹ of the unbent rod and tendons; arguments as in `tendon_strains`."""
-    return _flexibility(*_levers(UNBENT, r, r_s), K_v, K_u, r, tension)
+def unbent_flexibility(law: TendonLaw) -> Float[Any, "6 6"]:
+    """Return J⁻¹ of the unbent rod and tendons; the load is not used."""
+    return _flexibility(*_levers(UNBENT, law.r, law.r_s), law)
 
 
 def tendon_strains(
-    K_v: Float[Any, "3 3"],
-    K_u: Float[Any, "3 3"],
-    a: Float[Any, "3"],
-    b: Float[Any, "3"],
-    r: Float[Any, "c 3"],
-    r_s: Float[Any, "c 3"],
-    tension: Float[Any, " c"],
-    *,
-    flexibility: Float[Any, "6 6"] | None = None,
+    law: TendonLaw, flexibility: Float[Any, "6 6"] | None = None
 ) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
-    """Return the v and u (1/m) that satisfy the law in the module's docstring.
+    """Return the v and u (1/m) that satisfy a law, solved to rounding; NaN if Newton's method fails.
 
-    Args:
-        K_v: stiffness of shear and extension (N), symmetric and positive definite.
-        K_u: stiffness of bending and twisting (N·m²), likewise.
-        a: load on v (N).
-        b: load on u (N·m).
-        r: the tendons' places (m); the third components are not used.
-        r_s: derivative of r along the rod; the third components are not used.
-        tension: T (N), not negative; 0 for a tendon that has ended.
-        flexibility: `unbent_flexibility` of these arguments, or an approximation that is not zero. It affects
-            the speed of convergence, not the solution.
-
-    Returns:
-        v and u, solved to rounding; NaN if Newton's method did not converge. Derivatives of any order and
-        mode are those of the solution.
+    `flexibility` is `unbent_flexibility` of the law, or an approximation that is not zero. It affects the
+    speed of convergence, not the solution. Derivatives of any order and mode are those of the solution.
     """
     if flexibility is None:
-        flexibility = unbent_flexibility(K_v, K_u, r, r_s, tension)
-    ab = jnp.concatenate([a, b])
-    x = _solution(jax.lax.stop_gradient(flexibility), K_v, K_u, ab, r, r_s, tension)
+        flexibility = unbent_flexibility(law)
+    x = _solution(jax.lax.stop_gradient(flexibility), law)
     return x[:3], x[3:]
 
 
@@ -131,12 +106,10 @@ class Tendons(NamedTuple):
     def strains(self, elastic: dict[str, Elastic]) -> Fields:
         """Return v and u of the rod's elastic laws with the tendons."""
         v, u = elastic["v"], elastic["u"]
-        flexibility = unbent_flexibility(v.stiffness, u.stiffness, self.r, self.r_s, self.nominal_tension)
-        found = tendon_strains(
-            v.softened, u.softened, v.stress, u.stress, self.r, self.r_s, self.tension,
-            flexibility=flexibility,
-        )  # fmt: skip
-        return {"v": found[0], "u": found[1]}
+        load = jnp.concatenate([v.stress, u.stress])
+        nominal = TendonLaw(v.stiffness, u.stiffness, load, self.r, self.r_s, self.nominal_tension)
+        law = TendonLaw(v.softened, u.softened, load, self.r, self.r_s, self.tension)
+        return dict(zip("vu", tendon_strains(law, unbent_flexibility(nominal)), strict=True))
 
     def stresses(self, strains: Fields) -> Fields:
         """Return the tendons' part of Rᵀn and Rᵀm."""
@@ -177,33 +150,29 @@ def _levers(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) ->
     return jnp.stack([tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx]), shorter
 
 
-def _left(x: Any, g: Any, K_v: Any, K_u: Any, ab: Any, tension: Any) -> Float[Any, "6"]:
+def _residual(x: Any, g: Any, law: TendonLaw) -> Float[Any, "6"]:
     """Return the law's residual at x."""
-    elastic = jnp.concatenate([dot(K_v, x[:3]), dot(K_u, x[3:])])
-    return elastic + dot(g, tension) - ab
+    elastic = jnp.concatenate([dot(law.K_v, x[:3]), dot(law.K_u, x[3:])])
+    return elastic + dot(g, law.tension) - law.load
 
 
-def _stiffness(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
+def _stiffness(g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6 6"]:
     """Return J."""
-    rx, ry = _columns(r)
+    rx, ry = _columns(law.r)
     o, one = jnp.zeros_like(rx), jnp.ones_like(rx)
     # rows of Wᵢ: independent of x, and so constant if r is
     W = [jnp.stack(row) for row in ((one, o, o, o, o, -ry), (o, one, o, o, o, rx), (o, o, one, ry, -rx, o))]
     spread = sum(row[:, None] * row[None, :] for row in W)
-    stiffer = jnp.sum(tension * shorter * (spread - g[:, None] * g[None, :]), axis=2)
+    stiffer = jnp.sum(law.tension * shorter * (spread - g[:, None] * g[None, :]), axis=2)
     nothing = np.zeros((3, 3))
-    upper, lower = jnp.concatenate([K_v, nothing], axis=1), jnp.concatenate([nothing, K_u], axis=1)
+    upper = jnp.concatenate([law.K_v, nothing], axis=1)
+    lower = jnp.concatenate([nothing, law.K_u], axis=1)
     return jnp.concatenate([upper, lower]) + stiffer
 
 
-def _flexibility(g: Any, shorter: Any, K_v: Any, K_u: Any, r: Any, tension: Any) -> Float[Any, "6 6"]:
+def _flexibility(g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6 6"]:
     """Return J⁻¹."""
-    return small_inverse(_stiffness(g, shorter, K_v, K_u, r, tension))
-
-
-def _solved_by_cholesky(J: Any, right: Any) -> Float[Any, "6"]:
-    """Return J⁻¹ times a vector by the library: slower than a written-out inverse, but quick to compile."""
-    return jax.scipy.linalg.cho_solve((jnp.linalg.cholesky(J), True), right)
+    return small_inverse(_stiffness(g, shorter, law))
 
 
 #: optimisation barrier: without it XLA would recompute early results at each later use
@@ -216,22 +185,22 @@ def _turn(dx: Any, shorter: Any, r: Any) -> Any:
     return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
 
 
-def _unturned(K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+def _unturned(law: TendonLaw) -> Float[Any, "6"]:
     """Return the solution with unrotated tendons: a better initial guess far from the unbent rod."""
-    free = -_left(np.zeros(6), _levers(UNBENT, r, r_s)[0], K_v, K_u, ab, tension)
-    return jnp.concatenate([dot(inverse(K_v), free[:3]), dot(inverse(K_u), free[3:])])
+    free = -_residual(np.zeros(6), _levers(UNBENT, law.r, law.r_s)[0], law)
+    return jnp.concatenate([dot(inverse(law.K_v), free[:3]), dot(inverse(law.K_u), free[3:])])
 
 
-def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, tension: Any) -> Float[Any, "6"]:
+def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
     """Return the law's solution, starting from the unbent rod and tendons."""
-    law = flexibility, K_v, K_u, ab, r, r_s, tension
+    known = flexibility, law
 
-    def correction(x: Any, law: Any) -> tuple[Any, Any]:
+    def correction(x: Any, known: Any) -> tuple[Any, Any]:
         """Return minus the flexibility times the residual at x, and the rotation of a tendon by it."""
-        flexibility, K_v, K_u, ab, r, r_s, tension = law
-        g, shorter = _levers(x, r, r_s)
-        dx = -jnp.sum(flexibility * _left(x, g, K_v, K_u, ab, tension), axis=1)
-        return dx, _turn(dx, shorter, r)
+        flexibility, law = known
+        g, shorter = _levers(x, law.r, law.r_s)
+        dx = -jnp.sum(flexibility * _residual(x, g, law), axis=1)
+        return dx, _turn(dx, shorter, law.r)
 
     def unsolved(reached: Any) -> Any:
         count, _, missing = reached
@@ -239,12 +208,13 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
 
     def corrected(reached: Any) -> Any:
         """Return the next iterate of Newton's method, damped."""
-        (count, x, _), (_, K_v, K_u, ab, r, r_s, tension) = _in_turn((reached, law))
-        x = jnp.where(count == 0, _unturned(K_v, K_u, ab, r, r_s, tension), x)
-        g, shorter = _levers(x, r, r_s)
-        J = _stiffness(g, shorter, K_v, K_u, r, tension)
-        dx = -_solved_by_cholesky(J, _left(x, g, K_v, K_u, ab, tension))
-        turned = _turn(dx, shorter, r)
+        (count, x, _), (_, law) = _in_turn((reached, known))
+        x = jnp.where(count == 0, _unturned(law), x)
+        g, shorter = _levers(x, law.r, law.r_s)
+        # slower than a written-out inverse, but quick to compile
+        root = jnp.linalg.cholesky(_stiffness(g, shorter, law))
+        dx = -jax.scipy.linalg.cho_solve((root, True), _residual(x, g, law))
+        turned = _turn(dx, shorter, law.r)
         # damping that guarantees descent for a convex function with |f‴| ≤ 3 f″ (Sun & Tran-Dinh 2019)
         near = turned < SMALL
         x = x + jnp.where(near, 1.0, jnp.log1p(3.0 * turned) / jnp.maximum(3.0 * turned, 1e-300)) * dx
@@ -263,15 +233,15 @@ def _solved(flexibility: Any, K_v: Any, K_u: Any, ab: Any, r: Any, r_s: Any, ten
 
     def once_more(reached: Any) -> Any:
         # the barrier includes the law: XLA would otherwise evaluate it before a loop that may not need it
-        (x, before, _), own = _in_turn((reached, law))
+        (x, before, _), own = _in_turn((reached, known))
         dx, turned = correction(x, own)
         return x + dx, turned, left_over(turned, before)
 
     # the usual first corrections are written out: a loop's bookkeeping takes as long as a correction
-    x = _in_turn(UNBENT + correction(UNBENT, law)[0])
-    dx, first = correction(x, law)
+    x = _in_turn(UNBENT + correction(UNBENT, known)[0])
+    dx, first = correction(x, known)
     x, first = _in_turn((x + dx, first))
-    dx, turned = correction(x, law)
+    dx, turned = correction(x, known)
     x, turned = _in_turn((x + dx, turned))
     x, turned, missing = jax.lax.while_loop(converges, once_more, (x, turned, left_over(turned, first)))
     # continue from x if it is close to the solution
@@ -284,25 +254,22 @@ _solution = jax.custom_jvp(_solved)
 
 
 def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
-    """Return the solution's derivative, J dx = -d(law), for the arguments with tangents (mostly a and b)."""
+    """Return the solution's derivative, J dx = -d(law), for the arguments with tangents (mostly the load)."""
     x = _solution(*primals)
     # the derivative does not depend on the initial flexibility
-    primals, tangents = primals[1:], tangents[1:]
-    moves = [not isinstance(tangent, SymbolicZero) for tangent in tangents]
+    (_, law), (_, tangents) = primals, tangents
+    moves = TendonLaw(*(not isinstance(tangent, SymbolicZero) for tangent in tangents))
+    g, shorter = _in_turn(_levers(x, law.r, law.r_s))
 
-    K_v, K_u, _, r, r_s, tension = primals
-    g, shorter = _in_turn(_levers(x, r, r_s))
-    runs_elsewhere = moves[3] or moves[4]
+    def residual(*moving: Any) -> Any:
+        values = iter(moving)
+        changed = TendonLaw(*(next(values) if m else p for m, p in zip(moves, law, strict=True)))
+        return _residual(x, _levers(x, changed.r, changed.r_s)[0] if moves.r or moves.r_s else g, changed)
 
-    def left(*moving: Any) -> Any:
-        given = iter(moving)
-        K_v, K_u, ab, r, r_s, T = (next(given) if m else p for m, p in zip(moves, primals, strict=True))
-        return _left(x, _levers(x, r, r_s)[0] if runs_elsewhere else g, K_v, K_u, ab, T)
-
-    moving = [p for m, p in zip(moves, primals, strict=True) if m]
+    moving = [p for m, p in zip(moves, law, strict=True) if m]
     along = [t for m, t in zip(moves, tangents, strict=True) if m]
-    _, change = jax.jvp(left, moving, along)
-    return x, -dot_by_rows(_flexibility(g, shorter, K_v, K_u, r, tension), change)
+    _, change = jax.jvp(residual, moving, along)
+    return x, -dot_by_rows(_flexibility(g, shorter, law), change)
 
 
 _solution.defjvp(_slope, symbolic_zeros=True)

@@ -30,7 +30,7 @@ from knode_cosserat.rods.tendons import (
     tension,
 )
 from knode_cosserat.rods.trained_range import TrainedRange
-from knode_cosserat.rotation import cross, dot, rotation_matrix
+from knode_cosserat.rotation import cross, dot
 
 #: angles of the paper's four tendons about the rod, π/4 + iπ/2
 FOUR_TENDONS = tuple(np.pi / 4 + i * np.pi / 2 for i in range(4))
@@ -246,7 +246,16 @@ RIBS = tuple((k + 1) / 9 for k in range(9))
 
 
 class _VirtualTendons(PulledTendons):
-    """Controls of a virtual robot's tendons."""
+    """Tendons of a virtual robot: their controls, and the masses of the ribs in which they run."""
+
+    def load(self, point: RodPoint) -> Wrench:
+        """Return weight less inertia of the ribs per length, each spread along the rod."""
+        away = (point.s / point.rod.length - np.array(RIBS)) * point.rod.length / RIB_WIDTH
+        # a Gaussian, with half of the last one beyond the tip
+        lump = jnp.exp(-0.5 * away**2) / (RIB_WIDTH * np.sqrt(2.0 * np.pi))
+        _, R, q, w, q_t, _ = point.motion
+        mass = point.rod.rib_mass * jnp.sum(lump)
+        return Wrench(-mass * (dot(R, cross(w, q) + q_t) - point.rod.gravity), jnp.zeros(3))
 
     def actuation(self, rod: Any, control: Float[Any, " c"]) -> Float[Any, "3"]:
         """Return the total tension, and its moment about the axis (N, N·m, N·m)."""
@@ -289,35 +298,19 @@ class VirtualRobot(TendonRod):
         inside = jnp.exp(-((s / self.sleeve_length) ** 2))
         return self.Kbt * (1.0 + (self.sleeve_factor - 1.0) * inside)
 
-    def tendon_moment(self, s: Any, u_t: Float[Any, "3"], control: Any) -> Float[Any, "3"]:
+    def tendon_moment(self, s: Any, control: Any, u: Any, u_t: Float[Any, "3"]) -> Float[Any, "3"]:
         """Return Σ T_i r_i × d₃ (N·m) at s, material frame, at the rate of curvature u_t."""
         x, y = jnp.cos(self.tendon_angles), jnp.sin(self.tendon_angles)
         pulled_in = self.tendon_offset * (x * u_t[1] - y * u_t[0])
         loss = self.friction * s / self.length * jnp.tanh(pulled_in / self.sliding)
-        T = jnp.asarray(control) * (1.0 - loss)
+        T = control * (1.0 - loss)
         return self.tendon_offset * jnp.stack([jnp.sum(T * y), -jnp.sum(T * x), jnp.zeros(())])
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u with the tendons."""
         n, m = self.stresses(y)
         pulled = n - jnp.sum(jnp.asarray(control)) * np.array([0.0, 0.0, 1.0])
-        moment = jax.tree_util.Partial(_tendon_moment, self, s, jnp.asarray(control))
+        moment = jax.tree_util.Partial(VirtualRobot.tendon_moment, self, s, jnp.asarray(control))
         v = Viscoelastic(self.Kse, self.shear_damping, pulled + self.Kse @ self.v_star)
         u = Viscoelastic(self.stiffness(s), self.bending_damping, m, moment=moment)
         return MaterialLaw({"v": v, "u": u})
-
-    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return y_s of a rod without tendons, with the ribs' masses."""
-        away = (s / self.length - np.array(RIBS)) * self.length / RIB_WIDTH
-        # a Gaussian, with half of the last one beyond the tip
-        lump = jnp.exp(-0.5 * away**2) / (RIB_WIDTH * np.sqrt(2.0 * np.pi))
-        mass = self.rib_mass * jnp.sum(lump)
-        y_s = super().balance(s, t, y, y_t, z, z_t, control)
-        R = rotation_matrix(self.y_layout.get(y, "h"))
-        q, w, q_t = self.y_layout.get(y, "q"), self.y_layout.get(y, "w"), self.y_layout.get(y_t, "q")
-        more = mass * (dot(R, cross(w, q) + q_t) - self.gravity)
-        return y_s.at[self.y_layout.slice("n")].add(more)
-
-
-def _tendon_moment(robot: VirtualRobot, s: Any, control: Any, u: Any, u_t: Any) -> Float[Any, "3"]:
-    return robot.tendon_moment(s, u_t, control)
