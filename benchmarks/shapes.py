@@ -6,12 +6,12 @@ import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.trajectory import Trajectory
 
 
 def resting(
-    system: Rod,
+    system: SlenderRod,
     p: Float[np.ndarray, "nodes 3"],
     h: Float[np.ndarray, "nodes 4"],
     v: Float[np.ndarray, "nodes 3"],

@@ -23,7 +23,7 @@ def test_a_source_is_that_of_the_object():
     lines, first = inspect.getsourcelines(BDFAlpha.coefficients)
     assert (file.name, line) == ("time.py", first)
     assert code == textwrap.dedent("".join(lines)).rstrip()
-    decorated = source.found("knode_cosserat.rods.rod.Rod.section")[2]
+    decorated = source.found("knode_cosserat.rods.rod.SlenderRod.section")[2]
     assert decorated.startswith("@property\ndef section") and decorated.endswith("(self.radius)")
 
 

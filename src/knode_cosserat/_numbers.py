@@ -46,7 +46,7 @@ def real_array(values: Any) -> np.ndarray:
     array = np.asarray(values)
     kind = array.dtype.kind
     if kind == "O":
-        words = next((each for each in array.ravel() if isinstance(each, (str, bytes, bool))), None)
+        words = next((one for one in array.ravel() if isinstance(one, (str, bytes, bool))), None)
         if words is not None:
             raise ValueError(f"one of them is {words!r}")
     elif kind in _NO_NUMBERS:

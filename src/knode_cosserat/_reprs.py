@@ -38,7 +38,7 @@ def quantity(value: Any, unit: str = "", digits: int = 4) -> str:
     if array.ndim == 1 and array.size <= MOST:
         size = np.max(np.abs(array), initial=0.0)
         rounded = np.where(np.abs(array) < ROUNDING * size, 0.0, array)
-        return "[" + ", ".join(f"{each:.{digits}g}" for each in rounded) + "]" + shown
+        return "[" + ", ".join(f"{number:.{digits}g}" for number in rounded) + "]" + shown
     known = array[np.isfinite(array)]
     if not known.size:
         return f"no values {array.shape}"
@@ -47,7 +47,7 @@ def quantity(value: Any, unit: str = "", digits: int = 4) -> str:
 
 def field_text(value: Any, unit: str = "") -> str:
     """Return the text of a field: a number with its unit, words, or the classes of parts."""
-    if isinstance(value, tuple | list) and not all(isinstance(each, int | float) for each in value):
+    if isinstance(value, tuple | list) and not all(isinstance(one, int | float) for one in value):
         return "(" + ", ".join(map(field_text, value)) + ")"
     if isinstance(value, _SHOWN):
         return quantity(value, unit)

@@ -60,8 +60,11 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as a mapping for JSON."""
-        own = dataclasses.asdict(self)
-        return {**own, "checks": [check._asdict() for check in self.checks], "well": self.well}
+        return {
+            **dataclasses.asdict(self),
+            "checks": [check._asdict() for check in self.checks],
+            "well": self.well,
+        }
 
     def __repr__(self) -> str:
         wrong = [check.name for check in self.checks if not check.well]

@@ -137,9 +137,11 @@ def mean_turned(turn: Float[Any, "3"], vector: Float[Any, "3"]) -> Float[Any, "3
     real, over, square = _half(turn)
     small = square < SMALL
     # (1 - sin(angle) / angle) / angle²
-    left = jnp.where(small, 1 / 6 - square / 120.0, (1.0 - 2.0 * over * real) / jnp.where(small, 1.0, square))
+    third = jnp.where(
+        small, 1 / 6 - square / 120.0, (1.0 - 2.0 * over * real) / jnp.where(small, 1.0, square)
+    )
     across = cross(turn, vector)
-    return vector + 2.0 * over * over * across + left * cross(turn, across)
+    return vector + 2.0 * over * over * across + third * cross(turn, across)
 
 
 def inverse(matrix: Float[Any, "3 3"]) -> Float[Any, "3 3"]:
@@ -165,8 +167,8 @@ def small_inverse(matrix: Float[Any, "n n"]) -> Float[Any, "n n"]:
         return jnp.linalg.inv(matrix)
     A, B, C, D = matrix[:3, :3], matrix[:3, 3:], matrix[3:, :3], matrix[3:, 3:]
 
-    def product(left: Any, right: Any) -> Any:
-        return jnp.stack([dot(left, column) for column in _columns(right)], axis=1)
+    def product(one: Any, other: Any) -> Any:
+        return jnp.stack([dot(one, column) for column in _columns(other)], axis=1)
 
     inverse_A = inverse(A)
     across = product(inverse_A, B)

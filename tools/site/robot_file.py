@@ -9,7 +9,7 @@ import numpy as np
 
 from knode_cosserat.rods.parameters import Choice, Parameter, kinds_of, parameters_of, slots_of, stated_of
 from knode_cosserat.rods.robot_file import KINDS, NODES
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import SlenderRod
 
 SHAPES = {
     "scalar": "number",
@@ -40,17 +40,17 @@ FAMILIES = {
 
 def page() -> str:
     """Return the reference: kinds of robots, then the families of their parts."""
-    rod = set(parameters_of(Rod)) | set(slots_of(Rod)) | set(stated_of(Rod, Choice))
-    of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, Rod)]
+    rod = set(parameters_of(SlenderRod)) | set(slots_of(SlenderRod)) | set(stated_of(SlenderRod, Choice))
+    of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, SlenderRod)]
     shared = [
         "[Download the schema](robot.schema.json)",
         "## Robots of one rod",
         "Entries of all of `" + "`, `".join(kind for kind, cls in KINDS.items() if cls in of_a_rod) + "`.",
-        HEAD + "\n".join([*_rows(Rod, rod), _nodes()]),
+        HEAD + "\n".join([*_rows(SlenderRod, rod), _nodes()]),
     ]
     parts = []
     for kind, cls in KINDS.items():
-        one = issubclass(cls, Rod)
+        one = issubclass(cls, SlenderRod)
         rows = _rows(cls, None, without=rod) if one else [*_rows(cls, None), _nodes()]
         after = "No further entries." if one and not rows else HEAD + "\n".join(rows)
         parts += [f"## `{kind}`", _first(cls), after]

@@ -106,10 +106,10 @@ def parameters(system: System) -> dict[str, dict[str, Any]]:
 def derived(system: System) -> dict[str, dict[str, Any]]:
     """Return quantities that follow from the parameters, in the same form."""
     from knode_cosserat.rods.loads import AttachedMass
-    from knode_cosserat.rods.rod import Rod
+    from knode_cosserat.rods.rod import SlenderRod
 
     system = nominal_model(system)
-    if not isinstance(system, Rod):
+    if not isinstance(system, SlenderRod):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
     attached = sum(float(load.mass) for load in system.loads if isinstance(load, AttachedMass))

@@ -85,13 +85,13 @@ class Layout:
 
     def replaced(self, packed: Any, names: tuple[str, ...], values: Any) -> Any:
         """Return a packed vector with other values of the named fields; `values` is their concatenation."""
-        given, at = {}, 0
+        parts, at = {}, 0
         for name in names:
             where = self.slice(name)
-            given[name] = values[at : at + where.stop - where.start]
+            parts[name] = values[at : at + where.stop - where.start]
             at += where.stop - where.start
         # as a concatenation: XLA fuses it with later operations, unlike a scatter
-        return jnp.concatenate([given.get(each.name, self.get(packed, each.name)) for each in self.fields])
+        return jnp.concatenate([parts.get(field.name, self.get(packed, field.name)) for field in self.fields])
 
     def beyond(self, packed: Any) -> str:
         """Describe the first control (…, size) outside its field's limits; empty if all are within."""

@@ -19,7 +19,7 @@ from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.parts import RodPoint
-from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, Rod
+from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, SlenderRod
 from knode_cosserat.rods.strands import Bundle, in_strands
 from knode_cosserat.rods.system import Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
@@ -28,7 +28,7 @@ from knode_cosserat.rotation import cross, dot, rotation_matrix
 FIELDS = np.cumsum([field.size for field in Y_LAYOUT.fields])[:-1]
 
 
-class Leg(Rod):
+class _Leg(SlenderRod):
     """The rod between base and platform. Its control is the control of the whole robot."""
 
     y_layout: ClassVar[Layout] = Y_LAYOUT
@@ -44,10 +44,10 @@ class Leg(Rod):
 
 
 def _of_rod(name: str) -> Any:
-    """Return a field that states a parameter as `Leg` does."""
-    stated = Leg.__dataclass_fields__[name]
-    given = {} if stated.default is dataclasses.MISSING else {"default": stated.default}
-    return dataclasses.field(metadata=stated.metadata, **given)
+    """Return a field that states a parameter as `_Leg` does."""
+    stated = _Leg.__dataclass_fields__[name]
+    default = {} if stated.default is dataclasses.MISSING else {"default": stated.default}
+    return dataclasses.field(metadata=stated.metadata, **default)
 
 
 class ParallelRobot(Bundle):
@@ -65,7 +65,7 @@ class ParallelRobot(Bundle):
     the theory of slender beams. A simulation therefore starts at the equilibrium under zero control.
     """
 
-    strand_class: ClassVar[type[System]] = Leg
+    strand_class: ClassVar[type[System]] = _Leg
     length: Any = _of_rod("length")
     radius: Any = _of_rod("radius")
     density: Any = _of_rod("density")
@@ -116,9 +116,9 @@ class ParallelRobot(Bundle):
         return np.shape(self.base_angles)[-1]
 
     @property
-    def strand(self) -> Leg:
+    def strand(self) -> _Leg:
         """Equations along a leg; the legs share them."""
-        return Leg(**{name: getattr(self, name) for name in LEG}, legs=self.strands, nodes=self.nodes)
+        return _Leg(**{name: getattr(self, name) for name in LEG}, legs=self.strands, nodes=self.nodes)
 
     @property
     def control_layout(self) -> Layout:  # type: ignore[override]
@@ -233,7 +233,7 @@ class ParallelRobot(Bundle):
 
 
 #: rod parameters that a leg takes from the robot
-LEG = tuple(name for name in ParallelRobot.parameters() if name in Leg.parameters())
+LEG = tuple(name for name in ParallelRobot.parameters() if name in _Leg.parameters())
 
 
 class _PlatformEnds(Ends, of=ParallelRobot):

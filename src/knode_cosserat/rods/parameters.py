@@ -472,15 +472,15 @@ def in_order(cls: type) -> dict[str, Any]:
 class Parametrised(eqx.Module):
     """Base of systems and their parts: parameters, stated in the class and passed by name."""
 
-    def __new__(cls, *args: Any, **given: Any) -> Self:
+    def __new__(cls, *args: Any, **fields: Any) -> Self:
         """Raise `ParameterError` that lists the known names; Python's own message would not."""
-        for name in given.keys() - {field.name for field in dataclasses.fields(cls)}:
+        for name in fields.keys() - {field.name for field in dataclasses.fields(cls)}:
             # a class may define its own constructor
             stated = inspect.signature(cls.__init__).parameters
             if name in stated or any(one.kind is one.VAR_KEYWORD for one in stated.values()):
                 continue
             raise ParameterError(unknown_parameter(cls, name, [one for one in stated if one != "self"]))
-        return super().__new__(cls, *args, **given)
+        return super().__new__(cls, *args, **fields)
 
     @classmethod
     def parameters(cls) -> dict[str, Parameter]:
@@ -608,10 +608,10 @@ def owner_at(owner: Any, path: str) -> tuple[Any, str]:
 def parameter_at(owner: Any, path: str) -> Parameter | None:
     """Return the statement of a parameter; None if there is no such parameter or part."""
     try:
-        found, name = owner_at(owner, path)
+        owner, name = owner_at(owner, path)
     except ParameterError:
         return None
-    return parameters_of(type(found)).get(name) if dataclasses.is_dataclass(found) else None
+    return parameters_of(type(owner)).get(name) if dataclasses.is_dataclass(owner) else None
 
 
 def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
@@ -623,17 +623,18 @@ def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
     inner = _entry(owner, first, name)
     changed = with_value(inner, rest, value, name) if rest else value
     if isinstance(owner, tuple):
-        return tuple(changed if k == int(first) else each for k, each in enumerate(owner))
+        return tuple(changed if k == int(first) else part for k, part in enumerate(owner))
     return dataclasses.replace(owner, **{first: changed})
 
 
 def _entry(owner: Any, part: str, name: str) -> Any:
     """Return a field of a robot or part, or an entry of a tuple of parts. Raises `ParameterError`."""
-    several = isinstance(owner, tuple)
-    stated = dataclasses.fields(owner) if dataclasses.is_dataclass(owner) else ()
-    known = [str(k) for k in range(len(owner))] if several else [field.name for field in stated]
+    if isinstance(owner, tuple):
+        known = [str(k) for k in range(len(owner))]
+    else:
+        known = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
     if part not in known:
         raise ParameterError(
             f"there is no parameter {name!r}: no {part!r} among {', '.join(known) or 'nothing'}"
         )
-    return owner[int(part)] if several else getattr(owner, part)
+    return owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)

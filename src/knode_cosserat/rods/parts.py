@@ -3,8 +3,8 @@
 A part is a small class of a family, with its own parameters. A family is an abstract class. Its subclasses
 with a `kind` can be named in a robot's file. A part contributes to the robot (`Contribution`): fields of y
 and z, terms of the material's law and of the balance, conditions at the tip, discontinuities, controls. A rod
-asks its parts in their order (`Rod.parts`), and knows nothing else about them. A new effect is therefore one
-class: an `Effect` for any rod, or a load, a section, an obstacle.
+asks its parts in their order (`SlenderRod.parts`), and knows nothing else about them. A new effect is
+therefore one class: an `Effect` for any rod, or a load, a section, an obstacle.
 """
 
 from __future__ import annotations
@@ -139,6 +139,20 @@ class Contribution:
         """Return the form in which the part's control enters the equations; by default the control."""
         return control
 
+    # the tendons of its robot
+
+    def transmitted(self, point: RodPoint, tension: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return the tensions τ (N) at a point with this part's friction."""
+        return tension
+
+    def running(self, point: RodPoint, values: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return values of the tendons at a point, less those of tendons that this part ends before it."""
+        return values
+
+    def mobilised(self, point: RodPoint, friction: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return the mobilised fraction of the friction with this part."""
+        return friction
+
 
 class Part(Contribution, Parametrised):
     """Base class of parts with parameters."""
@@ -158,7 +172,7 @@ class Part(Contribution, Parametrised):
 
 
 class Effect(Part):
-    """Further physics of a rod (`Rod.effects`), such as an added mass or a layer with internal variables."""
+    """Further physics of a rod, such as an added mass or a layer with internal variables."""
 
 
 @functools.singledispatch
@@ -170,11 +184,11 @@ def eased(system: Any, part: float) -> Any:
     """
     changes: dict[str, Any] = {}
     for name in slots_of(type(system)):
-        held = getattr(system, name)
-        several = held if isinstance(held, tuple) else (held,)
-        easier = tuple(each and each.eased(part) for each in several)
-        if any(new is not old for new, old in zip(easier, several, strict=True)):
-            changes[name] = easier if isinstance(held, tuple) else easier[0]
+        value = getattr(system, name)
+        parts = value if isinstance(value, tuple) else (value,)
+        easier = tuple(one and one.eased(part) for one in parts)
+        if any(new is not old for new, old in zip(easier, parts, strict=True)):
+            changes[name] = easier if isinstance(value, tuple) else easier[0]
     return system.replace(**changes) if changes else system
 
 

@@ -64,8 +64,11 @@ NO_CONTROL = np.zeros(0)
 AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
-class Rod(System):
-    """A round rod with gravity, drag, loads, ends, surroundings and further effects.
+class SlenderRod(System):
+    """A round rod that is driven by its ends, loads and sections, and in contact with its surroundings.
+
+    With controlled curvature or stiffness of its `sections` it is a variable-curvature robot. With a driven
+    base and obstacles it is the soft slender robot of Xun, Zheng & Kruszewski (2024).
 
     All other terms of its equations are contributions of its `parts`. A subclass adds parts of its own, such
     as actuators.
@@ -126,12 +129,12 @@ class Rod(System):
 
         A subclass adds its own to these.
         """
-        several: Any = {
+        lists: dict[str, tuple[Contribution, ...]] = {
             "section": self.sections, "obstacle": self.surroundings, "load": self.loads,
             "effect": self.effects,
         }  # fmt: skip
-        ends = {"base": self.base_end, "tip": self.tip_end}
-        return ends | {f"{name}{k}": each for name, those in several.items() for k, each in enumerate(those)}
+        ends: dict[str, Contribution] = {"base": self.base_end, "tip": self.tip_end}
+        return ends | {f"{name}{k}": part for name, parts in lists.items() for k, part in enumerate(parts)}
 
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]
@@ -162,21 +165,26 @@ class Rod(System):
 
     def inputs(self, control: Any) -> list[tuple[Contribution, Any]]:
         """Return the parts, each with its control."""
-        found, first = [], 0
+        inputs: list[tuple[Contribution, Any]] = []
+        first = 0
         for part in self.parts.values():
             last = first + sum(field.size for field in part.control_fields)
             # an empty slice would only be traced
-            found.append((part, control[first:last] if last > first else NO_CONTROL))
+            inputs.append((part, control[first:last] if last > first else NO_CONTROL))
             first = last
-        return found
+        return inputs
+
+    def at_parts(self, point: RodPoint) -> list[tuple[Contribution, RodPoint]]:
+        """Return the parts, each with the point and its control."""
+        return [(part, point._replace(input=input)) for part, input in self.inputs(point.control)]
 
     def section_controls(self, control: Any) -> list[Any]:
         """Return the control of each section."""
-        return [own for part, own in self.inputs(control) if isinstance(part, SectionChange)]
+        return [input for part, input in self.inputs(control) if isinstance(part, SectionChange)]
 
     def end_controls(self, control: Any) -> list[Any]:
         """Return the controls of the ends."""
-        return [own for part, own in self.inputs(control) if isinstance(part, End)]
+        return [input for part, input in self.inputs(control) if isinstance(part, End)]
 
     # derived quantities
 
@@ -283,14 +291,13 @@ class Rod(System):
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u, linear but for the parts, and of internal variables."""
         motion = Motion.of(self.y_layout, y, y_t)
-        point = RodPoint(self, s, t, y, y_t, control, motion, self.material(s, control))
-        parts = [(part, point._replace(input=own)) for part, own in self.inputs(control)]
-        evolutions = {name: law for part, own in parts for name, law in part.evolutions(own).items()}
+        parts = self.at_parts(RodPoint(self, s, t, y, y_t, control, motion, self.material(s, control)))
+        evolutions = {name: law for part, point in parts for name, law in part.evolutions(point).items()}
 
         def law(internal: Fields) -> MaterialLaw:
             total = self.linear_law(s, y, control)
-            for part, own in parts:
-                total = part.law(own, total, internal)
+            for part, point in parts:
+                total = part.law(point, total, internal)
             return total
 
         return InternalState(evolutions, law) if evolutions else law({})
@@ -313,14 +320,12 @@ class Rod(System):
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
         q_s = v_t - cross(u, q) + cross(w, v)
         w_s = u_t - cross(u, w)
-        point = RodPoint(self, s, t, y, y_t, control, motion, material, z, z_t)
         rates: Fields = {}
-        for part, own in self.inputs(control):
-            at = point._replace(input=own)
-            load = part.load(at)
+        for part, point in self.at_parts(RodPoint(self, s, t, y, y_t, control, motion, material, z, z_t)):
+            load = part.load(point)
             if load is not None:
                 n_s, m_s = n_s - load.force, m_s - load.moment
-            rates |= part.rates(at)
+            rates |= part.rates(point)
         return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
 
     # discontinuities: places where something begins, ends or pulls
@@ -348,8 +353,8 @@ class Rod(System):
         """Return the sum of the point loads, each times the weight of its place."""
         motion = Motion.of(self.y_layout, y, y_t)
         acting = [
-            (part, weights[part.applied_at], own)
-            for part, own in self.inputs(control)
+            (part, weights[part.applied_at], input)
+            for part, input in self.inputs(control)
             if part.applied_at in weights
         ]
         return point_wrench(acting, motion, self.gravity)
@@ -383,7 +388,7 @@ class Rod(System):
         def curvature(at: Any) -> Any:
             return self.material(at, still).u_star
 
-        ends = {place for each in self.sections for place in (each.begin, each.end)}
+        ends = {place for section in self.sections for place in (section.begin, section.end)}
         edges = np.array(sorted({0.0, *ends, 1.0}))
         # z at a node is the far-side value, and where two sections meet both curvatures act; the margin is
         # less than the distance that moves places away from that side
@@ -417,7 +422,7 @@ class Rod(System):
             h = self.y_layout.get(y, "h")
             rows.append(jnp.sum(h * h)[None] - 1.0)
         point = RodPoint(self, self.length, t, y, y_t, control, Motion.of(self.y_layout, y, y_t))
-        others = (part.tip_rows(point._replace(input=own)) for part, own in self.inputs(control))
+        others = (part.tip_rows(at) for part, at in self.at_parts(point))
         return jnp.concatenate([*rows, *(row for row in others if row is not None)])
 
     def scales(self) -> Scales:
@@ -434,18 +439,10 @@ class Rod(System):
         return Scales(of(self.y_layout), of(Ends.of(self).layout))
 
 
-class SlenderRod(Rod):
-    """A rod that is pushed, pulled and turned at its ends, loaded, and in contact with its surroundings.
-
-    With controlled curvature or stiffness of its `sections` it is a variable-curvature robot. With a driven
-    base and obstacles it is the soft slender robot of Xun, Zheng & Kruszewski (2024).
-    """
-
-
-class _RodEnds(Ends, of=Rod):
+class _RodEnds(Ends, of=SlenderRod):
     """Ends of a rod, and the conditions of its parts."""
 
-    system: Rod
+    system: SlenderRod
 
     @property
     def held(self) -> bool:
@@ -470,8 +467,8 @@ class _RodEnds(Ends, of=Rod):
         rod = self.system
         ends = (rod.base_end, AT_ORIGIN), (rod.tip_end, rod.pose(rod.rest(rod.length)[0]))
         base, tip = (
-            end.pose(rest, own) if isinstance(end, Clamped) else None
-            for (end, rest), own in zip(ends, rod.end_controls(control), strict=True)
+            end.pose(rest, input) if isinstance(end, Clamped) else None
+            for (end, rest), input in zip(ends, rod.end_controls(control), strict=True)
         )
         return base, tip
 
@@ -484,10 +481,10 @@ class _RodEnds(Ends, of=Rod):
         return jnp.concatenate([y[:13], q, w, y[19:]])
 
 
-class _RodObserved(Observed, of=Rod):
+class _RodObserved(Observed, of=SlenderRod):
     """Motion and bending of a rod, in the material frame, and the controls of its parts."""
 
-    system: Rod
+    system: SlenderRod
     velocities: ClassVar[tuple[str, ...]] = ("q", "w", "u_t")
 
     @property
@@ -506,7 +503,7 @@ class _RodObserved(Observed, of=Rod):
         """Return acceleration, spin, q, w, curvature and its rate; see `layout`."""
         _, s, _, y, y_t, control, *_ = point
         layout, strains = self.system.y_layout, self.system.z_layout
-        (q, w), (q_t, w_t) = ([layout.get(given, name) for name in ("q", "w")] for given in (y, y_t))
+        (q, w), (q_t, w_t) = ([layout.get(state, name) for name in ("q", "w")] for state in (y, y_t))
         J = np.diag([1.0, 1.0, 2.0])
         acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
         bent = strains.get(point.z, "u") - self.system.material(s, control).u_star
@@ -515,7 +512,7 @@ class _RodObserved(Observed, of=Rod):
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return the controls of the parts in the form in which they enter the equations."""
         rod = self.system
-        return jnp.concatenate([part.actuation(rod, own) for part, own in rod.inputs(control)])
+        return jnp.concatenate([part.actuation(rod, input) for part, input in rod.inputs(control)])
 
     @property
     def has_actuation(self) -> bool:

@@ -135,13 +135,13 @@ class FunctionRouting(Routing):
         if not callable(self.function):
             raise ParameterError(f"FunctionRouting: function is {self.function!r}; {allowed}")
         try:
-            given = jax.eval_shape(self.function, jnp.zeros(()))
+            result = jax.eval_shape(self.function, jnp.zeros(()))
         except Exception as error:
             first = (str(error).splitlines() or [""])[0]
             raise ParameterError(
                 f"FunctionRouting: function raises {type(error).__name__}: {first}; {allowed}"
             ) from None
-        shapes = [np.shape(part) for part in given] if isinstance(given, tuple | list) else given
+        shapes = [np.shape(part) for part in result] if isinstance(result, tuple | list) else result
         if shapes != [(), ()]:
             raise ParameterError(f"FunctionRouting: function gives shapes {shapes}; {allowed}")
 
@@ -241,7 +241,7 @@ def path_lengths(
     `curvature` returns u (1/m) at an arclength (m).
     """
     nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
-    found = []
+    lengths = []
     for routing in routings:
         last = jnp.minimum(s, routing.end * length)
         at = 0.5 * (nodes + 1.0) * jnp.asarray(last)[..., None]
@@ -250,8 +250,8 @@ def path_lengths(
             r, r_s = routes((routing,), place / length, length)
             return stretches(*map(jnp.asarray, (ALONG, curvature(place), r, r_s)))[0]
 
-        found.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
-    return jnp.stack(found)
+        lengths.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
+    return jnp.stack(lengths)
 
 
 def _vectors(places: list[tuple[Any, Any]]) -> Any:

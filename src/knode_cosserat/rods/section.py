@@ -143,9 +143,8 @@ class Stretch(SectionChange):
                 continue
             least, where = _least(np.asarray(coefficients, dtype=float))
             if not least > 0.0:
-                given = np.asarray(coefficients).tolist()
                 raise ParameterError(
-                    f"{type(self).__name__}: {name} is {given}, which is {least:.3g} at ξ = {where:.3g}; "
+                    f"{type(self).__name__}: {name} is {np.asarray(coefficients).tolist()}, which is {least:.3g} at ξ = {where:.3g}; "
                     "allowed is what is above 0 all along the stretch"
                 )
 

@@ -233,8 +233,8 @@ def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
 
     def once_more(reached: Any) -> Any:
         # the barrier includes the law: XLA would otherwise evaluate it before a loop that may not need it
-        (x, before, _), own = _in_turn((reached, known))
-        dx, turned = correction(x, own)
+        (x, before, _), later = _in_turn((reached, known))
+        dx, turned = correction(x, later)
         return x + dx, turned, left_over(turned, before)
 
     # the usual first corrections are written out: a loop's bookkeeping takes as long as a correction

@@ -15,7 +15,7 @@ from knode_cosserat.rods.loads import transverse_force
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, slot
 from knode_cosserat.rods.parts import Contribution, RodPoint, Wrench
 from knode_cosserat.rods.relaxation import Relaxation
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.routing import OffsetPaths, RoutedPaths, Routing
 from knode_cosserat.rods.tendons import (
     EarlyAnchors,
@@ -36,7 +36,7 @@ from knode_cosserat.rotation import cross, dot
 FOUR_TENDONS = tuple(np.pi / 4 + i * np.pi / 2 for i in range(4))
 
 
-class TendonRod(Rod):
+class TendonRod(SlenderRod):
     """A rod with tendons around it. A subclass defines the part `tendons`, their action on the rod."""
 
     tendon_offset: Any = parameter(

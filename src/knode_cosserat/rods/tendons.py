@@ -97,9 +97,8 @@ class Reels(Part):
         motors = np.abs(np.asarray(self.motors))
         count = int(motors.max())
         if not np.array_equal(np.unique(motors), np.arange(1, count + 1)):
-            given = np.asarray(self.motors).tolist()
             raise ParameterError(
-                f"Reels: motors is {given}; allowed is one whole number for each tendon, that of its motor "
+                f"Reels: motors is {np.asarray(self.motors).tolist()}; allowed is one whole number for each tendon, that of its motor "
                 "from 1 on, negative on the side that lets out"
             )
         if self.radius is None and self.zero is None and count != len(motors):
@@ -196,26 +195,10 @@ def undelayed(
 BLEND = 1e-7
 
 
-class TendonContribution(Contribution):
-    """Contribution of a part that changes the tendons' tension; by default it does not."""
-
-    def transmitted(self, point: RodPoint, tension: Float[Any, " c"]) -> Float[Any, " c"]:
-        """Return the tensions τ (N) at a point with this part's friction."""
-        return tension
-
-    def running(self, point: RodPoint, values: Float[Any, " c"]) -> Float[Any, " c"]:
-        """Return values of the tendons at a point, less those of tendons that this part ends before it."""
-        return values
-
-    def mobilised(self, point: RodPoint, friction: Float[Any, " c"]) -> Float[Any, " c"]:
-        """Return the mobilised fraction of the friction with this part."""
-        return friction
-
-
 def running(point: RodPoint, values: Float[Any, " c"]) -> Float[Any, " c"]:
     """Return the tendons' values at a point, less those of tendons that end before it."""
     for part in point.rod.parts.values():
-        values = part.running(point, values) if isinstance(part, TendonContribution) else values
+        values = part.running(point, values)
     return values
 
 
@@ -228,12 +211,12 @@ def tension(point: RodPoint) -> Float[Any, " c"]:
     """Return the tensions τ (N) at a point: reduced by friction, and zero beyond a tendon's end."""
     T = base_tension(point)
     for part in point.rod.parts.values():
-        T = part.transmitted(point, T) if isinstance(part, TendonContribution) else T
+        T = part.transmitted(point, T)
     return running(point, T)
 
 
 @dataclasses.dataclass(frozen=True)
-class PulledTendons(TendonContribution):
+class PulledTendons(Contribution):
     """Controls of tendons that are pulled with a tension."""
 
     count: int
@@ -262,8 +245,8 @@ class RoutedTendons(PulledTendons):
 
     def base_tension(self, point: RodPoint) -> Float[Any, " c"]:
         """Return the tensions T (N) at the base."""
-        given = point.control[: self.count]
-        return given if self.cells is None else self.cells.tension(given)
+        tension = point.control[: self.count]
+        return tension if self.cells is None else self.cells.tension(tension)
 
     def running(self, point: RodPoint, values: Float[Any, " c"]) -> Float[Any, " c"]:
         """Return the values with zero beyond the tendons' anchors."""
@@ -361,7 +344,7 @@ class ReeledTendons(RoutedTendons):
         return control
 
 
-class EarlyAnchors(TendonContribution, Part):
+class EarlyAnchors(Part):
     """A place with early anchors: beyond it each tendon keeps a part of its tension, 0 if anchored there."""
 
     kind: ClassVar[str] = "early-anchors"
@@ -386,7 +369,7 @@ class EarlyAnchors(TendonContribution, Part):
 STRAIGHT = 1e-2
 
 
-class TendonFriction(TendonContribution, Part):
+class TendonFriction(Part):
     """Capstan friction of the tendons, by their length and by the angle they turn, with hysteresis."""
 
     kind: ClassVar[str] = "tendon-friction"
@@ -439,7 +422,7 @@ class TendonFriction(TendonContribution, Part):
         """Return λᵢ_s (1/m)."""
         f = point.get("f")
         for part in point.rod.parts.values():
-            f = part.mobilised(point, f) if isinstance(part, TendonContribution) else f
+            f = part.mobilised(point, f)
         return {"loss": self.loss_rates(point.get("u"), f)}
 
     def loss_rates(self, u: Float[Any, "3"], f: Float[Any, " c"]) -> Float[Any, " c"]:
@@ -456,7 +439,7 @@ class TendonFriction(TendonContribution, Part):
         return dataclasses.replace(self, reach=np.minimum(self.reach / part, 100.0))
 
 
-class Vibration(TendonContribution, Part):
+class Vibration(Part):
     """Loss of friction and of bending stiffness by vibration under high tensions."""
 
     kind: ClassVar[str] = "vibration"

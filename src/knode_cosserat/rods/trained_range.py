@@ -61,15 +61,15 @@ class TrainedRange(Part):
         The control of a first row is ignored: it acted before the motion.
         """
         strains, rates, controls = [], [], []
-        for each in trajectories:
-            z, solved = np.asarray(each.z, dtype=float), np.asarray(each.result) >= 0
+        for trajectory in trajectories:
+            z, solved = np.asarray(trajectory.z, dtype=float), np.asarray(trajectory.result) >= 0
             z = np.where(solved[:, None, None], z, np.nan)
             moving = slice(1 if len(z) > 1 else 0, None)
             strains.append(z.reshape(-1, z.shape[-1]))
-            rates.append(np.asarray(_rates(each.time, z)).reshape(-1, z.shape[-1]))
-            controls.append(np.where(solved[:, None], each.control, np.nan)[moving])
-        ends = [_ends(np.concatenate(each)) for each in (strains, rates, controls) if each]
-        if len(ends) < 3 or not all(np.all(np.isfinite(each)) for each in ends):
+            rates.append(np.asarray(_rates(trajectory.time, z)).reshape(-1, z.shape[-1]))
+            controls.append(np.where(solved[:, None], trajectory.control, np.nan)[moving])
+        ends = [_ends(np.concatenate(rows)) for rows in (strains, rates, controls) if rows]
+        if len(ends) < 3 or not all(np.all(np.isfinite(end)) for end in ends):
             return None
         return cls(*ends[0], *ends[1], *(ends[2] if ends[2].shape[1] else (None, None)))
 
@@ -82,21 +82,21 @@ class TrainedRange(Part):
         strain = system.z_layout
         beyond = _beyond(strain, z, self.strain_low, self.strain_high)
         beyond |= _beyond(strain, _rates(time, z), self.rate_low, self.rate_high)
-        found = numeric.any(beyond, axis=(-2, -1))
+        outside = numeric.any(beyond, axis=(-2, -1))
         if self.control_low is not None:
             driven = control[..., None, :]
             acted = _beyond(system.control_layout, driven, self.control_low, self.control_high)
             before = np.arange(np.shape(z)[-3]) == 0 if np.shape(z)[-3] > 1 else np.zeros(1, bool)
-            found |= numeric.any(acted, axis=(-2, -1)) & ~before
-        return found
+            outside |= numeric.any(acted, axis=(-2, -1)) & ~before
+        return outside
 
 
 def trained_range(system: Any) -> TrainedRange | None:
     """Return the range of a learned or identified model, or of its nominal model; None without one."""
     while system is not None:
-        found = getattr(system, "trained", None)
-        if found is not None:
-            return found
+        stated: TrainedRange | None = getattr(system, "trained", None)
+        if stated is not None:
+            return stated
         system = getattr(system, "knowledge", None)
     return None
 
@@ -126,7 +126,7 @@ def _beyond(layout: Layout, values: Any, low: Any, high: Any) -> Any:
         for field in layout.fields
     ]
     numeric: Any = jnp if is_traced((values, low)) else np
-    width = numeric.concatenate([numeric.repeat(each, size, axis=-1) for each, size in widths], axis=-1)
+    width = numeric.concatenate([numeric.repeat(width, size, axis=-1) for width, size in widths], axis=-1)
     slack = MARGIN * width + ROUNDING * numeric.maximum(numeric.abs(low), numeric.abs(high))
     return (values < low - slack) | (values > high + slack)
 
@@ -134,7 +134,7 @@ def _beyond(layout: Layout, values: Any, low: Any, high: Any) -> Any:
 def without_range(tree: Any) -> Any:
     """Return a system, or any tree of systems, without ranges, as the solvers' programs expect."""
 
-    def is_range(each: Any) -> bool:
-        return isinstance(each, TrainedRange)
+    def is_range(node: Any) -> bool:
+        return isinstance(node, TrainedRange)
 
-    return jax.tree.map(lambda each: None if is_range(each) else each, tree, is_leaf=is_range)
+    return jax.tree.map(lambda node: None if is_range(node) else node, tree, is_leaf=is_range)

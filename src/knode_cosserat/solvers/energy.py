@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Free, Pinned, Sliding
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWrench
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.guess import continuous, materials, rotations
@@ -43,7 +43,7 @@ SOFT, SOFT_BY_FORCE = 1e4, 200.0
 def is_tested(system: System) -> bool:
     """True for a rod, or a model of one, without actuators and contact, with dead loads only."""
     rod = nominal_model(system)
-    if not isinstance(rod, Rod) or rod.surroundings or rod.effects:
+    if not isinstance(rod, SlenderRod) or rod.surroundings or rod.effects:
         return False
     if any(part.actuates for part in rod.parts.values()):
         return False

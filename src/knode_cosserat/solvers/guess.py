@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from knode_cosserat.engine.places import values_along
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
@@ -65,7 +65,7 @@ def held_ends(system: System, control: Any) -> tuple[HeldEnd | None, HeldEnd | N
 def _poses(system: System, control: Any) -> Any:
     """Return the poses of clamped ends and of pinned ends."""
     rod, pinned = nominal_model(system), list[Any]((None, None))
-    for k, end in enumerate((rod.base_end, rod.tip_end) if isinstance(rod, Rod) else ()):
+    for k, end in enumerate((rod.base_end, rod.tip_end) if isinstance(rod, SlenderRod) else ()):
         if isinstance(end, Pinned):
             p, h = rod.y_layout.split(rod.rest(k * jnp.asarray(rod.length))[0])[:2]
             pinned[k] = Pose(end.pose(Pose(p, h), control[:0]).p, None)
@@ -75,7 +75,7 @@ def _poses(system: System, control: Any) -> Any:
 def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:
     """Return the indices in a control of the rotations of base and tip about x, y, z; -1 if not driven."""
     layout, rod, found = system.control_layout, nominal_model(system), np.full((2, 3), -1)
-    for end, prefix in enumerate(("base", "tip") if isinstance(rod, Rod) else ()):
+    for end, prefix in enumerate(("base", "tip") if isinstance(rod, SlenderRod) else ()):
         for k, axis in enumerate(AXES[3:]):
             if f"{prefix}_{axis}" in layout.names:
                 found[end, k] = layout.slice(f"{prefix}_{axis}").start
@@ -85,7 +85,9 @@ def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:
 def are_clamped(system: System) -> bool:
     """True if the orientation of both ends is prescribed."""
     rod = nominal_model(system)
-    return isinstance(rod, Rod) and all(isinstance(end, Clamped) for end in (rod.base_end, rod.tip_end))
+    return isinstance(rod, SlenderRod) and all(
+        isinstance(end, Clamped) for end in (rod.base_end, rod.tip_end)
+    )
 
 
 def state_from_positions(

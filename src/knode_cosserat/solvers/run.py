@@ -16,7 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.rods.rod import Rod
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
@@ -216,7 +216,7 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
     many, solved = np.ndim(system.length) > 0, np.asarray(rows.result) >= 0
     # a batch of robots of several rods has no `strand`
     strand = system if strand_count(system) == 1 or many else strand_of(system)
-    if not solved.any() or not isinstance(strand, Rod):
+    if not solved.any() or not isinstance(strand, SlenderRod):
         return
     ny, nz = system.y_layout.size, system.z_layout.size
     z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
