@@ -144,8 +144,8 @@ class Stretch(SectionChange):
             least, where = _least(np.asarray(coefficients, dtype=float))
             if not least > 0.0:
                 raise ParameterError(
-                    f"{type(self).__name__}: {name} is {np.asarray(coefficients).tolist()}, which is {least:.3g} at ξ = {where:.3g}; "
-                    "allowed is what is above 0 all along the stretch"
+                    f"{type(self).__name__}: {name} is {np.asarray(coefficients).tolist()}, which is "
+                    f"{least:.3g} at ξ = {where:.3g}; allowed is what is above 0 all along the stretch"
                 )
 
     @property

@@ -98,8 +98,8 @@ class Reels(Part):
         count = int(motors.max())
         if not np.array_equal(np.unique(motors), np.arange(1, count + 1)):
             raise ParameterError(
-                f"Reels: motors is {np.asarray(self.motors).tolist()}; allowed is one whole number for each tendon, that of its motor "
-                "from 1 on, negative on the side that lets out"
+                f"Reels: motors is {np.asarray(self.motors).tolist()}; allowed is one whole number for each "
+                "tendon, that of its motor from 1 on, negative on the side that lets out"
             )
         if self.radius is None and self.zero is None and count != len(motors):
             raise ParameterError("Reels: radius is missing; it is required where tendons share a motor")
