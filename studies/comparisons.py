@@ -62,8 +62,9 @@ class NoKnowledge(System):
         return type(self)(self.model.replace(**changes))
 
 
-for _aspect in (Ends, Drawing, Observed):
-    _aspect.register(NoKnowledge, lambda system, aspect=_aspect: aspect.of(system.model))
+Ends.register(NoKnowledge, lambda system: Ends.of(system.model))
+Drawing.register(NoKnowledge, lambda system: Drawing.of(system.model))
+Observed.register(NoKnowledge, lambda system: Observed.of(system.model))
 
 
 class NodePoses(NamedTuple):

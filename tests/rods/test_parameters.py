@@ -29,10 +29,8 @@ def test_matrices_in_three_ways(robot, given):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (
-            {"youngs_modulo": 1e9},
-            r"no parameter 'youngs_modulo'; there are length, radius, .*; did you mean youngs_modulus\?$",
-        ),
+        ({"youngs_modulo": 1e9},
+         r"no parameter 'youngs_modulo'; there are length, radius, .*; did you mean youngs_modulus\?$"),
         ({"length": -0.1}, r"length must be between 0.001 and 20 m \(got -0.1\)$"),
         ({"length": "long"}, r"length must be a number between 0.001 and 20 m \(got 'long'\)$"),
         ({"length": [1.0, 2.0]}, r"length must be a number .* \(got \[1, 2\]\)$"),
@@ -40,16 +38,14 @@ def test_matrices_in_three_ways(robot, given):
         ({"nodes": 1}, "nodes is 1; allowed is a whole number"),
         ({"nodes": 10.0}, "nodes is 10.0"),
         ({"gravity": [0.0, 1.0]}, r"gravity must be three numbers, .* \(got \[0, 1\]\)$"),
-        (
-            {"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]},
-            r"bending_stiffness must be .*, not symmetric\)$",
-        ),
+        ({"bending_stiffness": [[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]]},
+         r"bending_stiffness must be .*, not symmetric\)$"),
         ({"bending_stiffness": [-1.0, 1.0, 1.0]}, "bending_stiffness must be one number, three"),
         ({"drag": ["1", "2", "3"]}, "drag must be"),
         ({"drag": [True, True, False]}, "drag must be"),
         ({"drag": [[1.0], [1.0, 2.0]]}, "drag must be"),
     ],
-)
+)  # fmt: skip
 def test_what_is_refused(robot, change, message):
     with pytest.raises(kc.robots.ParameterError, match=message) as caught:
         robot.replace(**change)

@@ -129,10 +129,8 @@ HEAD = (
     ("more", "words"),
     [
         ("loads: [{kind: attached-mass, mass: -1}]", "loads.0.mass must be between 0 and 10000 kg (got -1)"),
-        (
-            "loads: [{kind: attached-mass}, {kind: attached-mass, at: 2}]",
-            "loads.1.at must be between 0 and 1 (got 2)",
-        ),
+        ("loads: [{kind: attached-mass}, {kind: attached-mass, at: 2}]",
+         "loads.1.at must be between 0 and 1 (got 2)"),
         (
             "loads: [{kind: attached-mas}]",
             "loads.0.kind is 'attached-mas'; allowed is attached-mass, distributed-wrench, "
@@ -141,56 +139,32 @@ HEAD = (
         ("loads: [{mass: 1}]", "loads.0 is {'mass': 1}; allowed is a mapping with a kind: attached-mass"),
         ("loads: {kind: attached-mass}", "loads is {'kind': 'attached-mass'}; allowed is a list of mappings"),
         ("loads: 3", "loads is 3; allowed is a list of mappings, each with a kind"),
-        (
-            "loads: [{kind: attached-mass, weight: 1}]",
-            "loads.0: the key 'weight' is unknown; allowed is at, mass",
-        ),
-        (
-            "loads: [{kind: point-wrench, follows: maybe}]",
-            "loads.0.follows is 'maybe'; allowed is false, true",
-        ),
-        (
-            "loads: [{kind: point-wrench, force: [1, 2]}]",
-            "loads.0.force must be three numbers, each .*(got [1, 2])",
-        ),
+        ("loads: [{kind: attached-mass, weight: 1}]",
+         "loads.0: the key 'weight' is unknown; allowed is at, mass"),
+        ("loads: [{kind: point-wrench, follows: maybe}]",
+         "loads.0.follows is 'maybe'; allowed is false, true"),
+        ("loads: [{kind: point-wrench, force: [1, 2]}]",
+         "loads.0.force must be three numbers, each .*(got [1, 2])"),
         ("base_end: {kind: driven, axes: [[x]]}", "base_end.axes is [['x']]; allowed is a list of different"),
-        (
-            "base_end: clamped",
-            "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned",
-        ),
-        (
-            "base_end: {kind: driven, axes: [x, x]}",
-            "base_end.axes is ['x', 'x']; allowed is a list of different ones of x, y",
-        ),
-        (
-            "base_end: {kind: driven, axes: [q]}",
-            "base_end.axes is ['q']; allowed is a list of different ones of x, y",
-        ),
-        (
-            "tip_end: {kind: pinned, orientation: [0, 0, 0, 0]}",
-            "tip_end.orientation must be four numbers, not all zero",
-        ),
-        (
-            "tip_end: {kind: clamped, orientation: [1.0e-200, 0, 0, 0]}",
-            "tip_end.orientation must be four numbers, .*length above 1e-09",
-        ),
-        (
-            "surroundings: [{kind: plane, normal: [0, 0, 1.0e-12]}]",
-            "surroundings.0.normal must be a direction, .*above 1e-09",
-        ),
-        (
-            "surroundings: [{kind: sphere, radius: 0}]",
-            "surroundings.0.radius must be between 1e-06 and 1000 m (got 0)",
-        ),
+        ("base_end: clamped",
+         "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned"),
+        ("base_end: {kind: driven, axes: [x, x]}",
+         "base_end.axes is ['x', 'x']; allowed is a list of different ones of x, y"),
+        ("base_end: {kind: driven, axes: [q]}",
+         "base_end.axes is ['q']; allowed is a list of different ones of x, y"),
+        ("tip_end: {kind: pinned, orientation: [0, 0, 0, 0]}",
+         "tip_end.orientation must be four numbers, not all zero"),
+        ("tip_end: {kind: clamped, orientation: [1.0e-200, 0, 0, 0]}",
+         "tip_end.orientation must be four numbers, .*length above 1e-09"),
+        ("surroundings: [{kind: plane, normal: [0, 0, 1.0e-12]}]",
+         "surroundings.0.normal must be a direction, .*above 1e-09"),
+        ("surroundings: [{kind: sphere, radius: 0}]",
+         "surroundings.0.radius must be between 1e-06 and 1000 m (got 0)"),
         ("sections: [{kind: stretch, radius: []}]", "sections.0.radius must be a list of numbers"),
-        (
-            "sections: [{kind: stretch, begin: 0.5, end: 0.5}]",
-            "sections.0: .*end is 0.5; allowed is a place beyond begin, 0.5",
-        ),
-        (
-            "loads: [{kind: distributed-wrench, begin: 0.7, end: 0.2}]",
-            "loads.0: .*end is 0.2; allowed is a place beyond begin, 0.7",
-        ),
+        ("sections: [{kind: stretch, begin: 0.5, end: 0.5}]",
+         "sections.0: .*end is 0.5; allowed is a place beyond begin, 0.5"),
+        ("loads: [{kind: distributed-wrench, begin: 0.7, end: 0.2}]",
+         "loads.0: .*end is 0.2; allowed is a place beyond begin, 0.7"),
     ],
 )  # fmt: skip
 def test_errors_name_file_place_value_and_what_is_allowed(more, words):
@@ -244,17 +218,14 @@ def test_parameters_of_parts_by_name():
     ("name", "value", "words"),
     [
         ("loads.3.mass", 1.0, r"no parameter 'loads.3.mass': no '3' among 0, 1, 2"),
-        (
-            "loads.0.weight",
-            1.0,
-            r"no parameter 'loads.0.weight': no 'weight' among at, mass, inertia, offset",
-        ),
+        ("loads.0.weight", 1.0,
+         r"no parameter 'loads.0.weight': no 'weight' among at, mass, inertia, offset"),
         ("loads.0.mass", -1.0, r"AttachedMass: mass must be between 0 and 10000 kg \(got -1\)"),
         ("cargo.0.mass", 1.0, r"no parameter 'cargo"),
         ("loads.0", 3.0, r"loads holds a float; allowed is a load"),
         ("length.0", 3.0, r"no parameter 'length.0': no '0' among nothing"),
     ],
-)
+)  # fmt: skip
 def test_wrong_names_of_parts(name, value, words):
     with pytest.raises(kc.robots.ParameterError, match=words) as caught:
         LADEN.replace(**{name: value})

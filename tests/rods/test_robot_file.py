@@ -188,10 +188,8 @@ def test_matrices(matrix):
         ({"name": "x"}, ["parameters: the key 'name' is unknown", "length, radius"]),
         ({"1": "2"}, ["the key 1 is unknown"]),
         # wrong types
-        (
-            {"youngs_modulus": "2.7 GPa"},
-            ["youngs_modulus must be", "a number between 1000 and 2e+12 Pa", "(got '2.7 GPa'"],
-        ),
+        ({"youngs_modulus": "2.7 GPa"},
+         ["youngs_modulus must be", "a number between 1000 and 2e+12 Pa", "(got '2.7 GPa'"]),
         ({"length": "'0.6'"}, ["length must be", "a number between 0.001 and 20 m", "(got '0.6'"]),
         ({"length": "yes"}, ["length must be", "(got 'yes'"]),
         ({"length": "true"}, ["length must be", "a number between 0.001 and 20 m", "(got True"]),
@@ -200,18 +198,14 @@ def test_matrices(matrix):
         ({"length": "{a: 1}"}, ["length must be", "a number", "(got {'a': 1}"]),
         ({"length": "1:30"}, ["length must be", "(got '1:30'"]),
         ({"length": "2001-01-01"}, ["length must be", "(got '2001-01-01'"]),
-        (
-            {"gravity": "9.81"},
-            ["gravity must be", "three numbers, each between -100 and 100 m/s2", "(got 9.81"],
-        ),
+        ({"gravity": "9.81"},
+         ["gravity must be", "three numbers, each between -100 and 100 m/s2", "(got 9.81"]),
         ({"gravity": "[0, 0]"}, ["gravity must be three numbers", "m/s2 (got [0, 0])"]),
         ({"gravity": "[0, 0, x]"}, ["gravity must be", "three numbers", "(got [0, 0, 'x']"]),
         ({"gravity": "[0, 0, true]"}, ["gravity must be", "three numbers", "(got [0, 0, True]"]),
         ({"gravity": "['0', '0', '-9.81']"}, ["gravity must be", "(got ['0', '0', '-9.81']"]),
-        (
-            {"drag": "[[1, 0, 0], [0, 1]]"},
-            ["drag must be", "symmetric 3x3 matrix", "(got [[1, 0, 0], [0, 1]]"],
-        ),
+        ({"drag": "[[1, 0, 0], [0, 1]]"},
+         ["drag must be", "symmetric 3x3 matrix", "(got [[1, 0, 0], [0, 1]]"]),
         ({"drag": "[[1, 0], [0, 1]]"}, ["drag must be", "symmetric 3x3 matrix", "(got [[1, 0], [0, 1]]"]),
         ({"drag": "[[[1]]]"}, ["drag must be", "symmetric 3x3 matrix", "(got [[[1]]]"]),
         ({"tendon_angles": "0.5"}, ["tendon_angles must be", "a list of numbers, each", "(got 0.5"]),
@@ -222,30 +216,16 @@ def test_matrices(matrix):
         ({"nodes": "true"}, ["nodes is True"]),
         ({"nodes": "010"}, ["nodes is 10.0"]),
         # values
-        (
-            {"youngs_modulus": "-2e9"},
-            ["youngs_modulus must be", "between 1000 and 2e+12 Pa", "(got -2000000000.0"],
-        ),
-        (
-            {"bending_stiffness": "-1"},
-            ["bending_stiffness must be", "with eigenvalues between 1e-15 and 1e+09 N m2", "(got -1"],
-        ),
-        (
-            {"bending_damping": "[0.1, 0.1, -0.1]"},
-            ["bending_damping must be", "eigenvalues between 0 and", "(got [0.1, 0.1, -0.1]"],
-        ),
-        (
-            {"drag": "[[1, 2, 0], [0, 1, 0], [0, 0, 1]]"},
-            [
-                "drag must be",
-                "a symmetric 3x3 matrix",
-                "(got [[1, 2, 0], [0, 1, 0], [0, 0, 1]], not symmetric",
-            ],
-        ),
-        (
-            {"drag": "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"},
-            ["drag must be", "with eigenvalues between 0 and 1000 kg/m2"],
-        ),
+        ({"youngs_modulus": "-2e9"},
+         ["youngs_modulus must be", "between 1000 and 2e+12 Pa", "(got -2000000000.0"]),
+        ({"bending_stiffness": "-1"},
+         ["bending_stiffness must be", "with eigenvalues between 1e-15 and 1e+09 N m2", "(got -1"]),
+        ({"bending_damping": "[0.1, 0.1, -0.1]"},
+         ["bending_damping must be", "eigenvalues between 0 and", "(got [0.1, 0.1, -0.1]"]),
+        ({"drag": "[[1, 2, 0], [0, 1, 0], [0, 0, 1]]"},
+         ["drag must be", "a symmetric 3x3 matrix", "(got [[1, 2, 0], [0, 1, 0], [0, 0, 1]], not symmetric"]),
+        ({"drag": "[[1, 2, 0], [2, 1, 0], [0, 0, 1]]"},
+         ["drag must be", "with eigenvalues between 0 and 1000 kg/m2"]),
         ({"length": ".nan"}, ["length must be", "between 0.001 and 20 m", "(got nan"]),
         ({"length": ".inf"}, ["length must be", "between 0.001 and 20 m", "(got inf"]),
         ({"length": "1e999"}, ["length must be", "between 0.001 and 20 m", "(got inf"]),
@@ -253,32 +233,22 @@ def test_matrices(matrix):
         ({"length": 5000 * "1"}, ["not YAML: "]),
         ({"gravity": "[0, 0, .nan]"}, ["gravity must be", "(got [0, 0, nan]"]),
         # the wrong unit
-        (
-            {"length": "635"},
-            ["length must be between 0.001 and 20 m (got 635). Did you mean 0.635 (635 mm)?"],
-        ),
-        (
-            {"radius": "3.175"},
-            ["radius must be", "and 0.5 m", "(got 3.175", "Did you mean 0.003175 (3.175 mm)?"],
-        ),
+        ({"length": "635"},
+         ["length must be between 0.001 and 20 m (got 635). Did you mean 0.635 (635 mm)?"]),
+        ({"radius": "3.175"},
+         ["radius must be", "and 0.5 m", "(got 3.175", "Did you mean 0.003175 (3.175 mm)?"]),
         ({"radius": "3175"}, ["radius must be", "(got 3175", "Did you mean 0.003175 (3175 um)?"]),
-        (
-            {"youngs_modulus": "2.757903"},
-            ["youngs_modulus must be", "(got 2.757903", "Did you mean 2757903000 (2.757903 GPa)?"],
-        ),
+        ({"youngs_modulus": "2.757903"},
+         ["youngs_modulus must be", "(got 2.757903", "Did you mean 2757903000 (2.757903 GPa)?"]),
         ({"youngs_modulus": "700"}, ["Did you mean 700000000 (700 MPa)?"]),
-        (
-            {"shear_modulus": "1.06"},
-            ["shear_modulus must be", "(got 1.06", "Did you mean 1060000000 (1.06 GPa)?"],
-        ),
+        ({"shear_modulus": "1.06"},
+         ["shear_modulus must be", "(got 1.06", "Did you mean 1060000000 (1.06 GPa)?"]),
         ({"density": "1400000"}, ["density must be", "(got 1400000", "Did you mean 1400 (1400000 g/m3)?"]),
         ({"gravity": "[0, 0, -9810]"}, ["Did you mean [0, 0, -9.81] ([0, 0, -9810] mm/s2)?"]),
-        (
-            {"tendon_angles": "[0, 90, 180, 270]"},
-            ["each between -10 and 10 rad", "Did you mean [0, 1.570796", "([0, 90, 180, 270] degrees)?"],
-        ),
+        ({"tendon_angles": "[0, 90, 180, 270]"},
+         ["each between -10 and 10 rad", "Did you mean [0, 1.570796", "([0, 90, 180, 270] degrees)?"]),
     ],
-)
+)  # fmt: skip
 def test_parameters_that_are_not_right(changes, parts):
     with fails("robots/mine.yaml: ", *parts):
         parse_robot(text(**changes), "robots/mine.yaml")
@@ -300,10 +270,8 @@ def test_no_unit_is_suggested_where_none_would_be_typical():
         (text().replace("format: 1", "format: 3\nrods: 3"), ["format is 3", "allowed is 1 or 2"]),
         (text().replace("format: 1", "format: true"), ["format is True", "allowed is 1 or 2"]),
         (text().replace("kind: tendon-robot\n", ""), ["the key 'kind' is missing"]),
-        (
-            text().replace("tendon-robot", "tendonrobot"),
-            ["kind is 'tendonrobot'", "did you mean tendon-robot?"],
-        ),
+        (text().replace("tendon-robot", "tendonrobot"),
+         ["kind is 'tendonrobot'", "did you mean tendon-robot?"]),
         (text().replace("tendon-robot", "[a]"), ["kind is ['a']", "allowed is text"]),
         (HEAD, ["the key 'parameters' is missing"]),
         (HEAD + "parameters:\n", ["parameters is None", "a mapping from names to values"]),
@@ -328,7 +296,7 @@ def test_no_unit_is_suggested_where_none_would_be_typical():
         ("a: \x00", ["not YAML: unacceptable character"]),
         ("[" * 5000, ["not YAML: "]),
     ],
-)
+)  # fmt: skip
 def test_files_that_are_not_right(content, parts):
     with fails("robots/mine.yaml: ", *parts):
         parse_robot(content, "robots/mine.yaml")

@@ -125,7 +125,7 @@ class Passive(Residual):
         self, knowledge: System, s: Any, y: Float[Any, " y"], control: Any
     ) -> tuple[Float[Any, "3 3"], Float[Any, "3 3"], Float[Any, "3"]]:
         """Return the stiffness κ S (N m²), the damping D (N m² s) and the moment κ b/L (N m) at a point."""
-        L, kappa = knowledge.length, _least(nominal_model(knowledge).Kbt)  # type: ignore[attr-defined]
+        L, kappa = knowledge.length, _least(nominal_model(knowledge).Kbt)
         sigma, x = 2.0 * s / L - 1.0, jnp.asarray(control) / self.sizes.control
         S, b = self.spring(sigma, x)
         stiffness = kappa * jnp.zeros((3, 3)).at[:2, :2].set(S)

@@ -456,11 +456,11 @@ def slots_of(cls: type) -> dict[str, Slot]:
     return stated_of(cls, Slot)
 
 
-def kinds_of(family: type) -> dict[str, type]:
+def kinds_of(family: Any) -> dict[str, Any]:
     """Return the classes of a family that robot files can name: the family and its subclasses."""
-    kinds = {} if inspect.isabstract(family) or not family.kind else {family.kind: family}  # type: ignore[attr-defined]
-    for cls in family.__subclasses__():
-        kinds |= kinds_of(cls)
+    kinds = {} if inspect.isabstract(family) or not family.kind else {family.kind: family}
+    for member in family.__subclasses__():
+        kinds |= kinds_of(member)
     return dict(sorted(kinds.items()))
 
 
@@ -556,7 +556,7 @@ def _part_text(part: Any) -> str:
         raise ParameterError(
             f"a {type(part).__name__} cannot be written to a robot file: it is made of code, not of numbers"
         )
-    defaults = {field.name: field.default for field in dataclasses.fields(part)}
+    defaults: dict[str, Any] = {field.name: field.default for field in dataclasses.fields(part)}
     entries = [f"kind: {part.kind}"]
     for name, stated in in_order(type(part)).items():
         value = getattr(part, name)

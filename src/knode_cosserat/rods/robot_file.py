@@ -268,7 +268,7 @@ def robot_schema() -> dict[str, Any]:
     """
     parts: dict[str, Any] = {}
     robots = {name: object_schema(cls, parts, nodes=NODES) for name, cls in KINDS.items()}
-    tip_only = [kind for kind, end in kinds_of(End).items() if not end.anywhere]  # type: ignore[attr-defined]
+    tip_only = [kind for kind, end in kinds_of(End).items() if not end.anywhere]
     for robot in robots.values():
         if "base_end" in robot["properties"]:
             kind = {"properties": {"kind": {"enum": tip_only}}, "required": ["kind"]}

@@ -155,8 +155,11 @@ class Stretch(SectionChange):
         # the gain of a batch, or of a traced robot, gives no limit
         if not (isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0):
             # at the limit itself the stiffness is zero
-            name, inside = ("low", np.inf) if gain > 0.0 else ("high", -np.inf)
-            field = field._replace(**{name: float(np.nextafter(-1.0 / float(gain), inside))})
+            limit = -1.0 / float(gain)
+            if gain > 0.0:
+                field = field._replace(low=float(np.nextafter(limit, np.inf)))
+            else:
+                field = field._replace(high=float(np.nextafter(limit, -np.inf)))
         return (field,) if self.controlled else ()
 
     def differences(self, part: Any, control: Any) -> Differences:

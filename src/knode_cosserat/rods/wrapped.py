@@ -82,7 +82,7 @@ class Wrapped(System):
         return self.around(self.knowledge.replace(**changes))
 
 
-def nominal_model(system: System) -> System:
+def nominal_model(system: System) -> Any:
     """Return the innermost wrapped system, whose parameters `replace` changes; else the system itself."""
     while isinstance(system, Wrapped):
         system = system.knowledge

@@ -68,8 +68,8 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
             strand = strand_of(system)
             if not getattr(strand, "is_undamped", False):
                 continue
-            frequency = float(np.min(strand.bending_frequency))  # type: ignore[attr-defined]
-            stiffness = float(np.max(np.asarray(strand.Kbt)[..., 0, 0]))  # type: ignore[attr-defined]
+            frequency = float(np.min(strand.bending_frequency))
+            stiffness = float(np.max(np.asarray(strand.Kbt)[..., 0, 0]))
         damping = LOSS_FACTOR * stiffness / (2.0 * np.pi * frequency)
         warnings.warn(
             "bending_damping is 0 and nothing else damps the motion: vibrations do not decay, and "
