@@ -51,7 +51,12 @@ class End(Part):
         "m", "where the end is held, global frame", shape="vector", low=-1e3, high=1e3, default=None
     )
     orientation: Any = parameter(
-        "1", "how the end is held: a quaternion", shape="quaternion", low=-1e3, high=1e3, default=None
+        "1",
+        "orientation of the held end, a quaternion",
+        shape="quaternion",
+        low=-1e3,
+        high=1e3,
+        default=None,
     )
 
     def pose(self, rest: Pose, control: Any) -> Pose:
@@ -109,7 +114,7 @@ class Driven(Clamped):
 
     kind: ClassVar[str] = "driven"
 
-    axes: tuple[str, ...] = choice("what is driven, of", AXES, ("z",))
+    axes: tuple[str, ...] = choice("driven axes", AXES, ("z",))
 
     @property
     def control_fields(self) -> tuple[Field, ...]:

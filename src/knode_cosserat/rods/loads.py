@@ -152,8 +152,8 @@ class _Prescribed(Load):
 
     force: Any
     moment: Any
-    follows: bool = choice("whether it turns with the rod", (False, True), False)
-    controlled: bool = choice("whether a control multiplies it", (False, True), False)
+    follows: bool = choice("true if it rotates with the rod", (False, True), False)
+    controlled: bool = choice("true if a control multiplies it", (False, True), False)
 
     @property
     def control_fields(self) -> tuple[Field, ...]:

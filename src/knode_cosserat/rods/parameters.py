@@ -326,7 +326,7 @@ class Slot:
             kinds = kinds_of(self.family)
             families[family] = {}  # before its members, which may hold parts of the same family
             for kind, cls in kinds.items():
-                made = object_schema(cls, families, kind={"const": kind, "description": "what it is"})
+                made = object_schema(cls, families, kind={"const": kind, "description": "class of the part"})
                 families[f"{family}.{kind}"] = {**made, "required": ["kind", *made["required"]]}
             families[family] = {
                 "type": "object",

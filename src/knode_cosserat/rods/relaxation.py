@@ -30,7 +30,7 @@ class Relaxation(Effect):
         "", "r, stiffness of the Maxwell branch over the stiffness at rest", low=0.0, high=1e3
     )
     time: Any = parameter("s", "T, relaxation time of the branch", low=1e-6, high=1e6, default=1.0)
-    shear: bool = choice("whether shear and extension relax too", (False, True), False)
+    shear: bool = choice("true if shear and extension relax too", (False, True), False)
 
     @property
     def strains(self) -> tuple[str, ...]:

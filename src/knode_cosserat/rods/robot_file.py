@@ -281,8 +281,8 @@ def robot_schema() -> dict[str, Any]:
         "additionalProperties": False,
         "properties": {
             "format": {"enum": list(FORMATS), "description": "2 if there are choices or parts, else 1"},
-            "kind": {"enum": list(KINDS), "description": "what robot it is"},
-            "description": {"type": "string", "description": "what it is, in one line"},
+            "kind": {"enum": list(KINDS), "description": "class of the robot"},
+            "description": {"type": "string", "description": "description in one line"},
             "parameters": {"type": "object", "description": "names and values, in SI units and radians"},
             "hardware": {
                 "type": ["object", "null"],

@@ -96,7 +96,7 @@ class SlenderRod(System):
         "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
     )
     sections: tuple[SectionChange, ...] = slot(
-        "where the section differs", SectionChange, many=True, default=()
+        "sections that differ from the rod", SectionChange, many=True, default=()
     )
 
     drag: Any = parameter("kg/m2", "C, square-law drag", shape="matrix", low=0.0, high=1e3, default=0.0)
@@ -107,11 +107,11 @@ class SlenderRod(System):
         "m/s2", "gravitational acceleration, global frame", shape="vector", low=-100.0, high=100.0,
         default=(0.0, 0.0, -9.81),
     )  # fmt: skip
-    loads: tuple[Load, ...] = slot("what loads it beside gravity and drag", Load, many=True, default=())
-    surroundings: tuple[Obstacle, ...] = slot("what it may touch", Obstacle, many=True, default=())
+    loads: tuple[Load, ...] = slot("loads beside gravity and drag", Load, many=True, default=())
+    surroundings: tuple[Obstacle, ...] = slot("obstacles that it may touch", Obstacle, many=True, default=())
     effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
-    base_end: End = slot("what holds it at s = 0", End, default=Clamped())
-    tip_end: End = slot("what holds it at s = length", End, default=Free())
+    base_end: End = slot("end at s = 0", End, default=Clamped())
+    tip_end: End = slot("end at s = length", End, default=Free())
 
     def __check_init__(self) -> None:
         if not self.base_end.anywhere:

@@ -123,15 +123,15 @@ class Stretch(SectionChange):
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
     curvature_slope: Any = parameter(
-        "1/m", "how much more of it there is where the stretch ends", shape="vector", low=-1e4, high=1e4,
+        "1/m", "increase of that curvature from its beginning to its end", shape="vector", low=-1e4, high=1e4,
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
-    controlled: bool = choice("whether a control acts on it", (False, True), False)
+    controlled: bool = choice("true if a control acts on it", (False, True), False)
     stiffness_gain: Any = parameter(
-        "", "what a control of 1 adds to the factor of the stiffness", low=-1e6, high=1e6, default=0.0
+        "", "increase of the stiffness factor by a control of 1", low=-1e6, high=1e6, default=0.0
     )
     curvature_gain: Any = parameter(
-        "1/m", "what a control of 1 adds to the curvature at rest", shape="vector", low=-1e4, high=1e4,
+        "1/m", "increase of the curvature at rest by a control of 1", shape="vector", low=-1e4, high=1e4,
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
 
@@ -145,13 +145,13 @@ class Stretch(SectionChange):
             if not least > 0.0:
                 raise ParameterError(
                     f"{type(self).__name__}: {name} is {np.asarray(coefficients).tolist()}, which is "
-                    f"{least:.3g} at ξ = {where:.3g}; allowed is what is above 0 all along the stretch"
+                    f"{least:.3g} at ξ = {where:.3g}; allowed are factors above 0 along the whole stretch"
                 )
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """One control, if the section is controlled; its limit leaves some stiffness."""
-        field, gain = Field("input", 1, "1", "what acts on the section"), self.stiffness_gain
+        field, gain = Field("input", 1, "1", "control of the section"), self.stiffness_gain
         # the gain of a batch, or of a traced robot, gives no limit
         if not (isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0):
             # at the limit itself the stiffness is zero
@@ -209,7 +209,7 @@ class FunctionSection(SectionChange):
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """One field of `inputs` numbers."""
-        return (Field("input", self.inputs, "1", "what acts on the section"),) if self.inputs else ()
+        return (Field("input", self.inputs, "1", "control of the section"),) if self.inputs else ()
 
     def differences(self, part: Any, control: Any) -> Differences:
         """Return the function's value."""

@@ -39,7 +39,7 @@ class Obstacle(Part):
     )
     smoothing: Any = parameter("m", "δ, depth over which contact sets in", low=1e-9, high=1.0, default=1e-4)
     damping: Any = parameter(
-        "s/m", "d, part by which the contact force grows with the speed of approach", low=0.0, high=1e4,
+        "s/m", "d, relative increase of the contact force by the speed of approach", low=0.0, high=1e4,
         default=0.0,
     )  # fmt: skip
     friction: Any = parameter("", "μ, coefficient of friction", low=0.0, high=10.0, default=0.0)
@@ -86,7 +86,7 @@ def _length(vector: Any) -> Any:
     return jnp.sqrt(jnp.sum(vector * vector) + 1e-24)
 
 
-_INSIDE = "whether the rod is inside of it"
+_INSIDE = "true if the rod is inside it"
 
 
 class Plane(Obstacle):

@@ -117,7 +117,7 @@ class RoutedTendonRobot(TendonRod):
     """
 
     routing: tuple[Routing, ...] | None = slot(
-        "where the tendons run; by default straight, at their offset and angles", Routing, many=True,
+        "paths of the tendons; by default straight, at their offset and angles", Routing, many=True,
         default=None,
     )  # fmt: skip
     tendon_twist: Any = parameter(
@@ -125,44 +125,46 @@ class RoutedTendonRobot(TendonRod):
         low=-10.0, high=10.0, default=None,
     )  # fmt: skip
     drive: str = choice(
-        "what is given of the tendons: their tension, or what reels take in", ("tension", "reel"), "tension"
+        "control of the tendons: tension, or length that reels take in",
+        ("tension", "reel"),
+        "tension",
     )
     tendon_compliance: Any = parameter(
         "m/N",
-        "C, how much a tendon gives by its tension, if a reel drives it",
+        "C, compliance of a tendon that a reel drives",
         low=0.0,
         high=1.0,
         default=0.0,
     )
     reels: Reels | None = slot(
-        "motors whose angles, or lengths, are the controls of the reels; none: one length for each tendon",
+        "motors of the reels; none: one length for each tendon",
         Reels, default=None,
     )  # fmt: skip
     friction: TendonFriction | None = slot(
         "friction of the tendons; none: they slide freely", TendonFriction, default=None
     )
     vibration: Vibration | None = slot(
-        "loss of friction where high tensions make the robot shake; none: it does not",
+        "loss of friction by vibration under high tensions; none: no vibration",
         Vibration,
         default=None,
     )
     rib_spacing: RibSpacing | None = slot(
-        "softening by tendons that are straight between ribs; none: they are bent as the rod is", RibSpacing,
+        "softening by tendons that are straight between ribs; none: tendons follow the rod", RibSpacing,
         default=None,
     )  # fmt: skip
     relaxation: Relaxation | None = slot(
         "relaxation of the material, a Maxwell branch; none: it does not creep", Relaxation, default=None
     )
     anchors: EarlyAnchors | None = slot(
-        "where tendons are anchored before the tip; none: at the tip, or where `routing` ends", EarlyAnchors,
+        "anchors before the tip; none: at the tip, or at the end of `routing`", EarlyAnchors,
         default=None,
     )  # fmt: skip
     load_cells: LoadCells | None = slot(
-        "what measured tensions have to be corrected by; none: controls are tensions", LoadCells, default=None
+        "correction of measured tensions; none: controls are tensions", LoadCells, default=None
     )
 
     trained: TrainedRange | None = slot(
-        "range of the recordings that it was identified from; outside it extrapolates", TrainedRange,
+        "range of the data of its identification; outside it extrapolates", TrainedRange,
         default=None,
     )  # fmt: skip
 
@@ -285,7 +287,7 @@ class VirtualRobot(TendonRod):
         "1/s", "ρ₀, rate of sliding per length from which friction is full", low=1e-6, high=10.0, default=0.02
     )
     sleeve_length: Any = parameter("m", "length of the sleeve at the base", low=0.0, high=1.0, default=0.08)
-    sleeve_factor: Any = parameter("", "what the sleeve multiplies Kbt by", low=1.0, high=100.0, default=4.0)
+    sleeve_factor: Any = parameter("", "factor of Kbt by the sleeve", low=1.0, high=100.0, default=4.0)
     rib_mass: Any = parameter("kg", "mass of one of the nine ribs", low=0.0, high=1.0, default=0.0015)
 
     @property

@@ -447,7 +447,7 @@ class Vibration(Part):
     tension: Any = parameter(
         "N", "T_v, tension of all tendons together above which vibration grows", low=0.0, high=1e6
     )
-    rate: Any = parameter("1/(N s)", "k_v, how fast it grows", low=0.0, high=1e3)
+    rate: Any = parameter("1/(N s)", "k_v, rate of growth", low=0.0, high=1e3)
     softening: Any = parameter(
         "m2", "c, loss of bending stiffness by vibration, by tension", low=0.0, high=1.0, default=0.0
     )
