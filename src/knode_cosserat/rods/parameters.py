@@ -177,14 +177,14 @@ class Parameter:
     def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
         """Return the JSON Schema of the values."""
         one: Any = {"type": "number", "minimum": self.low, "maximum": self.high}
-        shape: Any = {
+        shape: dict[str, Any] = {
             "scalar": one,
+            "vector": _array_schema(one, 3),
+            "direction": {**_array_schema(one, 3), **_NOT_ALL_ZERO},
+            "quaternion": {**_array_schema(one, 4), **_NOT_ALL_ZERO},
             "list": {"type": "array", "items": one, "minItems": 1},
-            "matrix": {"anyOf": [one, _tuple([one] * 3), _square(one, self.high)]},
-        }.get(self.shape)
-        if shape is None:
-            shape = {"type": "array", "items": one, **_count(_SIZES[self.shape][0])}
-            shape |= {} if self.shape == "vector" else _NOT_ALL_ZERO
+            "matrix": {"anyOf": [one, _array_schema(one, 3), _square_schema(one, self.high)]},
+        }[self.shape]
         unit = f" ({self.unit})" if self.unit else ""
         stated = {**_or_null(shape, self.optional), "description": f"{self.meaning}{unit}"}
         if default is not dataclasses.MISSING and default is not None:
@@ -214,18 +214,16 @@ def _array(value: Any) -> np.ndarray | None:
     return np.array(rows, dtype=float)
 
 
-def _count(count: int) -> dict[str, int]:
-    return {"minItems": count, "maxItems": count}
+def _array_schema(one: Any, count: int) -> dict[str, Any]:
+    return {"type": "array", "items": one, "minItems": count, "maxItems": count}
 
 
-def _tuple(items: list[Any]) -> dict[str, Any]:
-    return {"type": "array", "prefixItems": items, **_count(len(items))}
-
-
-def _square(one: Any, high: float) -> dict[str, Any]:
+def _square_schema(one: Any, high: float) -> dict[str, Any]:
     """Schema of a 3x3 matrix: diagonal within the eigenvalues' bounds, entries within the upper one."""
     other = {"type": "number", "minimum": -high, "maximum": high}
-    return _tuple([_tuple([one if row == column else other for column in range(3)]) for row in range(3)])
+    rows = [[one if row == column else other for column in range(3)] for row in range(3)]
+    matrix = [{"type": "array", "prefixItems": row, "minItems": 3, "maxItems": 3} for row in rows]
+    return {"type": "array", "prefixItems": matrix, "minItems": 3, "maxItems": 3}
 
 
 def _or_null(shape: dict[str, Any], optional: bool) -> dict[str, Any]:
