@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
+from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.robot_file import format_robot, parse_robot
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import TendonFriction, Vibration
@@ -175,3 +176,14 @@ def test_strong_pulls_and_much_friction_are_solved_or_reported():
         along = kc.simulate(robot, control, 0.05, on_failure="return")
         solved = np.asarray(along.result) >= Result.CONVERGED
         assert solved.mean() > 0.9 and np.all(np.isfinite(np.asarray(along.y)[solved]))
+
+
+@pytest.mark.parametrize("space", ["lobatto2", "lobatto4"])
+def test_a_straight_robot_with_friction_rests(space):
+    """Its moments are only rounding errors."""
+    robot = virtual_robot()
+    still = kc.equilibrium(robot, np.full(4, 5.0), space=space)
+    motion = kc.simulate(robot, np.full((40, 4), 5.0), 0.0025, initial=still, space=space)
+    assert np.all(motion.result == kc.Result.CONVERGED)
+    assert np.max(motion.position_error) < 1e-6 * robot.length
+    np.testing.assert_allclose(motion.position[-1], still.position[0], atol=1e-6)
