@@ -51,12 +51,7 @@ class End(Part):
         "m", "where the end is held, global frame", shape="vector", low=-1e3, high=1e3, default=None
     )
     orientation: Any = parameter(
-        "1",
-        "orientation of the held end, a quaternion",
-        shape="quaternion",
-        low=-1e3,
-        high=1e3,
-        default=None,
+        "1", "orientation of the held end, a quaternion", shape="quaternion", low=-1e3, high=1e3, default=None
     )
 
     def pose(self, rest: Pose, control: Any) -> Pose:

@@ -125,16 +125,10 @@ class RoutedTendonRobot(TendonRod):
         low=-10.0, high=10.0, default=None,
     )  # fmt: skip
     drive: str = choice(
-        "control of the tendons: tension, or length that reels take in",
-        ("tension", "reel"),
-        "tension",
+        "control of the tendons: tension, or length that reels take in", ("tension", "reel"), "tension"
     )
     tendon_compliance: Any = parameter(
-        "m/N",
-        "C, compliance of a tendon that a reel drives",
-        low=0.0,
-        high=1.0,
-        default=0.0,
+        "m/N", "C, compliance of a tendon that a reel drives", low=0.0, high=1.0, default=0.0
     )
     reels: Reels | None = slot(
         "motors of the reels; none: one length for each tendon",
@@ -144,9 +138,7 @@ class RoutedTendonRobot(TendonRod):
         "friction of the tendons; none: they slide freely", TendonFriction, default=None
     )
     vibration: Vibration | None = slot(
-        "loss of friction by vibration under high tensions; none: no vibration",
-        Vibration,
-        default=None,
+        "loss of friction by vibration under high tensions; none: no vibration", Vibration, default=None
     )
     rib_spacing: RibSpacing | None = slot(
         "softening by tendons that are straight between ribs; none: tendons follow the rod", RibSpacing,
