@@ -72,7 +72,7 @@ def test_a_model_and_what_is_known_of_it(bars, unseen):
 
 def test_a_model_is_what_its_knowledge_is():
     """A model delegates the whole interface of a system, except what follows from the other members."""
-    derived = {"nodes", "control_size"}
+    derived = {"nodes"}
     assert {name for name in vars(kc.System) if not name.startswith("_")} - set(vars(Wrapped)) == derived
     loose = kc.robots.SlenderRod(
         length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.robots.ends.Free()
