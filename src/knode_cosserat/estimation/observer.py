@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import (
     Belief,
     OnlineModel,
@@ -21,6 +20,7 @@ from knode_cosserat.estimation.online import (
     split_record,
 )
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.estimation.rollback import Rollback
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
@@ -105,8 +105,8 @@ class KalmanObserver:
         if columns < 1:
             raise ValueError(f"columns is {columns}; allowed is at least 1")
         self.dt, self.output = checked_dt(dt), output
-        self.parameters = AdaptedParameters(robot, adapt)
-        self.model = OnlineModel(robot, self.parameters, self.dt)
+        self.parameters, self._drift = adapted_model(robot, adapt)
+        self.model = OnlineModel(self.parameters.robot, self.dt)
         self.columns = columns + self.parameters.size
         self._control_deviation = _deviations(robot, control_deviation)
         self._start_deviation = float(start_deviation)
@@ -168,31 +168,23 @@ class KalmanObserver:
     @property
     def system(self) -> System:
         """Robot with the adapted parameters."""
-        return self.model.at(self.belief.x)
+        return self.parameters.robot(self.belief.x) if self.parameters.size else self.robot
 
     @property
     def estimate(self) -> Estimate:
         """Current state, and the parameters with their standard deviations."""
         y, z = split_record(self.robot, self.record)
-        numbers = self._numbers(self.belief.x)
-        # by the slope of each number
-        step = 1e-6
-        above = self._numbers(self.belief.x + step)
-        spread = (
-            np.sqrt(np.sum(np.asarray(self.belief.spread.parameters) ** 2, axis=0)) * (above - numbers) / step
-        )
-        labels = self.parameters.labels
+        numbers, labels = self.parameters.numbers, self.parameters.labels
+        spread = np.sqrt(np.sum(np.asarray(self.belief.spread.parameters) ** 2, axis=0))
+        values = [number.value(x) for number, x in zip(numbers, self.belief.x, strict=True)]
+        deviations = [
+            abs(number.slope(value)) * float(deviation)
+            for number, value, deviation in zip(numbers, values, spread, strict=True)
+        ]
         return Estimate(
-            self.time, y, z, dict(zip(labels, map(float, numbers), strict=True)),
-            dict(zip(labels, map(float, np.abs(spread)), strict=True)), self._innovation, self._surprise,
+            self.time, y, z, dict(zip(labels, values, strict=True)),
+            dict(zip(labels, deviations, strict=True)), self._innovation, self._surprise,
         )  # fmt: skip
-
-    def _numbers(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the adapted numbers at coordinates; a matrix by its first one."""
-        parts = zip(self.parameters.numbers(x), self.parameters.vector, strict=True)
-        return np.concatenate(
-            [np.zeros(0), *(np.ravel(part) if vector else np.ravel(part)[:1] for part, vector in parts)]
-        )
 
     def predict(self, control: Float[np.ndarray, " c"]) -> None:
         """Advance the estimate by one time step under a control.
@@ -219,7 +211,7 @@ class KalmanObserver:
 
     def _deviations(self) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " n"]]:
         """Return the standard deviations of controls, and of the parameters' drift in one step."""
-        return self._control_deviation, self.excitation * self.parameters.drift * np.sqrt(self.dt)
+        return self._control_deviation, self.excitation * self._drift * np.sqrt(self.dt)
 
     @property
     def excitation(self) -> float:

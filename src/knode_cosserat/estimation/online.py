@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.run import TimeIntegration
@@ -69,22 +69,19 @@ class Belief(NamedTuple):
 class OnlineModel(eqx.Module):
     """A robot with adapted parameters, and the numerical settings of its steps."""
 
-    robot: System
-    parameters: AdaptedParameters
+    parameters: ParametrisedRobot
     dt: float = eqx.field(static=True)
-    settings: Settings = eqx.field(static=True)
+    #: the default schemes: a plant holds its controls, as these do
+    settings: Settings = eqx.field(static=True, default=Settings())
 
-    def __init__(self, robot: System, parameters: AdaptedParameters, dt: float):
-        """Set the default schemes: a plant holds its controls, as these do."""
-        self.robot, self.parameters, self.dt, self.settings = robot, parameters, dt, Settings()
+    @property
+    def robot(self) -> System:
+        """The robot with its first parameters."""
+        return self.parameters.robot
 
     def task(self, steps: int) -> TimeIntegration:
         """Return so many steps from a state with a history."""
         return TimeIntegration(self.settings, self.dt, steps, self.settings.memory)
-
-    def at(self, x: Any) -> System:
-        """Return the robot at coordinates of its parameters."""
-        return self.parameters.of(self.robot, x)
 
     def moved(self, x: Any) -> tuple[System, Any]:
         """Return the robot, and its tangents by each parameter, stacked; None if there are none.
@@ -129,8 +126,8 @@ class OnlineModel(eqx.Module):
 
 @jax.jit
 def _moved(model: OnlineModel, x: Any) -> tuple[System, Any]:
-    by_x = jax.vmap(lambda d: jax.jvp(model.at, (x,), (d,))[1])
-    return model.at(x), by_x(jnp.eye(model.parameters.size))
+    robot = model.parameters
+    return robot(x), jax.vmap(lambda d: jax.jvp(robot, (x,), (d,))[1])(jnp.eye(robot.size))
 
 
 class Rollout(NamedTuple):
@@ -236,5 +233,5 @@ def motion_errors(
 @functools.partial(jax.jit, static_argnames="output")
 def measured_error(model: OnlineModel, x: Any, record: Any, measured: Any, output: Output) -> Any:
     """Return the error of a state's output from a measurement."""
-    system = model.at(x)
+    system = model.parameters(x)
     return output.error(system, *split_record(system, record), measured)

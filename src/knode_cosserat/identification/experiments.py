@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, States
-from knode_cosserat.identification.model import Model
+from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.steps import steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording

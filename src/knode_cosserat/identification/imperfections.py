@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.model import Model
+from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.virtual import commands
 from knode_cosserat.rods.parameters import ParameterError
@@ -64,7 +65,7 @@ def imperfect_robot(
     """
     if not 0 <= seed < 2**32:
         raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
-    model, random = Model.of_library(nominal, tension, bodies), np.random.default_rng(seed)
+    model, random = library_model(nominal, tension, bodies), np.random.default_rng(seed)
     names: list[str] = []
     own = [effect for effect in model.effects if not effect.of_recordings]
     for effect in own:
@@ -76,9 +77,8 @@ def imperfect_robot(
     # numbers that are not negative, say, and nominally zero
     sizes = np.where((low >= 0.0) | (high <= 0.0), np.abs(sizes) * np.where(high <= 0.0, -1.0, 1.0), sizes)
     x = np.where(model.mask(names), np.clip(sizes, low, high), 0.0)
-    values = dict(zip((each.label for each in model.numbers), model.values(x), strict=True))
-    mask = model.mask(names)
-    kept = {each.label: values[each.label] for each, on in zip(model.numbers, mask, strict=True) if on}
+    mask, values = model.mask(names), model.values(x)
+    kept = {label: value for label, value, on in zip(model.labels, values, mask, strict=True) if on}
     return Imperfect(model.reduced(x, names), tuple(names), kept, model, x)
 
 
@@ -92,5 +92,5 @@ def nominal_robot() -> TendonRod:
 def drawn_robot(seed: int) -> Imperfect:
     """Return the virtual robot of a seed: the paper's robot with random imperfections."""
     tension = np.concatenate([commands(signal, END).tension for signal in TRAINING.values()])
-    bodies = [each.fraction for each in RecordingConfig.paper_robot().markers]
+    bodies = [marker.fraction for marker in RecordingConfig.paper_robot().markers]
     return imperfect_robot(nominal_robot(), tension, seed, bodies)

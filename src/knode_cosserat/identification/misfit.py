@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.online import errors_along, errors_of
+from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
-from knode_cosserat.identification.model import Model, ParametrisedRobot
 from knode_cosserat.identification.steps import stepped
 from knode_cosserat.rods.load_cells import LoadCells
 from knode_cosserat.solvers.history import (
@@ -33,6 +33,7 @@ from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, static_tangents, tangent_time_loop
+from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
 
 #: seconds that recovery of one simulation may take
@@ -176,12 +177,14 @@ class Misfit:
             at_start, rows = initial_state(system, settings), None
         else:
             at_start = continued_state(system, data.initial, settings, data.dt)
-            rows = at_start.record, at_start.control
+            # a control acts on the history only where that is one state
+            one_state = at_start.state.known(settings) == 1
+            rows = (at_start.record, at_start.control) if one_state else (at_start.record,)
         known, past = at_start.state.known(settings), at_start.state.history
         record = np.asarray(at_start.record)[:, : system.y_layout.size + system.z_layout.size]
 
         def tangents(moves: SystemMoves) -> Any:
-            begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings, known == 1)
+            begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings)
             return np.asarray(d_record), begun, d_past
 
         return _Start(record, past, np.asarray(at_start.control), known, at_start.state.dt is None, tangents)
@@ -195,7 +198,7 @@ def _cells(system: Any) -> LoadCells | None:
 def _acting(system: Any, data: Experiment) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the controls of all steps by the load cells' latency, and their derivative by it (N/s).
 
-    The derivative is over one step: between steps it jumps, and at no latency it is of both sides.
+    The derivative is a central difference over one step, because it jumps between steps.
     """
     cells, dt = _cells(system), data.dt / data.steps
     before = data.control[0] if data.held is None else data.held
@@ -228,15 +231,18 @@ def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
     return jax.vmap(along)(jnp.eye(len(x)))
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "one_state"))
-def _begun(robot, x, rows, past, settings, one_state):  # type: ignore[no-untyped-def]
-    """Return the history of an unstressed robot or of rows, and tangents of record and history."""
+@functools.partial(jax.jit, static_argnames="settings")
+def _begun(robot: ParametrisedRobot, x: Any, rows: Any, past: Any, settings: Settings) -> Any:
+    """Return the history of an unstressed robot or of rows, and tangents of record and history.
+
+    `rows` are the record of the last row and, if it is the whole history, its control; None: unstressed.
+    """
 
     def begun(x: Any) -> Any:
         system = robot(x)
         if rows is None:
             return rest_record(system), resting_history(system, settings)
-        if system.mixed and one_state:
+        if system.mixed and len(rows) == 2:
             return rows[0], constant_history(system, settings, *rows, past.t0)
         return rows[0], past
 

@@ -9,9 +9,9 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, StructuredOptions
-from knode_cosserat.learning.fit import fit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training import rollouts as module
 from knode_cosserat.learning.training.rollouts import (
     RolloutRun,
@@ -143,7 +143,7 @@ def test_it_learns_from_positions_alone():
     config = FitConfig(NetworkOptions(hidden=5, convex=False), None, options)
     # stages are not known in measured rows, whose rates are differences of the rows
     moved = {period: pulled(period, time="bdf2", start="paper") for period in (1.0, 0.7, 1.4)}
-    model = fit(WRONG, [only_positions(moved[period]) for period in (1.0, 0.7)], config)
+    model = fit_states(WRONG, [only_positions(moved[period]) for period in (1.0, 0.7)], config)
     history = model.about.facts["rollouts"]
     assert history["loss"].shape == (401,) and history["learning_rate"].shape == (400,)
     assert history["loss"].min() < 1e-5 * history["loss"][0]
@@ -158,7 +158,7 @@ def test_any_residual_is_fine_tuned(bars):
     config = FitConfig(
         StructuredOptions(curved=False), None, dataclasses.replace(OPTIONS, learning_rate=1e-3)
     )
-    model = fit(WRONG, bars, config)
+    model = fit_states(WRONG, bars, config)
     loss = model.about.facts["rollouts"]["loss"]
     assert loss[0] > 1e-9 and loss.min() < 0.7 * loss[0]
     along = trajectory_batches(WRONG, bars, OPTIONS)
@@ -233,7 +233,7 @@ def test_a_model_that_cannot_be_simulated(bars):
     with pytest.raises(
         FitError, match=r"cannot be simulated over the trajectories.*nothing was kept"
     ) as caught:
-        fit(Torn(length=1.0, density=1.0, stiffness=30.0, nodes=6), bars, config)
+        fit_states(Torn(length=1.0, density=1.0, stiffness=30.0, nodes=6), bars, config)
     assert "\n" not in str(caught.value)
 
 
@@ -244,7 +244,7 @@ def test_best_held_out_weights_are_kept(bars):
         dataclasses.replace(OPTIONS, updates=200, learning_rate=0.05, stop_after=10, check_every=5),
     )
     unseen = pulled(1.4)
-    model = fit(WRONG, bars, config, held_out=[unseen])
+    model = fit_states(WRONG, bars, config, held_out=[unseen])
     history = model.about.facts["rollouts"]
     errors = history["held_out_error"]
     best = np.argmin(errors[:, 1])

@@ -52,7 +52,7 @@ LITTLE = 0.2
 SOLVED = 1e-8
 
 
-def fit(
+def fit_states(
     knowledge: System,
     trajectories: Sequence[Trajectory],
     config: FitConfig = BEST,
