@@ -215,15 +215,16 @@ def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
     return dataclasses.replace(trajectory, y=y, z=z)
 
 
-def _segment_runs(given: _Data, learned: dict[int, Residual]) -> list[Run]:
-    training = given.config.segments
+def _segment_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
+    training = data.config.segments
     if training is None:
         return []
-    runs: list[Run] = []
-    for seeds in _groups(given.config, len(given.dataset.segments.t)):
-        residuals = [learned[seed] for seed in seeds]
-        runs.append(SegmentRun(given.knowledge, residuals, given.dataset, training, seeds, given.held_out))
-    return runs
+    return [
+        SegmentRun(
+            data.knowledge, {seed: learned[seed] for seed in seeds}, data.dataset, training, data.held_out
+        )
+        for seeds in _groups(data.config, len(data.dataset.segments.t))
+    ]
 
 
 def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
@@ -236,13 +237,13 @@ def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
     return [(seed,) for seed in config.seeds]
 
 
-def _rollout_runs(given: _Data, learned: dict[int, Residual]) -> list[Run]:
-    options = given.config.rollouts
+def _rollout_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
+    options = data.config.rollouts
     if options is None:
         return []
-    along = trajectory_batches(given.knowledge, given.trajectories, options)
+    batches = trajectory_batches(data.knowledge, data.trajectories, options)
     return [
-        RolloutRun(given.knowledge, residual, along, options, seed, given.held_out)
+        RolloutRun(KNODE(data.knowledge, residual), batches, options, seed, data.held_out)
         for seed, residual in learned.items()
     ]
 

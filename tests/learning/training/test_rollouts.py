@@ -15,10 +15,8 @@ from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training import rollouts as module
 from knode_cosserat.learning.training.rollouts import (
     RolloutRun,
-    RolloutTargets,
     held_out_batches,
     loss_and_slope,
-    scales,
     tip_error,
     trajectory_batches,
 )
@@ -40,14 +38,8 @@ def residual():
     return dataclasses.replace(net, output_scale=jnp.full(4, 0.3, dtype=float))
 
 
-def aim_of(along, residual):
-    weights, rest = split(residual)
-    return weights, RolloutTargets(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
-
-
-def evaluated(along, residual):
-    weights, aim = aim_of(along, residual)
-    return loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
+def evaluated(batches, residual):
+    return loss_and_slope(*split(residual), WRONG, batches)
 
 
 def only_positions(trajectory):
@@ -161,10 +153,7 @@ def test_any_residual_is_fine_tuned(bars):
     model = fit_states(WRONG, bars, config)
     loss = model.about.facts["rollouts"]["loss"]
     assert loss[0] > 1e-9 and loss.min() < 0.7 * loss[0]
-    along = trajectory_batches(WRONG, bars, OPTIONS)
-    weights, rest = split(model.residual)
-    aim = RolloutTargets(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
-    found, _ = loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
+    found, _ = evaluated(trajectory_batches(WRONG, bars, OPTIONS), model.residual)
     np.testing.assert_allclose(found, loss.min(), rtol=1e-9)
 
 
@@ -189,7 +178,7 @@ def bumpy_run(bars, residual, monkeypatch, wall, **options):
     monkeypatch.setattr(RolloutRun, "_evaluated", lambda run, weights: bumpy(run, weights))
     start = dataclasses.replace(residual, input_biases=jnp.zeros(5))
     options = dataclasses.replace(OPTIONS, **options)
-    return bumpy, RolloutRun(WRONG, start, trajectory_batches(WRONG, bars, options), options, 0, None)
+    return bumpy, RolloutRun(KNODE(WRONG, start), trajectory_batches(WRONG, bars, options), options, 0, None)
 
 
 def to_its_end(run):

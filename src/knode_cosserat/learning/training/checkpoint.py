@@ -1,8 +1,8 @@
 """Checkpoints of a fit or an identification: after an interruption it resumes from the last ones.
 
 A checkpoint of a fit identifies it by settings, data and nominal model. A checkpoint of another fit is
-refused, and so is a truncated or damaged one. Files are `container`s: they are written atomically, and reading one
-runs no code.
+refused, and so is a truncated or damaged one. Files are `container`s: they are written atomically, and
+reading one runs no code.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -260,31 +260,18 @@ def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
 # the program
 
 
-class Numbers(NamedTuple):
-    """Numerical settings, which do not change the compiled program."""
-
-    learning_rate: Any
-    patience: Any
-    factor: Any
-    weight_decay: Any
-    epochs: Any
-
-
-class Recipe(NamedTuple):
-    """The settings that change the program."""
-
-    space: SpaceScheme
-    schedule: str
-
-
-class TrainingData(NamedTuple):
-    """Inputs of an epoch besides the weights: `known` if predictions are fixed, otherwise `samples`."""
+class TrainingData(eqx.Module):
+    """Inputs of an epoch besides the state; `known` if predictions are fixed, otherwise `samples`."""
 
     knowledge: System
     rest: Any
     samples: Samples | None
     known: NominalPredictions | None
     loss: PaperLoss | StandardisedLoss
+    #: numbers of `Training`, which do not change the compiled program
+    numbers: dict[str, Any]
+    space: SpaceScheme = eqx.field(static=True)
+    schedule: str = eqx.field(static=True)
 
 
 class State(NamedTuple):
@@ -299,49 +286,48 @@ class State(NamedTuple):
     waited: Int[Any, " G"]
 
 
-def _loss(weights: Any, recipe: Recipe, data: TrainingData) -> Any:
+def _loss(weights: Any, data: TrainingData) -> Any:
     residual = eqx.combine(weights, data.rest)
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
-    model = KNODE(data.knowledge, residual)
-    return data.loss(*_predicted(model, recipe.space, data.samples))
+    return data.loss(*_predicted(KNODE(data.knowledge, residual), data.space, data.samples))
 
 
-def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
+def plateau(numbers: dict[str, Any], loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
     """Return rate, best loss and epochs since then, after an epoch, as PyTorch's ReduceLROnPlateau."""
     better = loss < best * (1.0 - LEAST_GAIN)
     waited = jnp.where(better, 0, waited + 1)
-    enough = waited > numbers.patience
+    enough = waited > numbers["patience"]
     return (
-        jnp.where(enough, rate * numbers.factor, rate),
+        jnp.where(enough, rate * numbers["factor"], rate),
         jnp.where(better, loss, best),
         jnp.where(enough, 0, waited),
     )
 
 
-def _epoch(recipe: Recipe, numbers: Numbers, data: TrainingData, epoch: Any, of_seed: Any) -> Any:
+def _epoch(data: TrainingData, epoch: Any, seed_state: Any) -> Any:
     """Run one update of one seed: return its new state, the loss before, and the rate."""
-    weights, adam, rate, best, waited = of_seed
-    loss, slope = jax.value_and_grad(_loss)(weights, recipe, data)
-    now = rate
-    if recipe.schedule == "cosine":
-        now = numbers.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers.epochs))
+    weights, adam, rate, best, waited = seed_state
+    loss, slope = jax.value_and_grad(_loss)(weights, data)
+    now, numbers = rate, data.numbers
+    if data.schedule == "cosine":
+        now = numbers["learning_rate"] * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers["epochs"]))
     direction, adam = ADAM.update(slope, adam)
 
     def updated(weight: Any, change: Any) -> Any:
-        decay = numbers.weight_decay * weight if weight.ndim >= 2 else 0.0
+        decay = numbers["weight_decay"] * weight if weight.ndim >= 2 else 0.0
         return weight - now * (change + decay)
 
     weights = jax.tree.map(updated, weights, direction)
     weights, _ = split(eqx.combine(weights, data.rest).clamped())
-    if recipe.schedule == "plateau":
+    if data.schedule == "plateau":
         rate, best, waited = plateau(numbers, loss, rate, best, waited)
     return (weights, adam, rate, best, waited), loss, now
 
 
-@functools.partial(jax.jit, static_argnames="recipe")
+@jax.jit
 def run_epochs(
-    recipe: Recipe, numbers: Numbers, data: TrainingData, state: State, stop: Any
+    data: TrainingData, state: State, stop: Any
 ) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
     """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
@@ -351,45 +337,41 @@ def run_epochs(
     first = state.epoch
 
     def one(carry: Any) -> Any:
-        state, losses, rates = carry
-        epoch, *of_seeds = state
-        update = functools.partial(_epoch, recipe, numbers, data, epoch)
-        of_seeds, loss, rate = _side_by_side(update, tuple(of_seeds))
+        (epoch, *seed_states), losses, rates = carry
+
+        def update(seed_state: Any) -> Any:
+            return _epoch(data, epoch, seed_state)
+
+        if state.rate.shape[0] > 1:
+            seed_states, loss, rate = jax.vmap(update)(tuple(seed_states))
+        else:  # without a batch axis, which would cost a third more
+            alone = update(jax.tree.map(lambda leaf: leaf[0], tuple(seed_states)))
+            seed_states, loss, rate = jax.tree.map(lambda leaf: leaf[None], alone)
         i = epoch - first
-        return State(epoch + 1, *of_seeds), losses.at[i].set(loss), rates.at[i].set(rate)
+        return State(epoch + 1, *seed_states), losses.at[i].set(loss), rates.at[i].set(rate)
 
     nothing = jnp.full((PIECE, state.rate.shape[0]), jnp.nan)
     last = jnp.minimum(stop, first + PIECE)
     return jax.lax.while_loop(lambda carry: carry[0].epoch < last, one, (state, nothing, nothing))
 
 
-def _side_by_side(update: Any, of_seeds: Any) -> Any:
-    """Apply `update` to all seeds; without a batch axis for one seed, which would cost a third more."""
-    if jax.tree.leaves(of_seeds)[0].shape[0] > 1:
-        return jax.vmap(update)(of_seeds)
-    alone = update(jax.tree.map(lambda leaf: leaf[0], of_seeds))
-    return jax.tree.map(lambda leaf: leaf[None], alone)
-
-
 # before the first epoch
 
 
-def prepared(
-    knowledge: System, residual: Residual, dataset: Dataset, training: Training
-) -> tuple[Recipe, Numbers, TrainingData]:
+def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: Training) -> TrainingData:
     """Return the program's inputs besides its state."""
     segments, space = dataset.segments, dataset.space
-    numbers = Numbers(
-        training.learning_rate, training.patience, training.factor, training.weight_decay,
-        float(training.epochs),
-    )  # fmt: skip
     # the prediction is the nominal model's plus a linear combination of the network's outputs
     divided = grid_of(knowledge).parts.shape[1] > 1
     adds = isinstance(residual, Network) and not space.formula.stages and not divided
     known = _known(residual, knowledge, segments, space) if adds else None
-    loss = loss_for(training.loss, knowledge, segments)
-    data = TrainingData(knowledge, split(residual)[1], None if adds else segments, known, loss)
-    return Recipe(space, training.schedule), numbers, jax.tree.map(jnp.asarray, data)
+    names = ("learning_rate", "patience", "factor", "weight_decay", "epochs")
+    data = TrainingData(
+        knowledge, split(residual)[1], None if adds else segments, known,
+        loss_for(training.loss, knowledge, segments), {name: getattr(training, name) for name in names},
+        space, training.schedule,
+    )  # fmt: skip
+    return jax.tree.map(jnp.asarray, data)
 
 
 def started(residuals: Sequence[Residual], training: Training) -> State:
@@ -397,14 +379,10 @@ def started(residuals: Sequence[Residual], training: Training) -> State:
     every = [split(residual)[0] for residual in residuals]
     weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
     count = len(residuals)
-    return State(
-        jnp.zeros((), dtype=int),
-        weights,
-        jax.vmap(ADAM.init)(weights),
-        jnp.full(count, training.learning_rate),
-        jnp.full(count, jnp.inf),
-        jnp.zeros(count, dtype=int),
-    )
+    rate, best, waited = (
+        jnp.full(count, training.learning_rate), jnp.full(count, jnp.inf), jnp.zeros(count, dtype=int)
+    )  # fmt: skip
+    return State(jnp.zeros((), dtype=int), weights, jax.vmap(ADAM.init)(weights), rate, best, waited)
 
 
 class SegmentRun(Run):
@@ -413,17 +391,20 @@ class SegmentRun(Run):
     stage = "segments"
 
     def __init__(
-        self, knowledge: System, residuals: Sequence[Residual], dataset: Dataset, training: Training,
-        seeds: tuple[int, ...], held_out: TrajectoryBatches | None,
+        self, knowledge: System, residuals: Mapping[int, Residual], dataset: Dataset, training: Training,
+        held_out: TrajectoryBatches | None,
     ):  # fmt: skip
-        state = started(residuals, training)
-        super().__init__(seeds, training.epochs, state, Best(state.weights, training.stop_after))
+        """Prepare the training of the residuals, by their seeds."""
+        first, *_ = residuals.values()
+        state = started([*residuals.values()], training)
+        best = Best(state.weights, training.stop_after)
+        super().__init__(tuple(residuals), training.epochs, state, best)
         self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
-        self._inputs = prepared(knowledge.strand, residuals[0], dataset, training)
+        self._data = prepared(knowledge.strand, first, dataset, training)
 
     def compile(self) -> None:
         """Compile the epochs' program without running one, and run one held-out rollout."""
-        run_epochs(*self._inputs, self.state, self.done)
+        run_epochs(self._data, self.state, self.done)
         if self._held_out:
             tip_error(KNODE(self._knowledge, self._residual(0)), self._held_out)
 
@@ -433,7 +414,7 @@ class SegmentRun(Run):
         stop = min(stop, first + PIECE, self.steps)
         if self._held_out:
             stop = min(stop, first - first % self._every + self._every)
-        state, losses, rates = run_epochs(*self._inputs, self.state, stop)
+        state, losses, rates = run_epochs(self._data, self.state, stop)
         losses, rates = (np.asarray(values)[: stop - first] for values in (losses, rates))
         self._require_sane(losses, state.weights)
         self.state = state
@@ -465,9 +446,9 @@ class SegmentRun(Run):
 
     def _residual(self, k: int) -> Residual:
         """Return the residual of seed k with its last weights."""
-        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._inputs[2].rest)
+        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._data.rest)
 
     def residuals(self) -> list[Residual]:
         """Return residuals with the last weights, or the best if training may stop early."""
         chosen = [self.best.chosen(k, self.state.weights) for k in range(len(self.seeds))]
-        return [eqx.combine(weights, self._inputs[2].rest) for weights in chosen]
+        return [eqx.combine(weights, self._data.rest) for weights in chosen]
