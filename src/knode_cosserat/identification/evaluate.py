@@ -26,7 +26,7 @@ from knode_cosserat.trajectory import Trajectory
 RECOVERY = 5.0
 
 
-class PredictedPoses(NamedTuple):
+class _Poses(NamedTuple):
     """Positions (m) and orientations of bodies."""
 
     position: Float[np.ndarray, "T M 3"]
@@ -190,8 +190,8 @@ def compared(
     mse = rotation = None
     if oriented.any():
         both = (
-            PredictedPoses(position[oriented], quaternion[oriented]),
-            PredictedPoses(seen[oriented], turned[oriented]),
+            _Poses(position[oriented], quaternion[oriented]),
+            _Poses(seen[oriented], turned[oriented]),
         )
         mse, rotation = pose_mse(*both), rotation_rmse(*both)
     return Evaluation(

@@ -31,8 +31,8 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
     reels = nominal.reels or Reels(motors=np.arange(1.0, tendons + 1.0))
     ends = np.array([routing.end for routing in nominal.routings])
     # tendons that end together
-    levels, level_of = np.unique(ends, return_inverse=True)
-    level_of = tuple(level_of.ravel().tolist())
+    levels, inverse = np.unique(ends, return_inverse=True)
+    level_of = tuple(inverse.ravel().tolist())
     zero, taken_in, compliance = (
         np.zeros(count) if stated is None else np.asarray(stated)
         for stated, count in (
@@ -64,12 +64,12 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         ),
         Effect(
             "taken in", "length of tendons that is taken in at the motors' zeros, by where they end", lengths,
-            ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in),
+            _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in),
         ),
         Effect(
             "springs", "compliance of the springs in series with tendons, by where these end",
             tuple(_spring(end, float(np.mean(compliance[ends == end])), nominal) for end in levels),
-            ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
+            _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
         ),
     ]  # fmt: skip
     if radii is not None:
@@ -122,7 +122,7 @@ def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
 
 
 @dataclasses.dataclass(frozen=True)
-class ByLevel:
+class _ByLevel:
     """Replaces a parameter of all tendons by numbers of their levels: where they end."""
 
     parameter: str

@@ -163,15 +163,16 @@ def learn_residual(
     point = Point(begin, scale, problem, problem, model.mask(identified), search.prior)
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
-    before, steps = [fold.errors for fold in without], []
+    before, steps = [fold.errors for fold in without], list[str]()
     recordings = [experiment.name for experiment in data]
     tested: dict[float, list[PositionErrors]] = {}
 
-    def learned(
-        x: np.ndarray, end: Point, folds: Sequence[_Fold], part: float, kept: bool
-    ) -> LearnedResidual:
-        errors = (dict(zip(recordings, it, strict=False)) for it in (before, tested.get(part, ())))
-        return LearnedResidual(model, x, _widened(end, folds), kept, *errors, tuple(steps))
+    def learned(x: np.ndarray, end: Point, folds: Sequence[_Fold], fraction: float) -> LearnedResidual:
+        """Return the result with this fraction of the residual; 0: without."""
+        after = tested.get(fraction or 1.0, ())
+        without_it, with_it = (dict(zip(recordings, it, strict=False)) for it in (before, after))
+        covariance = _widened(end, folds)
+        return LearnedResidual(model, x, covariance, fraction > 0.0, without_it, with_it, tuple(steps))
 
     if not widths:
         steps.append("no part of a residual promises a lower error of held-out recordings")
@@ -197,10 +198,10 @@ def learn_residual(
             x = begin + fraction * (end.x - begin)
             reason = failed_trial(model.robot(x), data, space)
             if reason is None:
-                return learned(x, end, folds, fraction, True)
+                return learned(x, end, folds, fraction)
             steps.append(f"not accepted: {reason}")
         widths = dict(list(widths.items())[: len(widths) // 2])
-    return learned(begin, point, without, 1.0, False)
+    return learned(begin, point, without, 0.0)
 
 
 # parts that promise an improvement

@@ -258,11 +258,13 @@ class FitConfig(_Options):
         ConfigError: a value is not allowed.
     """
 
-    residual: StructuredOptions | NetworkOptions | PassiveOptions = _option(
+    residual: StructuredOptions | NetworkOptions | PassiveOptions = _option(  # noqa: RUF009
         StructuredOptions(), _part(StructuredOptions, NetworkOptions, PassiveOptions)
     )
-    segments: Training | None = _option(None, _part(Training), none="no such training")
-    rollouts: RolloutTraining | None = _option(None, _part(RolloutTraining), none="no such training")
+    segments: Training | None = _option(None, _part(Training), none="no such training")  # noqa: RUF009
+    rollouts: RolloutTraining | None = _option(  # noqa: RUF009
+        None, _part(RolloutTraining), none="no such training"
+    )
     seed: int | tuple[int, ...] = _option(0, _seeds())
 
     def __post_init__(self) -> None:

@@ -158,7 +158,7 @@ def _mean_square(errors: Float[Any, "x S"]) -> Float[Any, " S"]:
 # predictions of the nominal model
 
 
-class NominalPredictions(NamedTuple):
+class _NominalPredictions(NamedTuple):
     """Predictions of the samples (S) by the nominal model alone, and a network's scaled inputs."""
 
     #: at the starts of segments, then at their ends if the scheme uses them; the last row is ones, for the
@@ -174,7 +174,7 @@ class NominalPredictions(NamedTuple):
 
 def nominal_predictions(
     net: Network, knowledge: System, samples: Samples, space: SpaceScheme
-) -> NominalPredictions:
+) -> _NominalPredictions:
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
@@ -193,10 +193,10 @@ def nominal_predictions(
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
     joined = jnp.concatenate(inputs, axis=1)
     states = jnp.concatenate([samples.y, samples.y_next][: len(inputs)]).T
-    return NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), states, y, z, steps)
+    return _NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), states, y, z, steps)
 
 
-def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
+def corrected(net: Network, known: _NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
     """Return the predictions of all samples by nominal model and network, as `segments.predict_segment`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
@@ -260,13 +260,13 @@ def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
 # the program
 
 
-class TrainingData(eqx.Module):
+class _TrainingData(eqx.Module):
     """Inputs of an epoch besides the state; `known` if predictions are fixed, otherwise `samples`."""
 
     knowledge: System
     rest: Any
     samples: Samples | None
-    known: NominalPredictions | None
+    known: _NominalPredictions | None
     loss: PaperLoss | StandardisedLoss
     #: numbers of `Training`, which do not change the compiled program
     numbers: dict[str, Any]
@@ -274,7 +274,7 @@ class TrainingData(eqx.Module):
     schedule: str = eqx.field(static=True)
 
 
-class State(NamedTuple):
+class _State(NamedTuple):
     """State of the training; all fields but `epoch` have the seeds (G) as first axis."""
 
     epoch: Int[Any, ""]
@@ -286,7 +286,7 @@ class State(NamedTuple):
     waited: Int[Any, " G"]
 
 
-def _loss(weights: Any, data: TrainingData) -> Any:
+def _loss(weights: Any, data: _TrainingData) -> Any:
     residual = eqx.combine(weights, data.rest)
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
@@ -305,7 +305,7 @@ def plateau(numbers: dict[str, Any], loss: Any, rate: Any, best: Any, waited: An
     )
 
 
-def _epoch(data: TrainingData, epoch: Any, seed_state: Any) -> Any:
+def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:
     """Run one update of one seed: return its new state, the loss before, and the rate."""
     weights, adam, rate, best, waited = seed_state
     loss, slope = jax.value_and_grad(_loss)(weights, data)
@@ -327,8 +327,8 @@ def _epoch(data: TrainingData, epoch: Any, seed_state: Any) -> Any:
 
 @jax.jit
 def run_epochs(
-    data: TrainingData, state: State, stop: Any
-) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
+    data: _TrainingData, state: _State, stop: Any
+) -> tuple[_State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
     """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
     The number of epochs is a value, not a shape. One program serves every piece, so that an interruption does
@@ -348,7 +348,7 @@ def run_epochs(
             alone = update(jax.tree.map(lambda leaf: leaf[0], tuple(seed_states)))
             seed_states, loss, rate = jax.tree.map(lambda leaf: leaf[None], alone)
         i = epoch - first
-        return State(epoch + 1, *seed_states), losses.at[i].set(loss), rates.at[i].set(rate)
+        return _State(epoch + 1, *seed_states), losses.at[i].set(loss), rates.at[i].set(rate)
 
     nothing = jnp.full((PIECE, state.rate.shape[0]), jnp.nan)
     last = jnp.minimum(stop, first + PIECE)
@@ -358,7 +358,7 @@ def run_epochs(
 # before the first epoch
 
 
-def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: Training) -> TrainingData:
+def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: Training) -> _TrainingData:
     """Return the program's inputs besides its state."""
     segments, space = dataset.segments, dataset.space
     # the prediction is the nominal model's plus a linear combination of the network's outputs
@@ -366,7 +366,7 @@ def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: 
     adds = isinstance(residual, Network) and not space.formula.stages and not divided
     known = _known(residual, knowledge, segments, space) if adds else None
     names = ("learning_rate", "patience", "factor", "weight_decay", "epochs")
-    data = TrainingData(
+    data = _TrainingData(
         knowledge, split(residual)[1], None if adds else segments, known,
         loss_for(training.loss, knowledge, segments), {name: getattr(training, name) for name in names},
         space, training.schedule,
@@ -374,7 +374,7 @@ def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: 
     return jax.tree.map(jnp.asarray, data)
 
 
-def started(residuals: Sequence[Residual], training: Training) -> State:
+def started(residuals: Sequence[Residual], training: Training) -> _State:
     """Return the state before the first epoch, with one residual for each seed."""
     every = [split(residual)[0] for residual in residuals]
     weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
@@ -382,7 +382,7 @@ def started(residuals: Sequence[Residual], training: Training) -> State:
     rate, best, waited = (
         jnp.full(count, training.learning_rate), jnp.full(count, jnp.inf), jnp.zeros(count, dtype=int)
     )  # fmt: skip
-    return State(jnp.zeros((), dtype=int), weights, jax.vmap(ADAM.init)(weights), rate, best, waited)
+    return _State(jnp.zeros((), dtype=int), weights, jax.vmap(ADAM.init)(weights), rate, best, waited)
 
 
 class SegmentRun(Run):

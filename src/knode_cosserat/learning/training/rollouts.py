@@ -33,7 +33,7 @@ POSE = ("p", "h")
 DIVERGED, NOTHING = 1e6, 1e-6
 
 
-class TrajectoryBatch(NamedTuple):
+class _TrajectoryBatch(NamedTuple):
     """Trajectories (B) of one length: controls and target states."""
 
     control: Float[Any, "B T c"]
@@ -44,7 +44,7 @@ class TrajectoryBatch(NamedTuple):
 class TrajectoryBatches(eqx.Module):
     """All trajectories, grouped by length, with the settings of their simulation."""
 
-    parts: tuple[TrajectoryBatch, ...]
+    parts: tuple[_TrajectoryBatch, ...]
     #: scale of each compared field's errors: the rms of its motion
     scales: Float[Any, " fields"]
     compared: tuple[str, ...] = eqx.field(static=True)
@@ -66,7 +66,7 @@ def trajectory_batches(
         samples(knowledge, [_relevant(knowledge, one, compared) for one in trajectories])
     except DataError as error:
         raise DataError(f"{what}{error}") from None
-    by_length: dict[int, list[TrajectoryBatch]] = {}
+    by_length: dict[int, list[_TrajectoryBatch]] = {}
     for k, trajectory in enumerate(trajectories):
         if float(trajectory.time[0]) != 0.0:
             raise DataError(
@@ -75,7 +75,7 @@ def trajectory_batches(
             )
         rows = min(len(trajectory.time), 1 + (options.horizon or len(trajectory.time)))
         y, control = (np.asarray(part, dtype=float)[:rows] for part in (trajectory.y, trajectory.control))
-        by_length.setdefault(rows, []).append(TrajectoryBatch(control[1:], y))
+        by_length.setdefault(rows, []).append(_TrajectoryBatch(control[1:], y))
     parts = [jax.tree.map(lambda *leaves: np.stack(leaves), *several) for several in by_length.values()]
     scales = []
     for name in compared:
@@ -115,7 +115,7 @@ def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...]) -> Any
 
 
 def simulated_batch(
-    model: System, batch: TrajectoryBatch, batches: TrajectoryBatches
+    model: System, batch: _TrajectoryBatch, batches: TrajectoryBatches
 ) -> Float[Any, "B T+1 nodes y"]:
     """Return y of all trajectories simulated by the model, one after the other; NaN in unsolved steps."""
     settings = batches.settings
@@ -198,7 +198,7 @@ def _difference(name: str, values: Any, truth: Any) -> Any:
 # fine-tuning
 
 
-class RolloutState(NamedTuple):
+class _RolloutState(NamedTuple):
     """State of fine-tuning: weights, optimiser, gradient, weights of least loss, factor on the step."""
 
     weights: Any
@@ -209,7 +209,7 @@ class RolloutState(NamedTuple):
 
 
 @jax.jit
-def _proposal(state: RolloutState, rest: Any, rate: Any, clip: Any) -> Any:
+def _proposal(state: _RolloutState, rest: Any, rate: Any, clip: Any) -> Any:
     """Return the weights and the optimiser after a step."""
     slope, _ = optax.clip_by_global_norm(clip).update(state.slope, optax.EmptyState())
     direction, adam = ADAM.update(slope, state.adam)
@@ -234,7 +234,7 @@ class RolloutRun(Run):
         weights, self._rest = split(model.residual)
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
         slope = jax.tree.map(jnp.zeros_like, weights)
-        state = RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
+        state = _RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
         super().__init__((seed,), options.updates, state, Best(_one(weights), options.stop_after))
         self._knowledge, self._batches = model.knowledge, batches
         self._options, self._held_out = options, held_out
@@ -281,7 +281,7 @@ class RolloutRun(Run):
                 f"{options.rejections} times, to {step:.3g}, the robot still cannot be simulated after it"
             )
         lowest = weights if loss < self.losses.min() else state.lowest
-        self.state = RolloutState(weights, adam, slope, lowest, np.array(scale))
+        self.state = _RolloutState(weights, adam, slope, lowest, np.array(scale))
         watch.steps(self.stage, self.seeds, self.done, self.losses[-1:], np.array([[step]]))
         self.losses = np.append(self.losses, [[loss]], axis=0)
         self.rates = np.append(self.rates, [[step]], axis=0)
