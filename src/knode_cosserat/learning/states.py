@@ -121,16 +121,14 @@ def fit_states(
         verify = not type(knowledge.nominal).__module__.startswith("knode_cosserat.")
     models = []
     for seed, residual in learned.items():
-        own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
+        model, about = KNODE(knowledge, residual), {**facts, "seed": seed, **histories[seed]}
         if data.held_out is not None:
-            own["held_out_error"] = tip_error(KNODE(knowledge, residual), data.held_out)
+            about["held_out_error"] = tip_error(model, data.held_out)
         if verify:
-            own["rollout_errors"] = list(
-                rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
-            )
-        own["seconds"] = time.perf_counter() - began
-        models.append(KNODE(knowledge, residual, About(own), trained))
-        log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)
+            about["rollout_errors"] = list(rollout_errors(knowledge, model, trajectories[0]))
+        about["seconds"] = time.perf_counter() - began
+        models.append(KNODE(knowledge, residual, About(about), trained))
+        log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), about["seconds"], seed)
     return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
 
 
@@ -159,10 +157,10 @@ def require_allowed(knowledge: System, config: FitConfig) -> None:
             raise FitError(str(error)) from None
 
 
-def _listed(name: str, given: Any) -> list[Trajectory]:
-    if isinstance(given, Trajectory) or not isinstance(given, Iterable):
-        raise FitError(f"{name} is a {type(given).__name__}; allowed is a list of trajectories")
-    return list(given)
+def _listed(name: str, trajectories: Any) -> list[Trajectory]:
+    if isinstance(trajectories, Trajectory) or not isinstance(trajectories, Iterable):
+        raise FitError(f"{name} is a {type(trajectories).__name__}; allowed is a list of trajectories")
+    return list(trajectories)
 
 
 class _Data(NamedTuple):
@@ -229,11 +227,10 @@ def _segment_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
 
 def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
     """Group the seeds that share one vectorised program: all seeds, unless each keeps a core busy."""
-    if not isinstance(config.residual, NetworkOptions):
-        return [(seed,) for seed in config.seeds]
-    work = config.residual.hidden * count * len(config.seeds)
-    if jax.default_backend() != "cpu" or work <= SHARED:
-        return [config.seeds]
+    if isinstance(config.residual, NetworkOptions):
+        work = config.residual.hidden * count * len(config.seeds)
+        if jax.default_backend() != "cpu" or work <= SHARED:
+            return [config.seeds]
     return [(seed,) for seed in config.seeds]
 
 
@@ -285,12 +282,12 @@ def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> tu
         with warnings.catch_warnings():
             # the grid is that of the training data
             warnings.simplefilter("ignore")
-            found = simulate(
+            motion = simulate(
                 system, np.asarray(trajectory.control)[first:], trajectory.dt, time=settings.time or "bdf2",
                 space=settings.space, start=settings.start, initial=trajectory[:first], on_failure="return",
             )  # fmt: skip
-        apart = (np.asarray(found.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
-        errors.append(float(np.sqrt(np.mean(apart**2))) if found.all_valid else float("inf"))
+        apart = (np.asarray(motion.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
+        errors.append(float(np.sqrt(np.mean(apart**2))) if motion.all_valid else float("inf"))
     if np.isinf(errors[1]):
         warnings.warn(
             "the fitted model cannot be simulated over its first training trajectory: a step has no "

@@ -24,7 +24,17 @@ from knode_cosserat.learning.config import Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
 from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
-from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
+from knode_cosserat.learning.training.runs import (
+    ADAM,
+    DIVERGED,
+    NOTHING,
+    Best,
+    FitError,
+    ProgressMonitor,
+    Run,
+    is_finite,
+    split,
+)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
@@ -44,8 +54,6 @@ PAPER_FIELDS = ("p", "h", "n", "m", "q", "w")
 LEAST_PART = 1e-3
 #: relative variation below which a field is constant
 ROUNDING = 1e-12
-#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
-DIVERGED, NOTHING = 1e6, 1e-6
 
 
 # losses

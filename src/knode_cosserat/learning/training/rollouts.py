@@ -20,7 +20,17 @@ from jaxtyping import Float
 from knode_cosserat.learning.config import RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
+from knode_cosserat.learning.training.runs import (
+    ADAM,
+    DIVERGED,
+    NOTHING,
+    Best,
+    FitError,
+    ProgressMonitor,
+    Run,
+    is_finite,
+    split,
+)
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.segments import DataError, samples, settings_of
 from knode_cosserat.solvers.settings import Settings
@@ -29,8 +39,6 @@ from knode_cosserat.trajectory import Trajectory
 
 #: fields compared by default, if the system has them
 POSE = ("p", "h")
-#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
-DIVERGED, NOTHING = 1e6, 1e-6
 
 
 class _TrajectoryBatch(NamedTuple):
