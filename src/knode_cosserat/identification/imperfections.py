@@ -67,8 +67,7 @@ def imperfect_robot(
         raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
     model, random = library_model(nominal, tension, bodies), np.random.default_rng(seed)
     names: list[str] = []
-    own = [effect for effect in model.effects if not effect.of_recordings]
-    for effect in own:
+    for effect in (it for it in model.effects if not it.of_recordings):
         present = bool(random.uniform() < SHARE) or effect.basic
         if present and set(effect.needs) <= set(names):
             names.append(effect.name)

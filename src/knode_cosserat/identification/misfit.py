@@ -110,12 +110,12 @@ class Misfit:
             task = Equilibria(dataclasses.replace(data.settings, time=None), max(steps, 1), RECOVERY)
         else:
             acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
-        found, _, cause = run_one(task, system, acting, start.state, start.before)
+        solved_rows, _, cause = run_one(task, system, acting, start.state, start.before)
         if cause:
             return None
         size = system.y_layout.size + system.z_layout.size
         compared = slice(data.steps - 1, steps, data.steps)
-        records = np.concatenate([start.record[None], found.records[compared, :, :size]])
+        records = np.concatenate([start.record[None], solved_rows.records[compared, :, :size]])
 
         def every(rows: np.ndarray) -> np.ndarray:
             """Fill to all rows: one compiled program serves all horizons."""
@@ -131,7 +131,7 @@ class Misfit:
             d_controls = np.zeros((*controls.shape, len(x)))
             if slope is not None:
                 d_controls = slope[:steps, :, None] * np.asarray(by_latency)
-            solved = tuple(part[: steps * stages] for part in found.every_stage)
+            solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             d_records = np.zeros((0, *records.shape[1:], len(x)))
             if steps and data.static:
                 d_rows, *_ = static_tangents(task.settings, solved, (system, controls), (moves, d_controls))
@@ -156,14 +156,14 @@ class Misfit:
             return self._moving_start(system, x, data)
         control = np.zeros(system.control_size) if data.held is None else np.asarray(data.held, dtype=float)
         still = dataclasses.replace(settings, time=None)
-        found, y, cause = static_run(Equilibria(still, 1, RECOVERY), system, control[None])
+        rest, y, cause = static_run(Equilibria(still, 1, RECOVERY), system, control[None])
         if cause:
             return None
-        record = np.asarray(found.records[0][:, :size])
+        record = np.asarray(rest.records[0][:, :size])
         past = None if data.static else at_one_state(system, settings, record, control)
 
         def tangents(moves: SystemMoves) -> Any:
-            held, solved = control[None], (found.records, found.unknowns)
+            held, solved = control[None], (rest.records, rest.unknowns)
             changes = moves, np.zeros((*held.shape, len(x)))
             d_rows, _, d_records = static_tangents(still, solved, (system, held), changes)
             return d_rows[0], past, (np.stack([d_records] * data.settings.memory), np.zeros_like(d_records))

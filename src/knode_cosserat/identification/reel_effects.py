@@ -73,7 +73,7 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         ),
     ]  # fmt: skip
     if radii is not None:
-        each = tuple(
+        single = tuple(
             Number(f"reels.radius[{k}]", "m", float(at), 0.05, 1e-6, 1.0, True) for k, at in enumerate(radii)
         )
         effects += [
@@ -82,7 +82,7 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
                 (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),), _with_radius,
             ),
             Effect(
-                "reel radii", "radius of each reel", each,
+                "reel radii", "radius of each reel", single,
                 lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii]),
             ),
         ]  # fmt: skip

@@ -69,7 +69,7 @@ def _combination(names: np.ndarray, parts: np.ndarray) -> tuple[tuple[str, ...],
 
 def unexplained(search: Search, point: Point) -> tuple[str, ...]:
     """Return the fields whose remaining differences are not noise: rows are correlated at large lags."""
-    found: dict[str, None] = {}
+    fields: dict[str, None] = {}
     rollouts = search.misfit.differences(point.x)
     for k, (data, rollout) in enumerate(zip(search.misfit.data, rollouts, strict=True)):
         if rollout is None or data.static:
@@ -87,6 +87,6 @@ def unexplained(search: Search, point: Point) -> tuple[str, ...]:
                 count = max(int(np.sum(known[lag:, data.groups == field])), 1)
                 if np.abs(np.sum(one * other)) > max(ALIKE, 5.0 / np.sqrt(count)) * size:
                     several = len(search.misfit.data) > 1 and data.readings
-                    found[f"{name} in {data.name}" if several else name] = None
+                    fields[f"{name} in {data.name}" if several else name] = None
                     break
-    return tuple(found)
+    return tuple(fields)

@@ -163,7 +163,7 @@ class Passive(Residual):
     def clamped(self) -> Self:
         """Return the nearest residual with nonnegative damping coefficients."""
         return eqx.tree_at(
-            lambda own: [getattr(own, name) for name in POSITIVE if getattr(own, name) is not None],
+            lambda it: [getattr(it, name) for name in POSITIVE if getattr(it, name) is not None],
             self,
             replace_fn=_not_negative,
         )
@@ -184,7 +184,7 @@ class Passive(Residual):
         if self.dissipation is None or np.any(np.asarray(self.dissipation) > 0.0):
             return self
         none = [None, None]
-        return eqx.tree_at(lambda own: [own.dissipation, own.damping_weights], self, none)
+        return eqx.tree_at(lambda it: [it.dissipation, it.damping_weights], self, none)
 
 
 def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0, hidden: int = 4) -> Passive:

@@ -64,8 +64,8 @@ class Residual(eqx.Module):
 
     def coefficients(self) -> dict[str, Float[Any, "..."]]:
         """Return the arrays of `linear_in` by their paths; those that do not exist are left out."""
-        found = {path: _at(self, path) for path in self.linear_in}
-        return {path: value for path, value in found.items() if value is not None}
+        parts = {path: _at(self, path) for path in self.linear_in}
+        return {path: value for path, value in parts.items() if value is not None}
 
     def with_coefficients(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with other coefficients, which may be traced.
@@ -83,7 +83,7 @@ class Residual(eqx.Module):
                     f"residual.{path} has shape {np.shape(value)}; allowed is {np.shape(known[path])}"
                 )
         names = list(changes)
-        return eqx.tree_at(lambda own: [_at(own, name) for name in names], self, [*changes.values()])
+        return eqx.tree_at(lambda it: [_at(it, name) for name in names], self, [*changes.values()])
 
 
 def _at(owner: Any, path: str) -> Any:
@@ -163,9 +163,9 @@ class Network(Residual):
         """
         if self.quaternion is None:
             return added
-        own = slice(*self.quaternion)
-        h, h_s = y[own], added[own]
-        return added.at[own].add(-h * (jnp.sum(h * h_s, axis=0) / jnp.sum(h * h, axis=0)))
+        where = slice(*self.quaternion)
+        h, h_s = y[where], added[where]
+        return added.at[where].add(-h * (jnp.sum(h * h_s, axis=0) / jnp.sum(h * h, axis=0)))
 
     def clamped(self) -> Self:
         """Return a convex network with its negative weights set to zero; any other unchanged."""

@@ -66,8 +66,8 @@ class Identity:
             ("knowledge", "another knowledge"), ("trajectories", "other trajectories"),
             ("held_out", "other held-out trajectories"),
         ):  # fmt: skip
-            own = getattr(self, name)
-            if (list(own) if isinstance(own, tuple) else own) != other.get(name):
+            value = getattr(self, name)
+            if (list(value) if isinstance(value, tuple) else value) != other.get(name):
                 return f"of {words}"
         return ""
 
@@ -98,16 +98,14 @@ def hashed(*values: Any) -> str:
     return digest.hexdigest()
 
 
-def _first_change(own: Any, other: Any, where: str = "") -> str:
-    if isinstance(own, dict) and isinstance(other, dict):
-        for key in sorted({*own, *other}):
-            changed = _first_change(own.get(key), other.get(key), f"{where}.{key}" if where else key)
-            if changed:
-                return changed
+def _first_change(here: Any, there: Any, where: str = "") -> str:
+    if isinstance(here, dict) and isinstance(there, dict):
+        keys = sorted({*here, *there})
+        changes = (_first_change(here.get(key), there.get(key), f"{where}.{key}".strip(".")) for key in keys)
+        return next(filter(None, changes), "")
+    if here == there:
         return ""
-    if own == other:
-        return ""
-    return f"{where} is {json.dumps(other)[:60]} there and {json.dumps(own)[:60]} here"
+    return f"{where} is {json.dumps(there)[:60]} there and {json.dumps(here)[:60]} here"
 
 
 class Checkpoints:

@@ -150,13 +150,13 @@ def value_scales(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.n
         fields: size of each field, in order. A number that hardly varies, such as a force normal to the plane
             of motion, gets a part of its field's largest; the numbers of a constant field get one.
     """
-    found = []
+    scales = []
     for part in np.split(np.asarray(values), np.cumsum(fields)[:-1], axis=1):
         deviation = np.std(part, axis=0)
         largest = deviation.max(initial=0.0)
         varies = largest > ROUNDING * max(1e-3, np.abs(part).max(initial=0.0))
-        found.append(np.maximum(deviation, LEAST_PART * largest) if varies else np.ones_like(deviation))
-    return np.concatenate(found)
+        scales.append(np.maximum(deviation, LEAST_PART * largest) if varies else np.ones_like(deviation))
+    return np.concatenate(scales)
 
 
 def _mean_square(errors: Float[Any, "x S"]) -> Float[Any, " S"]:
