@@ -28,16 +28,6 @@ module = importlib.import_module("knode_cosserat.learning.states")
 SMALL = FitConfig.network(hidden=5, epochs=500)
 
 
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
-
-
-@pytest.fixture(scope="module")
-def unseen():
-    return pulled(1.4)
-
-
 def tip_rmse(model, truth):
     found = kc.simulate(model, truth.control[1:], truth.dt).tip_position
     return float(np.sqrt(np.mean(np.sum((found - truth.tip_position) ** 2, axis=-1))))

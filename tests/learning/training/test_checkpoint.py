@@ -39,11 +39,6 @@ LONG = FitConfig(
 )
 
 
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
-
-
 def assert_same(one, other):
     """Weights and histories, bit for bit."""
     for found, expected in zip(_members(one), _members(other), strict=True):
@@ -102,7 +97,7 @@ def test_interrupted_and_resumed(bars, tmp_path, interrupted, monkeypatch, every
 
 
 @pytest.mark.slow
-def test_resumed_with_early_stopping(bars, tmp_path, interrupted, monkeypatch):
+def test_resumed_with_early_stopping(bars, unseen, tmp_path, interrupted, monkeypatch):
     """The best weights so far, and what was seen of the held-out rollouts, are kept too."""
     training = Training(epochs=400, learning_rate=0.02, schedule="constant", stop_after=40, check_every=10)
     config = FitConfig(
@@ -111,7 +106,7 @@ def test_resumed_with_early_stopping(bars, tmp_path, interrupted, monkeypatch):
         RolloutTraining(updates=6, horizon=6, stop_after=4, check_every=2),
         seed=(0, 1),
     )
-    held_out = [pulled(1.4)]
+    held_out = [unseen]
     expected = fit_states(WRONG, bars, config, held_out=held_out)
     assert len(expected[0].about.facts["segments"]["loss"]) < 400
     for count in (3, 9, 2):

@@ -43,11 +43,6 @@ def moved(robot):
     ]
 
 
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
-
-
 # losses
 
 

@@ -28,11 +28,6 @@ OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)
 
 
 @pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
-
-
-@pytest.fixture(scope="module")
 def residual():
     net = network(WRONG, NetworkOptions(hidden=5, convex=False), jax.random.key(0))
     return dataclasses.replace(net, output_scale=jnp.full(4, 0.3, dtype=float))
@@ -226,13 +221,12 @@ def test_a_model_that_cannot_be_simulated(bars):
     assert "\n" not in str(caught.value)
 
 
-def test_best_held_out_weights_are_kept(bars):
+def test_best_held_out_weights_are_kept(bars, unseen):
     config = FitConfig(
         NetworkOptions(hidden=5, convex=False),
         None,
         dataclasses.replace(OPTIONS, updates=200, learning_rate=0.05, stop_after=10, check_every=5),
     )
-    unseen = pulled(1.4)
     model = fit_states(WRONG, bars, config, held_out=[unseen])
     history = model.about.facts["rollouts"]
     errors = history["held_out_error"]
