@@ -16,9 +16,8 @@ from knode_cosserat import controls
 from knode_cosserat.evaluation.comparison import legend_below
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style
-from knode_cosserat.learning.config import FitConfig
+from knode_cosserat.learning.config import FitConfig, FitError
 from knode_cosserat.learning.states import fit_states
-from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.identification import IdentificationError, identify
-from knode_cosserat.learning.config import FitConfig, StructuredOptions
+from knode_cosserat.learning.config import FitConfig, FitError, StructuredOptions
 from knode_cosserat.learning.states import fit_states
-from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 

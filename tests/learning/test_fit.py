@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
+from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions, RolloutTraining, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training.checkpoint import data_hash
-from knode_cosserat.learning.training.runs import FitError, WatchError
+from knode_cosserat.learning.training.runs import WatchError
 from knode_cosserat.rods.wrapped import Wrapped
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled

@@ -24,13 +24,12 @@ from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual, residual_model
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.identification.search import Search, SearchError
-from knode_cosserat.learning.config import FitConfig, PassiveOptions, StructuredOptions
+from knode_cosserat.learning.config import FitConfig, FitError, PassiveOptions, StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import Passive, passive
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.learning.states import BEST, fit_states, require_allowed
-from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System

@@ -55,10 +55,10 @@ def imperfect_robot(
     to 1.5 standard deviations of their priors from their nominal values.
 
     Args:
-        nominal: the robot as its data sheet has it.
-        tension: tensions (N) that it will be pulled with: some effects' sizes depend on them.
+        nominal: the robot of the data sheet.
+        tension: tensions (N) of its motions, which set the sizes of some effects.
         seed: a whole number from 0 to 2**32 - 1.
-        bodies: places of bodies that may be on ribs, as parts of the length.
+        bodies: places of bodies, which may be on ribs, as parts of the length.
 
     Raises:
         ParameterError: a seed out of range.
@@ -73,7 +73,7 @@ def imperfect_robot(
             names.append(effect.name)
     sizes = random.uniform(*SIZES, model.size) * random.choice([-1.0, 1.0], model.size)
     low, high = model.bounds
-    # numbers that are not negative, say, and nominally zero
+    # numbers with a bound at zero have one sign
     sizes = np.where((low >= 0.0) | (high <= 0.0), np.abs(sizes) * np.where(high <= 0.0, -1.0, 1.0), sizes)
     x = np.where(model.mask(names), np.clip(sizes, low, high), 0.0)
     mask, values = model.mask(names), model.values(x)

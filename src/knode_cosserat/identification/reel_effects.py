@@ -78,7 +78,7 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         )
         effects += [
             Effect(
-                "reel radius", "radius of all reels over what is known of it",
+                "reel radius", "radius of all reels over the known one",
                 (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),), _with_radius,
             ),
             Effect(

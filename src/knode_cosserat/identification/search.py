@@ -195,7 +195,7 @@ class Search:
 
     @property
     def folds(self) -> list[slice]:
-        """Rows that are left out together: of a recording that is alone, one piece after the other."""
+        """Rows that are left out together: a whole recording, or one piece of a single recording."""
         first = self.misfit.data[0]
         if len(self.misfit.data) > 1:
             return [slice(None)]

@@ -77,7 +77,7 @@ def simulated_rows(
         tension: from each row to the next.
         dt: time from row to row (s).
         start: equilibrium from which it moves; None: rest.
-        initial: tension before the first row; None: that of the first.
+        initial: tension before the first row; None: the first tension.
         continuous: tensions vary continuously; `Measurements.continuous`.
         space: the scheme along the rod.
         recovery: seconds that recovery from failed steps may take; None: the usual budget.

@@ -3,6 +3,7 @@
 from knode_cosserat.learning.config import (
     ConfigError,
     FitConfig,
+    FitError,
     NetworkOptions,
     PassiveOptions,
     RolloutTraining,
@@ -14,7 +15,6 @@ from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.checkpoint import CheckpointError
-from knode_cosserat.learning.training.runs import FitError
 from knode_cosserat.solvers.segments import DataError
 
 __all__ = [

@@ -19,6 +19,12 @@ class ConfigError(KnodeCosseratError, ValueError):
     code = "fit-config"
 
 
+class FitError(KnodeCosseratError, ValueError):
+    """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
+
+    code = "fit"
+
+
 class _Allowed(NamedTuple):
     """Accepted values: in words, and a function that returns the value to keep, or None to refuse it."""
 

@@ -63,7 +63,7 @@ class Residual(eqx.Module):
         return self
 
     def coefficients(self) -> dict[str, Float[Any, "..."]]:
-        """Return the arrays of `linear_in` by their paths; those that do not exist are left out."""
+        """Return the arrays of `linear_in` by their paths; missing ones are left out."""
         parts = {path: _at(self, path) for path in self.linear_in}
         return {path: value for path, value in parts.items() if value is not None}
 
@@ -133,7 +133,7 @@ class Network(Residual):
     convex: bool = eqx.field(static=True, default=True)
     #: c0 of the training's time steps (1/s), for the paper's inputs ʰy = y_t - c0 y and ʰz = z_t - c0 z; None
     #: without them. It is stored because ʰ of a problem depends on the time scheme, and is zero at rest:
-    #: with that of the training's steps the model is the same everywhere
+    #: with the c0 of the training's steps the model is the same everywhere
     c0: Float[Any, ""] | None = None
     #: first and last + 1 place in y of a quaternion whose length the correction leaves as it is, or None
     quaternion: tuple[int, int] | None = eqx.field(static=True, default=None)
@@ -178,7 +178,7 @@ class Network(Residual):
 def network(knowledge: System, options: NetworkOptions, key: Any, c0: Any = None) -> Network:
     """Return a network with random initial weights; inputs and outputs are not scaled.
 
-    `c0` (1/s) is that of the training's time steps, for a network with history inputs.
+    `c0` (1/s), of the training's time steps, is for a network with history inputs.
 
     A convex network starts like the paper's: weights |N(0.01, 0.01)|, biases N(0, 0.01). Any other starts
     with N(0, 1/√inputs) and N(0, 0.1/√hidden), and is therefore close to the nominal model.

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files.writing import package_version
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
+from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
@@ -31,7 +31,7 @@ from knode_cosserat.learning.training.rollouts import (
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, Run, run_all
+from knode_cosserat.learning.training.runs import ProgressMonitor, Run, run_all
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.segments import Dataset, samples, strand_samples
@@ -280,7 +280,7 @@ def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> tu
     scale, errors = np.asarray(nominal.scales().y), []
     for system in (nominal, model):
         with warnings.catch_warnings():
-            # the grid is that of the training data
+            # the training data have the same grid
             warnings.simplefilter("ignore")
             motion = simulate(
                 system, np.asarray(trajectory.control)[first:], trajectory.dt, time=settings.time or "bdf2",

@@ -8,7 +8,13 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, StructuredOptions
+from knode_cosserat.learning.config import (
+    FitConfig,
+    FitError,
+    NetworkOptions,
+    RolloutTraining,
+    StructuredOptions,
+)
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
 from knode_cosserat.learning.states import fit_states
@@ -20,7 +26,7 @@ from knode_cosserat.learning.training.rollouts import (
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, split
+from knode_cosserat.learning.training.runs import ProgressMonitor, split
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled
 

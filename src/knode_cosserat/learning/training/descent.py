@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.learning.config import Training
+from knode_cosserat.learning.config import FitError, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
 from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
@@ -29,7 +29,6 @@ from knode_cosserat.learning.training.runs import (
     DIVERGED,
     NOTHING,
     Best,
-    FitError,
     ProgressMonitor,
     Run,
     is_finite,

@@ -17,7 +17,7 @@ import numpy as np
 import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
-from knode_cosserat.learning.config import RolloutTraining
+from knode_cosserat.learning.config import FitError, RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.runs import (
@@ -25,7 +25,6 @@ from knode_cosserat.learning.training.runs import (
     DIVERGED,
     NOTHING,
     Best,
-    FitError,
     ProgressMonitor,
     Run,
     is_finite,

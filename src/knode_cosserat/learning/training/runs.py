@@ -19,18 +19,13 @@ import optax  # type: ignore[import-untyped]
 from tqdm import tqdm
 
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.learning.config import FitError
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed_tree, unpacked
 
 ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
 #: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
 DIVERGED, NOTHING = 1e6, 1e-6
-
-
-class FitError(KnodeCosseratError, ValueError):
-    """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
-
-    code = "fit"
 
 
 class WatchError(KnodeCosseratError, ValueError):
