@@ -27,14 +27,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.structured.regression import (
-    folds,
-    held_out_error,
-    moments,
-    refined_slopes,
-    relevant,
-    selected_groups,
-)
+from knode_cosserat.learning.structured import regression
 from knode_cosserat.learning.structured.residual import (
     CURVED,
     DRAG,
@@ -167,7 +160,7 @@ class _Regressions:
         if self.options.resample:  # random weights of rows (Bayesian bootstrap)
             rows, which = np.unique(data.origin, axis=0, return_inverse=True)
             shares = shares * np.random.default_rng(seed).exponential(size=len(rows))[which.ravel()]
-        return _Counting(shares / np.mean(shares), folds(data.origin))
+        return _Counting(shares / np.mean(shares), regression.folds(data.origin))
 
     @functools.cached_property
     def _law(self) -> tuple[list[_Offer], list[_Target]]:
@@ -264,13 +257,16 @@ def _points(knowledge: System, residual: Structured, data: Dataset) -> tuple[Any
     return jax.tree.map(lambda *parts: np.concatenate(parts), starts, ends)
 
 
+_rotations = jax.jit(jax.vmap(rotation_matrix))
+
+
 def _starts(knowledge: System, data: Samples) -> tuple[Any, Any]:
     return jax.vmap(lambda sample: start_point(knowledge, sample))(data), data.z
 
 
-@jax.jit
-def _corrected_strains(model: System, points: Any) -> Any:
-    return jax.vmap(lambda point: semi_discrete.strains(model, point))(points)
+_corrected_strains = jax.jit(jax.vmap(semi_discrete.strains, in_axes=(None, 0)))
+#: y_s of the nominal model at the true strains
+_rates = jax.jit(jax.vmap(semi_discrete.rates, in_axes=(None, 0, 0)))
 
 
 @jax.jit
@@ -287,12 +283,6 @@ def _views(knowledge: System, points: Any, z: Any) -> _Views:
 
 
 @jax.jit
-def _rates(knowledge: System, points: Any, z: Any) -> Any:
-    """Return y_s of the nominal model at the true strains."""
-    return jax.vmap(lambda point, z: semi_discrete.rates(knowledge, point, z))(points, z)
-
-
-@jax.jit
 def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
     """Return the residual of the conditions at the true tip, and the inputs of a load there."""
 
@@ -304,9 +294,6 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
         return conditions, _Views(jnp.concatenate([observables, ambient]), ambient, None)
 
     return jax.vmap(one)(data)
-
-
-_rotations = jax.jit(jax.vmap(rotation_matrix))
 
 
 def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
@@ -409,9 +396,7 @@ class _Offer:
         return _Offer(dataclasses.replace(self.part, slopes=slopes), self.inputs)
 
 
-@eqx.filter_jit
-def _features_of(part: Expansion, inputs: Any) -> Any:
-    return jax.vmap(part.features)(inputs)
+_features_of = eqx.filter_jit(lambda part, inputs: jax.vmap(part.features)(inputs))
 
 
 class _Fit(NamedTuple):
@@ -465,7 +450,9 @@ class _Problem:
         """Return the fit with these columns (by default all)."""
         among = np.ones(self.columns.shape[1], dtype=bool) if among is None else among
         weights = np.zeros((len(self.floors), len(among)))
-        weights[:, among], remainder = relevant(self.columns[:, among], self.values, self.floors, self.shares)
+        weights[:, among], remainder = regression.relevant(
+            self.columns[:, among], self.values, self.floors, self.shares
+        )
         if self.turned:
             parts = np.split(weights[0], [self.size * self.count])
             material, ambient = (part.reshape(self.size, -1) for part in parts)
@@ -493,10 +480,10 @@ class _Problem:
         ambient = np.arange(self.count * (self.size if self.turned else 1), self.columns.shape[1])
         groups += [ambient] if len(ambient) else []
         root = np.sqrt(self.shares)[:, None]
-        parts = moments(self.columns * root, self.values * root, self.fold)
+        parts = regression.moments(self.columns * root, self.values * root, self.fold)
         floor = float(np.mean(np.square(self.floors))) * self.values.size
-        best, error = selected_groups(parts, groups, floor)
-        if error > WORTH * held_out_error(parts, np.flatnonzero(simple)):
+        best, error = regression.selected_groups(parts, groups, floor)
+        if error > WORTH * regression.held_out_error(parts, np.flatnonzero(simple)):
             return None
         return np.isin(np.arange(self.columns.shape[1]), np.concatenate([[-1], *(groups[k] for k in best)]))
 
@@ -552,7 +539,7 @@ def _with_slopes(
     free = [k for k in sorted(owners) if np.any(problem.mask(np.isin(features, owners[k][1])) & fit.used)]
     kinds = [(owners[k][0].name, owners[k][0].form) for k in free]
     target = problem.values[:, int(np.argmax(fit.remainder))] * root
-    return rich.with_slopes(refined_slopes(build, target, part.slopes, free, kinds))
+    return rich.with_slopes(regression.refined_slopes(build, target, part.slopes, free, kinds))
 
 
 # refinement on the segments
