@@ -7,6 +7,7 @@ changes nothing, so one compiled program serves any selection of effects. A plai
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple, Protocol, runtime_checkable
 
@@ -67,7 +68,7 @@ class Number(NamedTuple):
         """Return the derivative of the value by the coordinate, at a value."""
         return self.width * (value if self.logarithmic else 1.0)
 
-    @property
+    @functools.cached_property
     def bounds(self) -> tuple[float, float]:
         """Lowest and highest coordinate."""
         return self.coordinate(self.low), self.coordinate(self.high)
@@ -183,7 +184,7 @@ class Model:
         """Number of coordinates."""
         return len(self.numbers)
 
-    @property
+    @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """Names of the effects."""
         return tuple(effect.name for effect in self.effects)
