@@ -16,9 +16,8 @@ from knode_cosserat import controls
 from knode_cosserat.evaluation.comparison import legend_below
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style
-from knode_cosserat.learning.config import FitConfig
-from knode_cosserat.learning.fit import fit
-from knode_cosserat.learning.training.runs import FitError
+from knode_cosserat.learning.config import FitConfig, FitError
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
@@ -53,7 +52,7 @@ def _without_knowledge(
     imperfect: System, training: Sequence[Trajectory], config: FitConfig
 ) -> LearnedSystems:
     try:
-        models = fit(NoKnowledge(imperfect), training, config)
+        models = fit_states(NoKnowledge(imperfect), training, config)
     except FitError as error:
         return LearnedSystems(dict.fromkeys(config.seeds, str(error)))
     return LearnedSystems(dict(zip(config.seeds, models, strict=True)))

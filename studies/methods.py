@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.identification import IdentificationError, identify
-from knode_cosserat.learning.config import FitConfig, StructuredOptions
-from knode_cosserat.learning.fit import fit
-from knode_cosserat.learning.training.runs import FitError
+from knode_cosserat.learning.config import FitConfig, FitError, StructuredOptions
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 
@@ -57,7 +56,7 @@ def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Lea
 
 def _fitted(imperfect: System, training: Trajectories, config: FitConfig) -> LearnedSystems:
     try:
-        models = fit(imperfect, training, config)
+        models = fit_states(imperfect, training, config)
     except FitError as error:
         return LearnedSystems(dict.fromkeys(config.seeds, str(error)))
     histories = {str(model.about.facts["seed"]): model.about.facts.get("segments") for model in models}

@@ -16,10 +16,9 @@ import numpy as np
 from knode_cosserat.identification.evaluate import Evaluation, compared, predict
 from knode_cosserat.identification.fit import fit as learn
 from knode_cosserat.identification.identify import IdentificationError, identify
-from knode_cosserat.learning.config import FitConfig
-from knode_cosserat.learning.fit import fit
+from knode_cosserat.learning.config import FitConfig, FitError
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.training.runs import FitError
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.estimation.estimate import estimate_states
 from knode_cosserat.recordings.load import load_recording
@@ -258,7 +257,7 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
         states.append(estimate_states(read[name], knowledge, "paper", DT, start, start + seconds))
     config = FitConfig.paper_recordings(seed=tuple(seeds))
     try:
-        models = fit(knowledge, states, config)
+        models = fit_states(knowledge, states, config)
     except FitError as error:
         return TrainedSystems(dict.fromkeys(seeds, str(error)))
     losses = {

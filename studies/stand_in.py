@@ -27,8 +27,8 @@ from knode_cosserat.control import (
     run_loop,
 )
 from knode_cosserat.control.planning import PlanController
-from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.outputs import TipPosition
+from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.identification import identify
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendon_robots import TendonRod

@@ -318,7 +318,9 @@ def residuals() -> dict[str, Residual]:
     return {
         "nothing": Nothing(),
         "network": MODEL.residual,
-        "passive": empty.with_numbers(0.1 * rng.normal(size=empty.size)).clamped(),
+        "passive": empty.with_coefficients(
+            {name: 0.1 * rng.normal(size=np.shape(part)) for name, part in empty.coefficients().items()}
+        ).clamped(),
         **{name: Structured(np.array(0.02), each, None, None) for name, each in stress.items()},
         "a user's": Pull(np.array(0.1)),
     }

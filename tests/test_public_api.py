@@ -58,7 +58,7 @@ def test_every_public_name_is_there_and_says_what_it_is(module):
         assert said and said.split()[0] not in VAGUE, f"{module.__name__}.{name}: {said}"
 
 
-@pytest.mark.parametrize("space", [kc, kc.solvers, kc.learning, kc.recordings, kch])
+@pytest.mark.parametrize("space", [kc, kc.solvers, kc.recordings, kch])
 def test_a_lazy_package_has_the_names_that_it_lists(space):
     assert dir(space) == sorted(space.__all__)
     with pytest.raises(AttributeError, match="has no attribute 'nothing'"):
@@ -67,11 +67,11 @@ def test_a_lazy_package_has_the_names_that_it_lists(space):
 
 def test_functions_win_over_the_modules_that_are_called_like_them():
     program = (
-        "import knode_cosserat.solvers.simulate, knode_cosserat.learning.fit\n"
+        "import knode_cosserat.solvers.simulate, knode_cosserat.identification.fit\n"
         "import knode_cosserat.statics.workspace\n"
         "import knode_cosserat as kc\n"
         "assert kc.solvers.simulate is kc.simulate and kc.solvers.equilibrium is kc.equilibrium\n"
-        "assert kc.learning.fit is kc.identification.fit is kc.fit\n"
+        "assert kc.identification.fit is kc.fit\n"
         "assert kc.statics.workspace is kc.workspace and kc.identification.identify is kc.identify\n"
     )
     subprocess.run([sys.executable, "-W", "error", "-c", program], check=True)

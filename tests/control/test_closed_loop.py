@@ -32,7 +32,7 @@ from knode_cosserat.control import (
 from knode_cosserat.control.loop import check_reference, warm_up
 from knode_cosserat.control.lqr import realized
 from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPosition
-from knode_cosserat.estimation.online import predicted_motion, split_record
+from knode_cosserat.estimation.online import split_record
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.residual import Nothing
 
@@ -157,11 +157,11 @@ def test_columns_of_the_observer_are_derivatives_of_the_step():
 
     def tip(control):
         none = np.zeros(4), np.zeros(1)
-        found = predicted_motion(own.model, own.belief, control[None], unseen, none, own.output)
+        found = own.model.predicted(own.belief, control[None], unseen, none, own.output)
         return np.asarray(TipPosition().value(ROBOT, *split_record(ROBOT, found.record)))
 
     deviations = np.ones(4), np.zeros(1)
-    found = predicted_motion(own.model, own.belief, tension[None], unseen, deviations, own.output)
+    found = own.model.predicted(own.belief, tension[None], unseen, deviations, own.output)
     columns = np.asarray(found.by_column)[own.columns : own.columns + 4, 0]
     differences = [(tip(tension + h * one) - tip(tension - h * one)) / (2.0 * h) for one in np.eye(4)]
     assert_allclose(columns, differences, rtol=1e-5, atol=1e-9)

@@ -17,7 +17,7 @@ from knode_cosserat.estimation import (
     TipPose,
     TipPosition,
 )
-from knode_cosserat.estimation.adapted import AdaptedParameters
+from knode_cosserat.estimation.parameters import adapted_model
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.solvers import Stepper
@@ -83,11 +83,11 @@ def test_an_error_of_orientation_is_a_rotation_vector(still):
 
 def test_coordinates_of_parameters_are_zero_at_their_values_and_bounded():
     robot = ROBOT.replace(loads=(AttachedMass(mass=0.0),))
-    adapted = AdaptedParameters(robot, ["youngs_modulus", "bending_damping", Adapted("loads.0.mass", 0.03)])
+    adapted, _ = adapted_model(robot, ["youngs_modulus", "bending_damping", Adapted("loads.0.mass", 0.03)])
     assert adapted.size == 3 and adapted.labels == ("youngs_modulus", "bending_damping", "loads.0.mass")
-    same = adapted.of(robot, np.zeros(3))
+    same = adapted.robot(np.zeros(3))
     assert float(same.youngs_modulus) == float(robot.youngs_modulus)
-    moved = adapted.of(robot, np.array([1.0, 0.0, 1.0]))
+    moved = adapted.robot(np.array([1.0, 0.0, 1.0]))
     assert float(moved.youngs_modulus) == pytest.approx(np.exp(0.3) * float(robot.youngs_modulus))
     assert float(moved.loads[0].mass) == pytest.approx(0.03)
     # a mass is not negative
@@ -104,7 +104,7 @@ def test_coordinates_of_parameters_are_zero_at_their_values_and_bounded():
 )
 def test_wrong_parameters_are_told_in_one_line(adapted, message):
     with pytest.raises(kc.KnodeCosseratError, match=message):
-        AdaptedParameters(ROBOT, adapted)
+        adapted_model(ROBOT, adapted)
 
 
 Window = MovingHorizonObserver

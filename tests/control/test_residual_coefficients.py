@@ -7,7 +7,7 @@ from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
 from knode_cosserat.estimation import Adapted, KalmanObserver, TipPosition
-from knode_cosserat.estimation.adapted import AdaptedParameters
+from knode_cosserat.estimation.parameters import adapted_model
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.rods.wrapped import nominal_model
@@ -39,7 +39,7 @@ def test_coefficients_are_replaced_by_their_names():
 )
 def test_wrong_coefficients_are_told_in_one_line(robot, adapted, message):
     with pytest.raises(kc.KnodeCosseratError, match=message):
-        AdaptedParameters(robot, adapted)
+        adapted_model(robot, adapted)
 
 
 def test_a_coefficient_of_another_shape_is_refused():

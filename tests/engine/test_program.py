@@ -168,8 +168,9 @@ def with_curved_law():
 
 
 def with_passive_residual():
-    empty = passive(PAPER, np.full((1, 4), 5.0))
-    return KNODE(PAPER, empty.with_numbers(0.1 * np.random.default_rng(0).normal(size=empty.size)).clamped())
+    empty, rng = passive(PAPER, np.full((1, 4), 5.0)), np.random.default_rng(0)
+    numbers = {name: 0.1 * rng.normal(size=np.shape(part)) for name, part in empty.coefficients().items()}
+    return KNODE(PAPER, empty.with_coefficients(numbers).clamped())
 
 
 SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.catalog()} | {

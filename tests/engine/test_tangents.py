@@ -11,8 +11,8 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.pattern import Pattern
-from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import OnlineModel
+from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import Discontinuities
@@ -148,7 +148,7 @@ def test_a_parameter_that_is_zero_moves():
 def test_an_adapted_zero_is_no_constant_of_the_code():
     """Otherwise the machine code would be compiled again in the loop, as soon as the zero moves."""
     robot = kc.load_robot(PAPER).replace(loads=(AttachedMass(mass=0.0),))
-    model = OnlineModel(robot, AdaptedParameters(robot, [Adapted("loads.0.mass", 0.03)]), DT)
+    model = OnlineModel(adapted_model(robot, [Adapted("loads.0.mass", 0.03)])[0].robot, DT)
     cores, still = [], np.zeros(robot.control_layout.size)
     for x in (0.0, 0.5):
         system, _ = model.moved(np.array([x]))

@@ -8,8 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
-from knode_cosserat.identification.effects import Number
-from knode_cosserat.identification.model import Model
+from knode_cosserat.estimation.parameters import Number
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.rods.routing import Helical, Straight
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import EarlyAnchors, LoadCells, RibSpacing, TendonFriction, pressed
@@ -21,7 +21,7 @@ TENSION = np.array([7.0, 5.0, 3.0, 5.0])
 
 @pytest.fixture(scope="module")
 def model():
-    return Model.of_library(NOMINAL, np.tile(TENSION, (4, 1)))
+    return library_model(NOMINAL, np.tile(TENSION, (4, 1)))
 
 
 def shape(robot, tension=TENSION, **more):
@@ -143,7 +143,7 @@ def test_tendons_whose_routing_is_stated_are_moved_by_effects_of_that():
     routing = tuple(
         Straight(0.02 * np.cos(angle), 0.02 * np.sin(angle)) for angle in np.asarray(NOMINAL.tendon_angles)
     )
-    model = Model.of_library(ROUTED.replace(routing=routing), np.tile(TENSION, (4, 1)))
+    model = library_model(ROUTED.replace(routing=routing), np.tile(TENSION, (4, 1)))
     assert not {"tendon offset", "tendon angles", "tendon twist"} & set(model.names)
     x = np.zeros(model.size)
     x[model.slice("routing by motor")] = [1.0, 0.0, 0.0, 0.0]

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import coverage, evaluate
 from knode_cosserat.identification.experiments import poses_of_nodes
 from knode_cosserat.identification.fit import coordinates_of, fit
-from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.trials import failed_trial
@@ -68,7 +68,7 @@ def test_a_passive_network_does_not_diverge_and_its_spread_is_told():
     )
     unseen = measured(TRUE, tensions("random", 2.0, seed=9), "unseen", seed=9)
     before = evaluate(NOMINAL, unseen).tip_rmse
-    model = Model.of_library(NOMINAL, unseen.tension)
+    model = library_model(NOMINAL, unseen.tension)
     from knode_cosserat.identification.experiments import of_measurements
 
     data = [of_measurements(each, model, each.source) for each in given]
@@ -97,7 +97,7 @@ def test_what_is_kept():
 
 
 def test_coordinates_are_those_of_the_estimates():
-    model = Model.of_library(NOMINAL, np.full((4, 4), 5.0))
+    model = library_model(NOMINAL, np.full((4, 4), 5.0))
     x = np.where(model.mask(("stiffness", "damping", "rest curvature")), 0.3, 0.0)
     values = model.values(x)
     estimates = [

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import of_measurements
-from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.section import Sleeve, Stretch
@@ -102,7 +102,7 @@ def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
 def test_trials_name_what_fails():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
-    data = of_measurements(seen, Model.of_library(NOMINAL, seen.tension), "own")
+    data = of_measurements(seen, library_model(NOMINAL, seen.tension), "own")
     assert failed_trial(true, [data], "lobatto2") is None
     # a rod that its own tendons buckle between its ribs
     weak = true.replace(rib_spacing=RibSpacing(softening=1.0))
@@ -113,7 +113,7 @@ def test_trials_name_what_fails():
 def test_a_grid_is_too_coarse_or_fine_enough():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
-    data = [of_measurements(seen, Model.of_library(NOMINAL, seen.tension), "own")]
+    data = [of_measurements(seen, library_model(NOMINAL, seen.tension), "own")]
     assert not has_coarse_rows(true, data, "lobatto2")
     soft = true.replace(nodes=5, youngs_modulus=2e8, sections=(Sleeve(stiffening=8.0, length=0.1),))
     assert has_coarse_rows(soft, data, "lobatto2")

@@ -2,15 +2,16 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.estimation import BodyPositions
 from knode_cosserat.identification.experiments import Experiment
-from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Rollout
-from knode_cosserat.identification.search import Search, SearchError
+from knode_cosserat.identification.search import Search, SearchError, Subset
+from knode_cosserat.learning.training.checkpoint import Checkpoints
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
 
@@ -60,12 +61,12 @@ FREE = np.array([True, True, True])
 
 def searched(folder, curve, stop=None):
     """Three searches; the run is interrupted before the one with the number `stop`."""
-    search = Search(curve, journal=None if folder is None else Journal(folder))
+    search = Search(curve, journal=None if folder is None else Checkpoints(folder))
     ends = []
     for k, which in enumerate((None, [0], [1])):
         if k == stop:
             raise KeyboardInterrupt
-        ends.append(search.run(np.zeros(3), FREE, which=which))
+        ends.append(search.run(np.zeros(3), FREE, Subset(None, which)))
     return ends
 
 
@@ -73,7 +74,7 @@ def same(ends, others):
     return all(
         np.array_equal(a, b)
         for end, other in zip(ends, others, strict=True)
-        for a, b in zip(end.arrays().values(), other.arrays().values(), strict=True)
+        for a, b in zip(jax.tree.leaves(end.facts()), jax.tree.leaves(other.facts()), strict=True)
     )
 
 

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.misfit import Misfit
-from knode_cosserat.identification.model import Model
 from knode_cosserat.rods.tendons import LoadCells, undelayed
 from tests.identification.recorded import DT, measured, tensions
 
@@ -61,7 +61,7 @@ def test_derivatives_by_latency_are_those_of_differences():
     """Where tensions rise linearly in time, what acts is linear in the latency, across rows too."""
     rising = np.concatenate([np.full((20, 4), 4.0), 4.0 + np.outer(np.arange(31), [0.2, 0.0, -0.1, 0.05])])
     seen = measured(kc.robots.RoutedTendonRobot.like(NOMINAL), rising, "own", noise=0.0)
-    model = Model.of_library(NOMINAL, seen.tension)
+    model = library_model(NOMINAL, seen.tension)
     misfit = Misfit(model, [of_measurements(seen, model, "own")])
     k = model.slice("latency").start
     one = np.eye(model.size)[k] * DT / model.numbers[k].width

@@ -8,11 +8,11 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.estimation import BaseWrench, Curvatures
+from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification import Experiment, IdentificationError, identify, search
-from knode_cosserat.identification.effects import labels_of, parameter_effects
+from knode_cosserat.identification.effects import parameter_effects
 from knode_cosserat.identification.experiments import experiments_of
 from knode_cosserat.identification.misfit import Misfit
-from knode_cosserat.identification.model import Model
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.aspects import Ends
@@ -334,7 +334,7 @@ def test_matrices_and_vectors_as_numbers():
     robot = ROBOT.replace(bending_damping=[0.03, 0.04, 0.05])
     effects = parameter_effects(robot, ["bending_damping", "drag", "gravity", "radius"])
     model = Model(robot, effects)
-    assert labels_of(effects) == (
+    assert model.labels == (
         "bending_damping[0]", "bending_damping[1]", "bending_damping[2]", "drag",
         "gravity[0]", "gravity[1]", "gravity[2]", "radius",
     )  # fmt: skip

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
-from knode_cosserat.identification.model import Model
 from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.tendons import Reels
@@ -24,7 +24,7 @@ PAIR = CABLES.replace(
 
 @pytest.mark.parametrize("robot", [CABLES, PAIR])
 def test_nominal_numbers_change_nothing(robot):
-    model = Model.of_library(robot, np.ones((4, robot.control_layout.size)))
+    model = library_model(robot, np.ones((4, robot.control_layout.size)))
     assert not {"load cell gains", "early anchors", "vibration", "friction"} & set(model.names)
     assert ("tendon angles" in model.names) == (robot.routing is None)
     same = model.robot(np.zeros(model.size))
@@ -45,7 +45,7 @@ def test_nominal_numbers_change_nothing(robot):
 
 
 def test_what_effects_do():
-    model = Model.of_library(PAIR, np.ones((4, 2)))
+    model = library_model(PAIR, np.ones((4, 2)))
     x = np.zeros(model.size)
     x[model.slice("taken in")] = [1.0, 2.0]
     x[model.slice("motor zeros")] = [0.5, 0.0]

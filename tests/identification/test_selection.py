@@ -5,7 +5,7 @@ import hypothesis.strategies as st
 import numpy as np
 import pytest
 
-from knode_cosserat.identification.selection import ERRORS, WORTH, Left
+from knode_cosserat.identification.selection import ERRORS, WORTH, HeldOutCosts
 
 AMOUNT = np.array([40.0, 40.0, 40.0])
 
@@ -15,7 +15,7 @@ def left(*falls):
     cost = np.ones((3, 10))
     for part, block, fall in falls:
         cost[part, block] -= fall
-    return Left(cost, AMOUNT)
+    return HeldOutCosts(cost, AMOUNT)
 
 
 EVERYWHERE = [(part, block, 0.3) for part in range(3) for block in range(10)]
@@ -40,7 +40,7 @@ def test_a_fall_in_one_block_is_not_trusted():
 @hypothesis.given(st.lists(st.floats(0.1, 10.0), min_size=30, max_size=30))
 @hypothesis.settings(deadline=None, max_examples=50)
 def test_worth_of_the_way_back_is_the_loss(costs):
-    one, other = left(), Left(np.array(costs).reshape(3, 10), AMOUNT)
+    one, other = left(), HeldOutCosts(np.array(costs).reshape(3, 10), AMOUNT)
     (there, error), (back, same) = one.worth(other), other.worth(one)
     assert there == pytest.approx(-back, abs=1e-9) and error == pytest.approx(same, abs=1e-9)
     assert one.worth(one) == (0.0, 0.0)

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.misfit import Misfit
-from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.steps import (
     LONGEST,
     MOST,
@@ -77,7 +77,7 @@ def test_recordings_of_both_kinds_are_simulated_as_each_alone_with_its_derivativ
     nominal = ROBOT.replace(nodes=6)
     seen = measured(kc.robots.RoutedTendonRobot.like(nominal), tensions(0.5, 1.5), "own")
     held = dataclasses.replace(seen, time=0.5 * seen.time)
-    model = Model.of_library(nominal, seen.tension)
+    model = library_model(nominal, seen.tension)
     data = [
         of_measurements(each, model, "own") for each in (dataclasses.replace(held, continuous=True), held)
     ]

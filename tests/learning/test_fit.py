@@ -13,30 +13,20 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
-from knode_cosserat.learning.fit import fit
+from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions, RolloutTraining, Training
 from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training.checkpoint import data_hash
-from knode_cosserat.learning.training.runs import FitError, WatchError
+from knode_cosserat.learning.training.runs import WatchError
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.wrapped import Wrapped
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled
 
 #: the package has its function under the same name
-module = importlib.import_module("knode_cosserat.learning.fit")
+module = importlib.import_module("knode_cosserat.learning.states")
 
 SMALL = FitConfig.network(hidden=5, epochs=500)
-
-
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
-
-
-@pytest.fixture(scope="module")
-def unseen():
-    return pulled(1.4)
 
 
 def tip_rmse(model, truth):
@@ -52,7 +42,7 @@ def with_training(config=SMALL, **changes):
 
 
 def test_a_model_and_what_is_known_of_it(bars, unseen):
-    model = fit(WRONG, bars, SMALL, held_out=[unseen])
+    model = fit_states(WRONG, bars, SMALL, held_out=[unseen])
     assert isinstance(model, KNODE) and model.knowledge is WRONG
     assert tip_rmse(model, unseen) < 0.1 * tip_rmse(WRONG, unseen)
     facts = model.about.facts
@@ -93,8 +83,8 @@ def test_noise_in_the_data_is_in_every_number_and_the_same_each_time(bars):
 def test_several_seeds(bars, monkeypatch, shared):
     """On their own threads, or in one vectorised program, they are what they are alone."""
     monkeypatch.setattr(module, "SHARED", shared)
-    models = fit(WRONG, bars, dataclasses.replace(SMALL, seed=(0, 7, 3)))
-    alone = fit(WRONG, bars, dataclasses.replace(SMALL, seed=7))
+    models = fit_states(WRONG, bars, dataclasses.replace(SMALL, seed=(0, 7, 3)))
+    alone = fit_states(WRONG, bars, dataclasses.replace(SMALL, seed=7))
     assert [model.about.facts["seed"] for model in models] == [0, 7, 3]
     for found, expected in zip(*map(jax.tree.leaves, (models[1].residual, alone.residual)), strict=True):
         np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-9)
@@ -104,7 +94,7 @@ def test_several_seeds(bars, monkeypatch, shared):
 
 
 def test_the_default_is_structured(bars, unseen):
-    model = fit(WRONG, bars, held_out=[unseen])
+    model = fit_states(WRONG, bars, held_out=[unseen])
     # the error is one of rounding, of which the two computations differ
     np.testing.assert_allclose(
         model.about.facts["held_out_error"], tip_rmse(model, unseen), rtol=1e-6, atol=1e-12
@@ -117,7 +107,7 @@ def test_early_stopping_keeps_the_best(bars, unseen):
     config = with_training(
         epochs=3000, schedule="constant", learning_rate=0.03, stop_after=100, check_every=20
     )
-    model = fit(WRONG, bars, config, held_out=[unseen])
+    model = fit_states(WRONG, bars, config, held_out=[unseen])
     history = model.about.facts["segments"]
     errors = history["held_out_error"]
     best = np.argmin(errors[:, 1])
@@ -128,11 +118,13 @@ def test_early_stopping_keeps_the_best(bars, unseen):
 def test_early_stopping_of_one_seed_does_not_stop_another(bars, unseen, monkeypatch):
     config = with_training(epochs=600, schedule="constant", learning_rate=0.03, stop_after=40, check_every=20)
     alone = [
-        fit(WRONG, bars, dataclasses.replace(config, seed=seed), held_out=[unseen]).about.facts["segments"]
+        fit_states(WRONG, bars, dataclasses.replace(config, seed=seed), held_out=[unseen]).about.facts[
+            "segments"
+        ]
         for seed in (0, 1, 2)
     ]
     monkeypatch.setattr(module, "SHARED", 10**9)
-    together = fit(WRONG, bars, dataclasses.replace(config, seed=(0, 1, 2)), held_out=[unseen])
+    together = fit_states(WRONG, bars, dataclasses.replace(config, seed=(0, 1, 2)), held_out=[unseen])
     assert len({len(each["loss"]) for each in alone}) > 1
     for model, expected in zip(together, alone, strict=True):
         found = model.about.facts["segments"]
@@ -151,7 +143,7 @@ def test_wrong_arguments(bars):
         ((WRONG, bars, with_training(stop_after=5)), {}, "stop_after is 5, but there are no held_out"),
     ):
         with pytest.raises(FitError, match=words) as caught:
-            fit(*arguments, **options)
+            fit_states(*arguments, **options)
         assert "\n" not in str(caught.value)
 
 
@@ -172,13 +164,13 @@ def test_data_that_nothing_can_be_learned_from(bars):
             if config.segments and config.segments.nodes:
                 config = with_training(config, nodes=(2,))
             with pytest.raises(DataError, match=words) as caught:
-                fit(WRONG, trajectories, config)
+                fit_states(WRONG, trajectories, config)
             assert "\n" not in str(caught.value)
     with pytest.raises(DataError, match=r"nodes is \(3, 5, 7, 9\); allowed is .* from 1 to 5"):
-        fit(WRONG, bars, FitConfig.paper())
+        fit_states(WRONG, bars, FitConfig.paper())
     moving = dataclasses.replace(bars[0], time=bars[0].time + 1.0)
     with pytest.raises(DataError, match="held-out trajectory 0 begins at 1 s, in motion"):
-        fit(WRONG, bars, SMALL, held_out=[moving])
+        fit_states(WRONG, bars, SMALL, held_out=[moving])
 
 
 def test_a_loss_that_diverges(bars, tmp_path):
@@ -187,17 +179,17 @@ def test_a_loss_that_diverges(bars, tmp_path):
         NetworkOptions(hidden=5, convex=False), Training(epochs=400, learning_rate=10.0, schedule="constant")
     )
     with pytest.raises(FitError, match=r"the loss of seed 0 became .* nothing was kept") as caught:
-        fit(WRONG, bars, config)
+        fit_states(WRONG, bars, config)
     assert "\n" not in str(caught.value)
     path = tmp_path / "segments-0.checkpoint"
     with pytest.raises(FitError, match="in epoch ") as caught:
-        fit(WRONG, bars, config, checkpoint=tmp_path, checkpoint_every=1)
+        fit_states(WRONG, bars, config, checkpoint=tmp_path, checkpoint_every=1)
     message = str(caught.value)
     assert f"the last good state is kept in {path}" in message and "\n" not in message
     epoch = int(message.split("in epoch ")[1].split()[0])
     assert epoch >= 1  # what was kept is of the epoch before: the next one fails again, at once
     with pytest.raises(FitError, match=f"in epoch {epoch} "):
-        fit(WRONG, bars, config, checkpoint=tmp_path, checkpoint_every=1)
+        fit_states(WRONG, bars, config, checkpoint=tmp_path, checkpoint_every=1)
 
 
 def test_one_seed_that_fails_stops_the_others(bars, monkeypatch):
@@ -208,17 +200,17 @@ def test_one_seed_that_fails_stops_the_others(bars, monkeypatch):
         seed=(0, 1, 2),
     )
     with pytest.raises(FitError, match="the loss of seed"):
-        fit(WRONG, bars, config)
+        fit_states(WRONG, bars, config)
 
 
 # what it tells
 
 
 def test_progress(bars, capfd):
-    fit(WRONG, bars, with_training(epochs=60), progress=True)
+    fit_states(WRONG, bars, with_training(epochs=60), progress=True)
     captured = capfd.readouterr()
     assert captured.out == "" and "segments: 100%" in captured.err and "loss " in captured.err
-    fit(WRONG, bars, with_training(epochs=60))
+    fit_states(WRONG, bars, with_training(epochs=60))
     assert capfd.readouterr().err == ""
 
 
@@ -243,7 +235,7 @@ def test_metrics_for_tensorboard(bars, unseen, tmp_path):
     config = dataclasses.replace(
         with_training(epochs=70, check_every=30), rollouts=RolloutTraining(updates=3, horizon=6), seed=(0, 4)
     )
-    models = fit(WRONG, bars, config, held_out=[unseen], log_dir=tmp_path)
+    models = fit_states(WRONG, bars, config, held_out=[unseen], log_dir=tmp_path)
     assert sorted(folder.name for folder in tmp_path.iterdir()) == ["seed-0", "seed-4"]
     for model in models:
         facts = model.about.facts
@@ -270,14 +262,14 @@ def test_metrics_without_tensorboard(bars, tmp_path, monkeypatch):
 
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(WatchError, match=r"pip install knode-cosserat\[tensorboard\]"):
-        fit(WRONG, bars, SMALL, log_dir=tmp_path)
+        fit_states(WRONG, bars, SMALL, log_dir=tmp_path)
 
 
 def test_metrics_that_cannot_be_written(bars, tmp_path):
     pytest.importorskip("tensorboardX")
     (tmp_path / "file").write_text("")
     with pytest.raises(WatchError, match="file/seed-0: metrics cannot be written") as caught:
-        fit(WRONG, bars, with_training(epochs=10), log_dir=tmp_path / "file")
+        fit_states(WRONG, bars, with_training(epochs=10), log_dir=tmp_path / "file")
     assert "\n" not in str(caught.value)
 
 
@@ -320,7 +312,7 @@ def sines(robot):
 @pytest.mark.campaign
 @pytest.mark.parametrize("imperfection", ["stiffness", "self-weight"])
 def test_losses_of_the_paper(robot, sines, imperfection):
-    model = fit(robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper())
+    model = fit_states(robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper())
     last = model.about.facts["segments"]["loss"][-1]
     assert last < 1.2 * LOSSES[imperfection]
     assert imperfection == "self-weight" or last > 0.8 * LOSSES[imperfection]
@@ -330,7 +322,9 @@ def test_losses_of_the_paper(robot, sines, imperfection):
 @pytest.mark.campaign
 @pytest.mark.parametrize("imperfection", IMPERFECTIONS)
 def test_table_one_of_the_paper(robot, sines, imperfection):
-    models = fit(robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper(seed=(0, 1, 2, 3, 4)))
+    models = fit_states(
+        robot.replace(**IMPERFECTIONS[imperfection]), sines, FitConfig.paper(seed=(0, 1, 2, 3, 4))
+    )
     losses = [model.about.facts["segments"]["loss"][-1] for model in models]
     assert np.median(losses) < 1.2 * LOSSES[imperfection]
     for name, controls in (

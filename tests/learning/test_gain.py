@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.fit import rollout_errors
+from knode_cosserat.learning.states import rollout_errors
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 

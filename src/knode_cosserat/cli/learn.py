@@ -112,7 +112,7 @@ def fit(
     require_writable(None if several else out, figure, (out if several else None, checkpoint, log))
     if figure:
         figures()
-    from knode_cosserat.learning.fit import fit as learn
+    from knode_cosserat.learning.states import fit_states as learn
     from knode_cosserat.solvers.segments import DataError
 
     nominal = load_system(robot, changes)

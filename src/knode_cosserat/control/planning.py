@@ -25,10 +25,10 @@ from knode_cosserat.control.commands import (
 )
 from knode_cosserat.control.qp import QuadraticProgram
 from knode_cosserat.control.references import Reference
-from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
 from knode_cosserat.estimation.online import Belief, OnlineModel, errors_along, split_record
 from knode_cosserat.estimation.outputs import Output, TipPosition
+from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
 

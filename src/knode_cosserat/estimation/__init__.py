@@ -1,8 +1,7 @@
 """Online estimation: states and parameters of a moving robot from incomplete measurements."""
 
-from knode_cosserat.estimation.adapted import Adapted
 from knode_cosserat.estimation.boundary import BoundaryObserver
-from knode_cosserat.estimation.observer import Estimate, KalmanObserver, ObserverError
+from knode_cosserat.estimation.observer import KalmanObserver, ObserverError, StateEstimate
 from knode_cosserat.estimation.outputs import (
     BaseWrench,
     BodyPoses,
@@ -12,6 +11,7 @@ from knode_cosserat.estimation.outputs import (
     TipPose,
     TipPosition,
 )
+from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.estimation.window import MovingHorizonObserver
 
 __all__ = [
@@ -21,11 +21,11 @@ __all__ = [
     "BodyPositions",
     "BoundaryObserver",
     "Curvatures",
-    "Estimate",
     "KalmanObserver",
     "MovingHorizonObserver",
     "ObserverError",
     "Output",
+    "StateEstimate",
     "TipPose",
     "TipPosition",
 ]

@@ -10,17 +10,16 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.estimation.adapted import Adapted, AdaptedParameters
 from knode_cosserat.estimation.online import (
     Belief,
     OnlineModel,
     Predicted,
     Spread,
     measured_error,
-    predicted_motion,
     split_record,
 )
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.estimation.rollback import Rollback
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
@@ -51,7 +50,7 @@ class ObserverError(KnodeCosseratError, RuntimeError):
     code = "observer"
 
 
-class Estimate(NamedTuple):
+class StateEstimate(NamedTuple):
     """State of a robot at one time, by an observer.
 
     `y` (N, y) and `z` (N, z) are at the nodes; `innovation` is the last measurement's error from its
@@ -106,8 +105,8 @@ class KalmanObserver:
         if columns < 1:
             raise ValueError(f"columns is {columns}; allowed is at least 1")
         self.dt, self.output = checked_dt(dt), output
-        self.parameters = AdaptedParameters(robot, adapt)
-        self.model = OnlineModel(robot, self.parameters, self.dt)
+        self.parameters, self._drift = adapted_model(robot, adapt)
+        self.model = OnlineModel(self.parameters.robot, self.dt)
         self.columns = columns + self.parameters.size
         self._control_deviation = _deviations(robot, control_deviation)
         self._start_deviation = float(start_deviation)
@@ -171,31 +170,23 @@ class KalmanObserver:
     @property
     def system(self) -> System:
         """Robot with the adapted parameters."""
-        return self.model.at(self.belief.x)
+        return self.parameters.robot(self.belief.x) if self.parameters.size else self.robot
 
     @property
-    def estimate(self) -> Estimate:
+    def estimate(self) -> StateEstimate:
         """Current state, and the parameters with their standard deviations."""
         y, z = split_record(self.robot, self.record)
-        numbers = self._numbers(self.belief.x)
-        # by the slope of each number
-        step = 1e-6
-        above = self._numbers(self.belief.x + step)
-        spread = (
-            np.sqrt(np.sum(np.asarray(self.belief.spread.parameters) ** 2, axis=0)) * (above - numbers) / step
-        )
-        labels = self.parameters.labels
-        return Estimate(
-            self.time, y, z, dict(zip(labels, map(float, numbers), strict=True)),
-            dict(zip(labels, map(float, np.abs(spread)), strict=True)), self._innovation, self._surprise,
+        numbers, labels = self.parameters.numbers, self.parameters.labels
+        spread = np.sqrt(np.sum(np.asarray(self.belief.spread.parameters) ** 2, axis=0))
+        values = [number.value(x) for number, x in zip(numbers, self.belief.x, strict=True)]
+        deviations = [
+            abs(number.slope(value)) * float(deviation)
+            for number, value, deviation in zip(numbers, values, spread, strict=True)
+        ]
+        return StateEstimate(
+            self.time, y, z, dict(zip(labels, values, strict=True)),
+            dict(zip(labels, deviations, strict=True)), self._innovation, self._surprise,
         )  # fmt: skip
-
-    def _numbers(self, x: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        """Return the adapted numbers at coordinates; a matrix by its first one."""
-        parts = zip(self.parameters.numbers(x), self.parameters.vector, strict=True)
-        return np.concatenate(
-            [np.zeros(0), *(np.ravel(part) if vector else np.ravel(part)[:1] for part, vector in parts)]
-        )
 
     def predict(self, control: Float[np.ndarray, " c"]) -> None:
         """Advance the estimate by one time step under a control.
@@ -211,19 +202,17 @@ class KalmanObserver:
             )
         self._roll_back()
         nothing = np.full((1, self.output.size), np.nan)
-        found = predicted_motion(
-            self.model, self.belief, control[None], nothing, self._deviations(), self.output
-        )
-        if not bool(found.solved):
+        motion = self.model.predicted(self.belief, control[None], nothing, self._deviations(), self.output)
+        if not bool(motion.solved):
             raise ObserverError(f"the model's step at t = {self.time + self.dt:g} s was not solved")
         if self._rollback is not None:
             self._rollback.predicted(control, self.belief.past)
         self.control = control
-        self._accept(found, self.belief.x, np.eye(found.by_column.shape[0]))
+        self._accept(motion, self.belief.x, np.eye(motion.by_column.shape[0]))
 
     def _deviations(self) -> tuple[Float[np.ndarray, " c"], Float[np.ndarray, " n"]]:
         """Return the standard deviations of controls, and of the parameters' drift in one step."""
-        return self._control_deviation, self.excitation * self.parameters.drift * np.sqrt(self.dt)
+        return self._control_deviation, self.excitation * self._drift * np.sqrt(self.dt)
 
     @property
     def excitation(self) -> float:
@@ -237,15 +226,15 @@ class KalmanObserver:
         count = 2.0 * BIASED / self.dt
         return 1.0 if np.max(np.abs(self._bias)) * np.sqrt(count) > SIGNIFICANT else float(moved)
 
-    def _accept(self, found: Predicted, x: Float[np.ndarray, " n"], remaining: Any) -> None:
-        """Take over the end of a motion; `remaining` (m, k) combines its columns to those that are left."""
-        spread = found.spread.combined(remaining)
+    def _accept(self, motion: Predicted, x: Float[np.ndarray, " n"], remaining: Any) -> None:
+        """Set the state to the end of a motion; `remaining` (m, k) combines its columns to new ones."""
+        spread = motion.spread.combined(remaining)
         matrix = self._compression(spread)
-        value = np.asarray(found.values[-1])[: len(self.output.noise)] / self.output.noise
+        value = np.asarray(motion.values[-1])[: len(self.output.noise)] / self.output.noise
         self._values = np.concatenate([self._values, value[None]])[-max(2, round(BIASED / self.dt)) :]
-        self.record = np.asarray(found.record)
-        self.belief = Belief(x, found.past, spread.combined(matrix))
-        self._slopes = matrix.T @ (remaining.T @ np.asarray(found.by_column)[:, -1])
+        self.record = np.asarray(motion.record)
+        self.belief = Belief(x, motion.past, spread.combined(matrix))
+        self._slopes = matrix.T @ (remaining.T @ np.asarray(motion.by_column)[:, -1])
 
     def covers(self, truth: Trajectory, level: float = 0.95) -> bool:
         """Return True if the true position of the tip lies in the estimate's confidence region.
@@ -262,10 +251,10 @@ class KalmanObserver:
         positions = Drawing.of(self.robot).positions
         tips = np.array([positions(c[0][nodes[-1:], :ny])[0] for c in np.asarray(self.belief.spread.records)])
         apart = np.asarray(truth.tip_position[-1]) - np.asarray(positions(self.record[-1:, :ny]))[0]
-        own = tips.T @ tips
-        covariance = own + NUMERICAL**2 * np.eye(3)
+        estimated = tips.T @ tips
+        covariance = estimated + NUMERICAL**2 * np.eye(3)
         # the tip of an inextensible rod moves on a surface: only its uncertain directions count
-        uncertain = np.trace(np.linalg.solve(covariance, own))
+        uncertain = np.trace(np.linalg.solve(covariance, estimated))
         return bool(apart @ np.linalg.solve(covariance, apart) <= chi2.ppf(level, uncertain))
 
     def wait(self) -> None:
@@ -334,24 +323,24 @@ class KalmanObserver:
             self.rollbacks += 1
 
     def __copy__(self) -> Self:
-        found = type(self).__new__(type(self))
-        found.__dict__.update(self.__dict__)
-        found._bias = self._bias.copy()
+        twin = type(self).__new__(type(self))
+        twin.__dict__.update(self.__dict__)
+        twin._bias = self._bias.copy()
         if self._rollback is not None:
-            found._rollback = self._rollback.copied()
-        return found
+            twin._rollback = self._rollback.copied()
+        return twin
 
 
 def surprise(H: Float[np.ndarray, "e m"], error: Float[np.ndarray, " e"]) -> tuple[float, float]:
-    """Return the mean squared error in standard deviations of its prediction, and the weight that it gets.
+    """Return the mean squared error in standard deviations of its prediction, and its weight.
 
     Args:
         H: derivatives of the error by the columns; errors are divided by their noise.
         error: of a measurement. One that is too far away counts less.
     """
     count = len(error)
-    found = float(error @ np.linalg.solve(np.eye(count) + H @ H.T, error)) / count
-    return found, min(1.0, _largest_usual(count) / max(found, 1e-12))
+    size = float(error @ np.linalg.solve(np.eye(count) + H @ H.T, error)) / count
+    return size, min(1.0, _largest_usual(count) / max(size, 1e-12))
 
 
 def correction(H: Float[np.ndarray, "e m"], error: Float[np.ndarray, " e"]) -> tuple[Any, Any]:
@@ -368,14 +357,14 @@ def _largest_usual(count: int) -> float:
     return float(chi2.ppf(GATE, count) / count)
 
 
-def _deviations(robot: System, given: Any) -> Float[np.ndarray, " c"]:
-    if given is None:
+def _deviations(robot: System, stated: Any) -> Float[np.ndarray, " c"]:
+    if stated is None:
         parts = [
             np.full(field.size, TENSION_DEVIATION if field.name == "tension" else OTHER_DEVIATION)
             for field in robot.control_layout.fields
         ]
         return np.concatenate(parts)
-    found = np.broadcast_to(np.asarray(given, dtype=float), (robot.control_layout.size,))
-    if not np.all(found >= 0.0):
-        raise ValueError(f"control_deviation is {given}; allowed is zero or more for each control")
-    return np.array(found)
+    deviations = np.broadcast_to(np.asarray(stated, dtype=float), (robot.control_layout.size,))
+    if not np.all(deviations >= 0.0):
+        raise ValueError(f"control_deviation is {stated}; allowed is zero or more for each control")
+    return np.array(deviations)

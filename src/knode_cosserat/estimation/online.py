@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.adapted import AdaptedParameters
 from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.run import TimeIntegration
@@ -69,22 +69,19 @@ class Belief(NamedTuple):
 class OnlineModel(eqx.Module):
     """A robot with adapted parameters, and the numerical settings of its steps."""
 
-    robot: System
-    parameters: AdaptedParameters
+    parameters: ParametrisedRobot
     dt: float = eqx.field(static=True)
-    settings: Settings = eqx.field(static=True)
+    #: the default schemes: a plant holds its controls, as these do
+    settings: Settings = eqx.field(static=True, default=Settings())
 
-    def __init__(self, robot: System, parameters: AdaptedParameters, dt: float):
-        """Set the default schemes: a plant holds its controls, as these do."""
-        self.robot, self.parameters, self.dt, self.settings = robot, parameters, dt, Settings()
+    @property
+    def robot(self) -> System:
+        """The robot with its first parameters."""
+        return self.parameters.robot
 
     def task(self, steps: int) -> TimeIntegration:
         """Return so many steps from a state with a history."""
         return TimeIntegration(self.settings, self.dt, steps, self.settings.memory)
-
-    def at(self, x: Any) -> System:
-        """Return the robot at coordinates of its parameters."""
-        return self.parameters.of(self.robot, x)
 
     def moved(self, x: Any) -> tuple[System, Any]:
         """Return the robot, and its tangents by each parameter, stacked; None if there are none.
@@ -103,7 +100,7 @@ class OnlineModel(eqx.Module):
 
     def rollout(
         self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]
-    ) -> tuple[System, Rollout]:
+    ) -> tuple[System, Motion]:
         """Return the robot, and its motion with the tangents of all rows along columns.
 
         A column is a direction of the belief's spread, with the tangents of the controls beside it.
@@ -124,16 +121,52 @@ class OnlineModel(eqx.Module):
         d_records, d_rate = (np.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))
         moved = Spread(d_records, d_rate, spread.parameters)
         after = after._replace(t0=past.t0 + steps * self.dt)
-        return system, Rollout(after, rows.records, d_rows, moved, bool(done == steps))
+        return system, Motion(after, rows.records, d_rows, moved, bool(done == steps))
+
+    def predicted(
+        self, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any], output: Output
+    ) -> Predicted:
+        """Return a motion under controls, with new columns for their uncertainty and parameters' drift.
+
+        The new columns are T c for the controls (T, c), step by step, and n for the parameters. `measured`
+        (T, p) are the measurements after each control; NaN: none. `deviations` are those of each control
+        (c,), independent in each step, and of the drift of each parameter (n,).
+        """
+        of_control, of_drift = deviations
+        spread = belief.spread
+        (steps, c), m, n = controls.shape, len(spread.records), len(of_drift)
+        count = steps * c
+
+        def more(part: Any) -> Any:
+            return np.concatenate([part, np.zeros((count + n, *part.shape[1:]))])
+
+        drifts = np.concatenate([spread.parameters, np.zeros((count, n)), np.diag(of_drift)])
+        wide = Spread(more(spread.records), more(spread.rate), drifts)
+        noise = np.diag(np.tile(of_control, steps)).reshape(count, steps, c)
+        d_controls = np.concatenate([np.zeros((m, steps, c)), noise, np.zeros((n, steps, c))])
+        system, motion = self.rollout(belief._replace(spread=wide), controls, d_controls)
+        outputs = _measured(system, output, motion.records, motion.d_records, measured)
+        values, errors, slopes = map(np.asarray, outputs)
+        record = motion.records[-1]
+        return Predicted(motion.past, record, motion.spread, values, errors, slopes, motion.solved)
+
+    def errors(
+        self, x: Float[Any, " n"], past: StateHistory, controls: Any, measured: Any, output: Output
+    ) -> Float[Any, "T e"]:
+        """Return the errors of the motion with these parameters; infinite after a failure."""
+        system, steps = self.moved(x)[0], len(controls)
+        done, _, rows = self.task(steps).solve(system, controls, past, (0, steps))
+        errors = np.asarray(errors_of(system, output, rows.records, measured))
+        return np.where((np.arange(steps) < done)[:, None], errors, np.inf)
 
 
 @jax.jit
 def _moved(model: OnlineModel, x: Any) -> tuple[System, Any]:
-    by_x = jax.vmap(lambda d: jax.jvp(model.at, (x,), (d,))[1])
-    return model.at(x), by_x(jnp.eye(model.parameters.size))
+    robot = model.parameters
+    return robot(x), jax.vmap(lambda d: jax.jvp(robot, (x,), (d,))[1])(jnp.eye(robot.size))
 
 
-class Rollout(NamedTuple):
+class Motion(NamedTuple):
     """A simulated motion, and the tangents of its rows."""
 
     past: StateHistory
@@ -185,34 +218,6 @@ class Predicted(NamedTuple):
     solved: Any
 
 
-def predicted_motion(
-    model: OnlineModel, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any],
-    output: Output,
-) -> Predicted:  # fmt: skip
-    """Return a motion under controls (T, c), with new columns for their uncertainty and parameters' drift.
-
-    The new columns are T c for the controls, step by step, and n for the parameters. `measured` (T, p) are
-    the measurements after each control; NaN: none. `deviations` are those of each control (c,), independent
-    in each step, and of the drift of each parameter (n,).
-    """
-    of_control, of_drift = deviations
-    spread = belief.spread
-    (steps, c), m, n = controls.shape, len(spread.records), len(of_drift)
-    count = steps * c
-
-    def more(part: Any) -> Any:
-        return np.concatenate([part, np.zeros((count + n, *part.shape[1:]))])
-
-    drifts = np.concatenate([spread.parameters, np.zeros((count, n)), np.diag(of_drift)])
-    wide = Spread(more(spread.records), more(spread.rate), drifts)
-    noise = np.diag(np.tile(of_control, steps)).reshape(count, steps, c)
-    d_controls = np.concatenate([np.zeros((m, steps, c)), noise, np.zeros((n, steps, c))])
-    system, found = model.rollout(belief._replace(spread=wide), controls, d_controls)
-    outputs = _measured(system, output, found.records, found.d_records, measured)
-    values, errors, slopes = map(np.asarray, outputs)
-    return Predicted(found.past, found.records[-1], found.spread, values, errors, slopes, found.solved)
-
-
 @functools.partial(jax.jit, static_argnames="output")
 def _measured(system: System, output: Output, records: Any, d_records: Any, measured: Any) -> Any:
     """Return values of the output in every row, their errors, and the errors' tangents."""
@@ -223,18 +228,8 @@ def _measured(system: System, output: Output, records: Any, d_records: Any, meas
     return values, errors, errors_along(system, output, records, d_records, known)[1]
 
 
-def motion_errors(
-    model: OnlineModel, x: Float[Any, " n"], past: StateHistory, controls: Any, measured: Any, output: Output
-) -> Float[Any, "T e"]:
-    """Return the errors of the motion with these parameters; infinite after a failure."""
-    system, steps = model.moved(x)[0], len(controls)
-    done, _, rows = model.task(steps).solve(system, controls, past, (0, steps))
-    errors = np.asarray(errors_of(system, output, rows.records, measured))
-    return np.where((np.arange(steps) < done)[:, None], errors, np.inf)
-
-
 @functools.partial(jax.jit, static_argnames="output")
 def measured_error(model: OnlineModel, x: Any, record: Any, measured: Any, output: Output) -> Any:
     """Return the error of a state's output from a measurement."""
-    system = model.at(x)
+    system = model.parameters(x)
     return output.error(system, *split_record(system, record), measured)

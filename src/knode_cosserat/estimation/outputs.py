@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import dataclasses
-import functools
 from typing import Any, Self
 
 import jax
@@ -57,37 +56,40 @@ class Output(abc.ABC):
         return len(self.labels)
 
 
-def _checked_fractions(fractions: Any) -> tuple[float, ...]:
-    given = tuple(float(part) for part in np.atleast_1d(fractions))
-    if not given or not all(0.0 <= part <= 1.0 for part in given):
-        raise ValueError(f"fractions are {given}; allowed are parts of the length from 0 to 1")
-    return given
-
-
 def _xyz(name: str, unit: str) -> tuple[str, ...]:
     return tuple(f"{name}.{axis} ({unit})" for axis in "xyz")
 
 
 @dataclasses.dataclass(frozen=True)
-class BodyPositions(Output):
-    """Positions (m) of points on the rod at fractions of its length, global frame."""
+class _AtFractions(Output):
+    """Output at fractions of the length, with numbers of one standard deviation."""
 
     fractions: tuple[float, ...]
-    #: standard deviation (m)
-    sigma: float = 2e-4
+    sigma: float
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "fractions", _checked_fractions(self.fractions))
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Name and unit of every number of a value."""
-        return tuple(label for part in self.fractions for label in _xyz(f"position[{part:g}]", "m"))
+        fractions = tuple(float(part) for part in np.atleast_1d(self.fractions))
+        if not fractions or not all(0.0 <= part <= 1.0 for part in fractions):
+            raise ValueError(f"fractions are {fractions}; allowed are parts of the length from 0 to 1")
+        object.__setattr__(self, "fractions", fractions)
 
     @property
     def noise(self) -> Float[np.ndarray, " e"]:
         """Standard deviation of every number of an error."""
         return np.full(self.size, self.sigma)
+
+
+@dataclasses.dataclass(frozen=True)
+class BodyPositions(_AtFractions):
+    """Positions (m) of points on the rod at fractions of its length, global frame."""
+
+    #: standard deviation (m)
+    sigma: float = 2e-4
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(label for part in self.fractions for label in _xyz(f"position[{part:g}]", "m"))
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the positions, one after the other."""
@@ -103,33 +105,28 @@ class TipPosition(BodyPositions):
 
 
 @dataclasses.dataclass(frozen=True)
-class BodyPoses(Output):
+class BodyPoses(_AtFractions):
     """Positions (m) and unit quaternions (scalar first) at fractions of the length.
 
     An error of an orientation is the rotation vector (rad) from the reference, in its own frame.
     """
 
-    fractions: tuple[float, ...]
     #: standard deviations of positions (m) and of rotations (rad)
     sigma: float = 2e-4
     sigma_rotation: float = 2e-3
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "fractions", _checked_fractions(self.fractions))
-
     @property
     def labels(self) -> tuple[str, ...]:
         """Name and unit of every number of a value."""
-        found: list[str] = []
+        labels: list[str] = []
         for part in self.fractions:
-            found += [*_xyz(f"position[{part:g}]", "m"), *(f"quaternion[{part:g}].{k}" for k in "wxyz")]
-        return tuple(found)
+            labels += [*_xyz(f"position[{part:g}]", "m"), *(f"quaternion[{part:g}].{k}" for k in "wxyz")]
+        return tuple(labels)
 
     @property
     def noise(self) -> Float[np.ndarray, " e"]:
         """Standard deviation of every number of an error."""
-        one = np.repeat([self.sigma, self.sigma_rotation], 3)
-        return np.tile(one, len(self.fractions))
+        return np.tile(np.repeat([self.sigma, self.sigma_rotation], 3), len(self.fractions))
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return position and quaternion of each place."""
@@ -141,12 +138,12 @@ class BodyPoses(Output):
         self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
     ) -> Float[Any, " e"]:
         """Return differences of positions (m) and rotation vectors (rad)."""
-        now, wanted = (each.reshape(-1, 7) for each in (self.value(system, y, z), reference))
+        value, wanted = (it.reshape(-1, 7) for it in (self.value(system, y, z), reference))
         parts = []
         for k in range(len(self.fractions)):
-            turned = quaternion_product(conjugate(wanted[k, 3:]), now[k, 3:])
+            turned = quaternion_product(conjugate(wanted[k, 3:]), value[k, 3:])
             shorter = jnp.where(turned[0] < 0.0, -1.0, 1.0)
-            parts += [now[k, :3] - wanted[k, :3], 2.0 * shorter * turned[1:]]
+            parts += [value[k, :3] - wanted[k, :3], 2.0 * shorter * turned[1:]]
         return jnp.concatenate(parts)
 
 
@@ -195,12 +192,13 @@ class States(Output):
     def of(cls, system: System) -> Self:
         """Return the states of a system."""
         layouts = system.y_layout, system.z_layout
-        return cls(system.nodes, *(tuple((it.name, it.size) for it in each.fields) for each in layouts))
+        return cls(system.nodes, *(tuple((it.name, it.size) for it in layout.fields) for layout in layouts))
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Field of every number of a value."""
-        parts = ([name for name, size in each for _ in range(size)] for each in (self.y_names, self.z_names))
+        fields = self.y_names, self.z_names
+        parts = ([name for name, size in names for _ in range(size)] for names in fields)
         return tuple(label for part in parts for label in part * self.nodes)
 
     @property
@@ -230,25 +228,16 @@ class States(Output):
 
 
 @dataclasses.dataclass(frozen=True)
-class Curvatures(Output):
+class Curvatures(_AtFractions):
     """Curvatures u (1/m) about the material x and y axes at fractions of the length (Bragg gratings)."""
 
-    fractions: tuple[float, ...]
     #: standard deviation (1/m)
     sigma: float = 0.02
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "fractions", _checked_fractions(self.fractions))
 
     @property
     def labels(self) -> tuple[str, ...]:
         """Name and unit of every number of a value."""
         return tuple(f"curvature[{part:g}].{axis} (1/m)" for part in self.fractions for axis in "xy")
-
-    @property
-    def noise(self) -> Float[np.ndarray, " e"]:
-        """Standard deviation of every number of an error."""
-        return np.full(self.size, self.sigma)
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the curvatures, interpolated linearly between nodes."""
@@ -283,9 +272,7 @@ class BaseWrench(Output):
 
 def final_output(system: System, trajectory: Trajectory, output: Output) -> Float[np.ndarray, " p"]:
     """Return an output (p,) at the last row of a trajectory, by one compiled program for each output."""
-    return np.asarray(_value(system, np.asarray(trajectory.y[-1]), np.asarray(trajectory.z[-1]), output))
+    return np.asarray(_value(output, system, np.asarray(trajectory.y[-1]), np.asarray(trajectory.z[-1])))
 
 
-@functools.partial(jax.jit, static_argnames="output")
-def _value(system: System, y: Any, z: Any, output: Output) -> Any:
-    return output.value(system, y, z)
+_value = jax.jit(lambda output, system, y, z: output.value(system, y, z), static_argnums=0)

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import dataclasses
+import copy
 from collections import deque
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.online import OnlineModel, motion_errors
+from knode_cosserat.estimation.online import OnlineModel
 from knode_cosserat.estimation.outputs import Output
 
 #: seconds between comparisons, and number of earlier parameters that are kept
@@ -20,8 +20,7 @@ BETTER = 0.5
 LARGEST = 30.0
 
 
-@dataclasses.dataclass(frozen=True)
-class _Comparison:
+class _Comparison(NamedTuple):
     """Comparison of parameters by a past second: candidates (k, n), the newest last, and errors so far."""
 
     past: Any
@@ -38,25 +37,26 @@ class Rollback:
     simulations of a comparison are spread over the periods that follow, so that none takes much longer.
     """
 
+    _past: Any
+    _controls: list[Any]
+    _measured: list[Any]
+
     def __init__(self, model: OnlineModel, output: Output, x: Float[np.ndarray, " n"], dt: float):
-        """Keep the first parameters; compile the comparison."""
+        """Keep the first parameters."""
         self._model, self._output = model, output
         self._steps = max(2, round(WINDOW / dt))
         #: simulations in one period
-        self._each = -(-(KEPT + 1) // self._steps)
+        self._quota = -(-(KEPT + 1) // self._steps)
         self._kept = deque([np.array(x)] * KEPT, maxlen=KEPT)
         self._comparison: _Comparison | None = None
-        self._past: Any = None
-        self._controls: list[Any] = []
-        self._measured: list[Any] = []
+        self.forget()
 
     def copied(self) -> Rollback:
         """Return a copy that moves independently."""
-        found = Rollback.__new__(Rollback)
-        found.__dict__.update(self.__dict__)
-        found._kept = deque(self._kept, maxlen=KEPT)
-        found._controls, found._measured = list(self._controls), list(self._measured)
-        return found
+        twin = copy.copy(self)
+        twin._kept = self._kept.copy()
+        twin._controls, twin._measured = list(self._controls), list(self._measured)
+        return twin
 
     def compile(self, past: Any, controls: int) -> None:
         """Compile the comparison for a history and a number of controls."""
@@ -72,17 +72,17 @@ class Rollback:
     def measured(
         self, measured: Float[np.ndarray, " p"], x: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"] | None:
-        """Note a measurement; return earlier parameters once a comparison has found that they were better."""
+        """Note a measurement; return earlier parameters once a comparison has shown that they were better."""
         if len(self._measured) < len(self._controls):
             unseen = len(self._controls) - 1 - len(self._measured)
             self._measured += [np.full(len(measured), np.nan)] * unseen
             self._measured.append(np.asarray(measured, dtype=float))
-        found = self._compared()
+        earlier = self._compared()
         if len(self._controls) >= self._steps and len(self._measured) == len(self._controls):
-            controls, rows = (np.array(each[: self._steps]) for each in (self._controls, self._measured))
+            controls, rows = (np.array(it[: self._steps]) for it in (self._controls, self._measured))
             self._comparison = _Comparison(self._past, controls, rows, np.array([*self._kept, x]))
             self.forget()
-        return found
+        return earlier
 
     def forget(self) -> None:
         """Begin a new window."""
@@ -90,26 +90,25 @@ class Rollback:
 
     def _compared(self) -> Float[np.ndarray, " n"] | None:
         """Simulate some candidates of the comparison; return the best earlier one after the last of them."""
-        now = self._comparison
-        if now is None:
+        comparison = self._comparison
+        if comparison is None:
             return None
-        first, count = len(now.errors), len(now.candidates)
-        more = [self._error(now, k) for k in range(first, min(first + self._each, count))]
-        errors = (*now.errors, *more)
-        self._comparison = dataclasses.replace(now, errors=errors)
-        if len(errors) < count:
+        first, candidates = len(comparison.errors), comparison.candidates
+        last = min(first + self._quota, len(candidates))
+        errors = (*comparison.errors, *(self._error(comparison, k) for k in range(first, last)))
+        self._comparison = comparison._replace(errors=errors)
+        if last < len(candidates):
             return None
         self._comparison = None
         best = int(np.argmin(errors[:-1]))
         better = errors[best] < BETTER * errors[-1]
-        self._kept.append(now.candidates[best if better else -1])
-        return now.candidates[best] if better else None
+        self._kept.append(candidates[best if better else -1])
+        return candidates[best] if better else None
 
-    def _error(self, now: _Comparison, k: int) -> float:
+    def _error(self, comparison: _Comparison, k: int) -> float:
         """Return the mean squared error of a candidate, in units of the noise and at least 1."""
-        found = motion_errors(
-            self._model, now.candidates[k], now.past, now.controls, now.measured, self._output
-        )
-        square = np.minimum((np.asarray(found) / self._output.noise) ** 2, LARGEST**2)
+        past, controls, measured, candidates, _ = comparison
+        errors = self._model.errors(candidates[k], past, controls, measured, self._output)
+        square = np.minimum((errors / self._output.noise) ** 2, LARGEST**2)
         known = np.isfinite(square)
         return 1.0 + float(np.sum(square[known])) / max(int(known.sum()), 1)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError, correction, surprise
-from knode_cosserat.estimation.online import Belief, Predicted, predicted_motion
+from knode_cosserat.estimation.online import Belief, Predicted
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
@@ -52,7 +52,7 @@ class MovingHorizonObserver(KalmanObserver):
         # compile before the loop
         controls = np.tile(self.control, (window, 1))
         nothing = np.full((window, output.size), np.nan)
-        predicted_motion(self.model, self.belief, controls, nothing, self._deviations(), output)
+        self.model.predicted(self.belief, controls, nothing, self._deviations(), output)
 
     def restart(self, initial: Trajectory | Literal["equilibrium"] | None = "equilibrium") -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
@@ -62,28 +62,27 @@ class MovingHorizonObserver(KalmanObserver):
         super().restart(initial)
 
     def __copy__(self) -> Self:
-        found = super().__copy__()
-        found._controls, found._measured = deque(self._controls), deque(self._measured)
-        found._arrival = copy.copy(self._arrival)
-        return found
+        twin = super().__copy__()
+        twin._controls, twin._measured = deque(self._controls), deque(self._measured)
+        twin._arrival = copy.copy(self._arrival)
+        return twin
 
     def update(self, measured: Float[np.ndarray, " p"]) -> Float[np.ndarray, " m"]:
         """Correct the estimate by a measurement; return the coordinates of the correction in the columns."""
-        found = super().update(measured)
+        coordinates = super().update(measured)
         if self._arrival is None:
             self._arrival = self._filter()
         elif len(self._measured) < len(self._controls):
             self._measured.append(np.asarray(measured, dtype=float))
-        return found
+        return coordinates
 
     def _filter(self) -> KalmanObserver:
-        """Return a Kalman filter that stands where this observer does."""
-        found = KalmanObserver.__new__(KalmanObserver)
-        found.__dict__.update(self.__dict__)
-        found._bias = self._bias.copy()
-        # the parameters are those of the filter
+        """Return a Kalman filter in the state of this observer; the filter has the rollback from then on."""
+        arrival = KalmanObserver.__new__(KalmanObserver)
+        arrival.__dict__.update(self.__dict__)
+        arrival._bias = self._bias.copy()
         self._rollback = None
-        return found
+        return arrival
 
     def wait(self) -> None:
         """Let a period pass without a prediction: the state is held, and a new window begins."""
@@ -136,24 +135,24 @@ class MovingHorizonObserver(KalmanObserver):
             belief = arrival.belief.moved(total[:size], bounds, self.excitation)
             of_controls = total[size:end].reshape(controls.shape)
             belief = belief._replace(x=np.clip(belief.x + deviations[1] * total[end:], *bounds))
-            found = predicted_motion(
-                self.model, belief, controls + of_controls * deviations[0], measured, deviations, self.output
+            motion = self.model.predicted(
+                belief, controls + of_controls * deviations[0], measured, deviations, self.output
             )
-            if not bool(found.solved):
+            if not bool(motion.solved):
                 raise ObserverError(f"the motion until t = {self.time + self.dt:g} s was not solved")
-            H, e = self._rows(found)
+            H, e = self._rows(motion)
             # the prior belongs to the whole way from the arrival
             step, remaining = correction(H, e - H @ total)
             move, total = step - total, step
             if last:
-                after = Belief(belief.x, found.past, found.spread).moved(move, bounds, self.excitation)
-                self._accept(found._replace(past=after.past), after.x, remaining)
+                after = Belief(belief.x, motion.past, motion.spread).moved(move, bounds, self.excitation)
+                self._accept(motion._replace(past=after.past), after.x, remaining)
 
-    def _rows(self, found: Predicted) -> tuple[np.ndarray, np.ndarray]:
+    def _rows(self, motion: Predicted) -> tuple[np.ndarray, np.ndarray]:
         """Return derivatives and errors of all measurements, divided by their noise and weighted."""
-        by_column, noise = np.asarray(found.by_column), self.output.noise
+        by_column, noise = np.asarray(motion.by_column), self.output.noise
         rows, values = [np.zeros((0, len(by_column)))], [np.zeros(0)]
-        for k, error in enumerate(np.asarray(found.errors)):
+        for k, error in enumerate(np.asarray(motion.errors)):
             known = np.isfinite(error)
             if known.any():
                 H, e = by_column[:, k, known].T / noise[known, None], error[known] / noise[known]

@@ -1,8 +1,4 @@
-"""Unknown numbers of a robot, and effects: physical causes that change parameters of its parts.
-
-An effect names a part and its parameters, and adds the part to robots that lack it. At nominal values it
-changes nothing, so one compiled program serves any selection of effects: unselected ones stay nominal. A
-plain parameter of any system is an effect too, without a prior.
+"""Effects of a robot: the library, which is selected by recordings, and plain parameters of any system.
 
 A library effect registers itself: a module `*_effects.py` in this package with a function under `register`.
 """
@@ -15,9 +11,10 @@ import pkgutil
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
+from knode_cosserat.estimation.parameters import Effect, Model, Number, Replace
 from knode_cosserat.rods.parameters import (
     Parameter,
     ParameterError,
@@ -28,68 +25,11 @@ from knode_cosserat.rods.parameters import (
     value_at,
 )
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 from knode_cosserat.rods.wrapped import nominal_model
 
-#: change of a robot by the values of an effect's parameters; equal for all robots of the same parts
-Change = Callable[[Any, list[Any]], Any]
-
-
-class Number(NamedTuple):
-    """One unknown number: its nominal value, the width of its prior, and its bounds.
-
-    The search moves x = (value - nominal) / width, or log(value / nominal) / width if `logarithmic`. It
-    starts at `begin`, in these coordinates: for example, friction has no derivative at zero. The prior of x
-    is normal with deviation 1; if `flat`, there is none, and the width is a usual step.
-    """
-
-    label: str
-    unit: str
-    nominal: float
-    width: float
-    low: float = -np.inf
-    high: float = np.inf
-    logarithmic: bool = False
-    begin: float = 0.0
-    flat: bool = False
-
-    def value(self, x: Any) -> Any:
-        """Return the value at a coordinate; it may be traced."""
-        if self.logarithmic:
-            return self.nominal * jnp.exp(self.width * x)
-        return self.nominal + self.width * x
-
-    def coordinate(self, value: float) -> float:
-        """Return the coordinate of a value: the inverse of `value`."""
-        if self.logarithmic:
-            with np.errstate(divide="ignore"):
-                return float(np.log(max(value, 0.0) / self.nominal) / self.width)
-        return float((value - self.nominal) / self.width)
-
-    @property
-    def bounds(self) -> tuple[float, float]:
-        """Lowest and highest coordinate."""
-        return self.coordinate(self.low), self.coordinate(self.high)
-
-
-@dataclasses.dataclass(frozen=True)
-class Effect:
-    """A physical cause, its numbers, and the change that it makes to a robot.
-
-    `part` adds the part that the effect changes to a robot without it. `needs` names effects that it
-    requires. A `basic` effect is always identified. A search with few effects starts with the `usual` ones.
-    An effect `of_recordings` belongs to the recordings, not to the robot.
-    """
-
-    name: str
-    meaning: str
-    numbers: tuple[Number, ...]
-    apply: Change
-    part: Callable[[Any], Any] | None = None
-    needs: tuple[str, ...] = ()
-    basic: bool = False
-    usual: bool = False
-    of_recordings: bool = False
+#: tendon offset of a robot that states none, over its radius
+OFFSET = 5.0
 
 
 class Usual(NamedTuple):
@@ -106,7 +46,7 @@ class Usual(NamedTuple):
     bodies: tuple[float, ...] = ()
 
 
-#: effects that a robot may have, for given sizes
+#: effects that a robot may have, for usual sizes
 Library = Callable[[RoutedTendonRobot, Usual], list[Effect]]
 _libraries: dict[Library, int] = {}
 
@@ -131,49 +71,31 @@ def effects_of(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
             for effect in function(nominal, usual)]  # fmt: skip
 
 
-@dataclasses.dataclass(frozen=True)
-class Replace:
-    """Replaces parameters by name; equal to another by their names, so that programs are shared."""
+def library_model(
+    nominal: TendonRod, tension: Float[np.ndarray, "T c"], bodies: Iterable[float] = (),
+    more: Sequence[Effect] = (),
+) -> Model:  # fmt: skip
+    """Return the model with all registered effects of a robot whose tendons run beside it.
 
-    parameters: tuple[str, ...]
-
-    def __call__(self, robot: Any, values: list[Any]) -> Any:
-        """Return the robot with these values."""
-        return robot.replace(**dict(zip(self.parameters, values, strict=True)))
-
-
-@dataclasses.dataclass(frozen=True)
-class ReplaceInPart:
-    """Replaces numbers of one of the robot's parts, or one vector by all numbers."""
-
-    part: str
-    parameters: tuple[str, ...]
-    as_vector: bool = False
-
-    def __call__(self, robot: Any, values: list[Any]) -> Any:
-        """Return the robot with these values."""
-        numbers = [jnp.stack(values)] if self.as_vector else values
-        changes = dict(zip(self.parameters, numbers, strict=True))
-        return robot.replace(**{self.part: dataclasses.replace(getattr(robot, self.part), **changes)})
+    Args:
+        nominal: the robot of the data sheet.
+        tension: tensions in the recordings (N), which set the widths of some priors.
+        bodies: places of measured bodies, as parts of the length.
+        more: further effects, such as plain parameters.
+    """
+    if not isinstance(nominal, RoutedTendonRobot):
+        offset = float(nominal.tendon_offset) or OFFSET * float(nominal.radius)
+        nominal = RoutedTendonRobot.like(nominal, tendon_offset=offset)
+    usual = Usual(
+        float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1))),
+        tuple(float(at) for at in bodies if at > 0.0),
+    )  # fmt: skip
+    return Model(nominal, [*effects_of(nominal, usual), *more])
 
 
-@dataclasses.dataclass(frozen=True)
-class ReplaceWhole:
-    """Replaces a parameter with several numbers, or a matrix with one."""
-
-    parameter: str
-    kind: Literal["multiple", "diagonal", "components"]
-
-    def __call__(self, robot: Any, values: list[Any]) -> Any:
-        """Return the robot with a multiple of the identity, a diagonal matrix, or a vector."""
-        numbers = values[0] * jnp.eye(3) if self.kind == "multiple" else jnp.stack(values)
-        value = jnp.diag(numbers) if self.kind == "diagonal" else numbers
-        return robot.replace(**{self.parameter: value})
-
-
-def along_axes(label: str, unit: str, width: float, axes: str = "xyz", **more: Any) -> tuple[Number, ...]:
+def along_axes(label: str, unit: str, width: float, axes: str = "xyz") -> tuple[Number, ...]:
     """Return one number for each axis, nominally zero."""
-    return tuple(Number(f"{label}.{axis}", unit, 0.0, width, **more) for axis in axes)
+    return tuple(Number(f"{label}.{axis}", unit, 0.0, width) for axis in axes)
 
 
 # plain parameters
@@ -187,7 +109,7 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
     a multiple of the identity, or the three of its diagonal.
 
     Raises:
-        ParameterError: a name that does not exist or is given twice, a parameter without a value, or a
+        ParameterError: a name that does not exist or is repeated, a parameter without a value, or a
             matrix that is not diagonal.
     """
     owner = nominal_model(robot)
@@ -199,7 +121,7 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
     if isinstance(wanted, str) or not isinstance(wanted, Sequence) or not wanted:
         listed = ", ".join(known)
         raise ParameterError(f"parameters is {names!r}; allowed is a list of them, or 'all': {listed}")
-    found = []
+    effects = []
     for name in names:
         parameter = known.get(name) if "." not in str(name) else parameter_at(owner, name)
         if parameter is None and "." in str(name):
@@ -215,8 +137,8 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
         option = _parameter_effect(owner, name, parameter)
         if isinstance(option, str):
             raise ParameterError(option)
-        found.append(option)
-    return found
+        effects.append(option)
+    return effects
 
 
 def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Effect | str:
@@ -227,34 +149,22 @@ def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Effect 
     stated = value_at(owner, name)
     if stated is None:
         return f"{name} has no value: it follows from other parameters; give it one, or search for those"
-    value, change = np.asarray(stated, dtype=float), None
+    value, kind = np.asarray(stated, dtype=float), "numbers"
     if value.ndim == 2:
-        if np.any(value != np.diag(np.diag(value))):
+        diagonal = np.diag(value)
+        if np.any(value != np.diag(diagonal)):
             return (
                 f"{name} is a matrix with more than a diagonal; allowed is one number or three, its diagonal"
             )
-        alike = bool(np.all(np.diag(value) == value[0, 0]))
-        value, change = np.diag(value), ReplaceWhole(name, "multiple" if alike else "diagonal")
-        value = value[:1] if alike else value
+        kind = "diagonal"
+        value = diagonal[0] if np.all(diagonal == diagonal[0]) else diagonal
     elif value.ndim == 1:
-        change = ReplaceWhole(name, "components")
-    numbers = np.atleast_1d(value)
-    single = value.ndim == 0 or (change is not None and change.kind == "multiple")
-    labels = [name] if single else [f"{name}[{k}]" for k in range(len(numbers))]
-    return Effect(
-        name,
-        parameter.meaning,
-        tuple(_flat(label, parameter, float(it)) for label, it in zip(labels, numbers, strict=True)),
-        change or Replace((name,)),
-    )
-
-
-def _flat(label: str, parameter: Parameter, value: float) -> Number:
+        kind = "vector"
+    labels = [f"{name}[{k}]" for k in range(value.size)] if value.ndim else [name]
     log = parameter.low > 0.0
-    width = 1.0 if log else abs(value) or 1.0
-    return Number(label, parameter.unit, value, width, parameter.low, parameter.high, log, flat=True)
-
-
-def labels_of(effects: Iterable[Effect]) -> tuple[str, ...]:
-    """Return the label of every number."""
-    return tuple(number.label for effect in effects for number in effect.numbers)
+    numbers = [
+        Number(label, parameter.unit, at, 1.0 if log else abs(at) or 1.0, parameter.low, parameter.high, log,
+               flat=True)
+        for label, at in zip(labels, np.atleast_1d(value).tolist(), strict=True)
+    ]  # fmt: skip
+    return Effect(name, parameter.meaning, tuple(numbers), Replace((name,), kind))  # type: ignore[arg-type]

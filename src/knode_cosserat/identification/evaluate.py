@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 from collections.abc import Iterable
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,13 +25,6 @@ from knode_cosserat.trajectory import Trajectory
 
 #: seconds that recovery may take before a prediction has failed
 RECOVERY = 5.0
-
-
-class PredictedPoses(NamedTuple):
-    """Positions (m) and orientations of bodies."""
-
-    position: Float[np.ndarray, "T M 3"]
-    quaternion: Float[np.ndarray, "T M 4"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,13 +51,9 @@ class Evaluation:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the errors, or the reason of a failure, as plain JSON values."""
-        figures: dict[str, Any] = {
-            "tip_dtw": self.tip_dtw, "pose_mse": self.pose_mse, "tip_rmse": self.tip_rmse,
-            "rotation_rmse": self.rotation_rmse,
-        }  # fmt: skip
-        if self.extrapolated is not None:
-            figures["extrapolated"] = self.extrapolated
-        return figures if self.failed is None else {**figures, "failed": self.failed}
+        errors = {name: getattr(self, name) for name in ("tip_dtw", "pose_mse", "tip_rmse", "rotation_rmse")}
+        more = {name: getattr(self, name) for name in ("extrapolated", "failed")}
+        return errors | {name: value for name, value in more.items() if value is not None}
 
     def __repr__(self) -> str:
         return f"Evaluation: {self}"
@@ -109,9 +99,8 @@ def coverage(
         raise ValueError("fewer than two members have no spread")
     from scipy.stats import t
 
-    half = (
-        t.ppf(0.5 + level / 2.0, count - 1) * np.sqrt(1.0 + 1.0 / count) * np.std(predicted, axis=0, ddof=1)
-    )
+    factor = t.ppf(0.5 + level / 2.0, count - 1) * np.sqrt(1.0 + 1.0 / count)
+    half = factor * np.std(predicted, axis=0, ddof=1)
     off = np.abs(measured.position - np.mean(predicted, axis=0))[1:]
     return float(np.mean((off <= half[1:])[np.isfinite(off)]))
 
@@ -189,11 +178,11 @@ def compared(
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
     mse = rotation = None
     if oriented.any():
-        both = (
-            PredictedPoses(position[oriented], quaternion[oriented]),
-            PredictedPoses(seen[oriented], turned[oriented]),
-        )
-        mse, rotation = pose_mse(*both), rotation_rmse(*both)
+        poses = [
+            types.SimpleNamespace(position=p[oriented], quaternion=h[oriented])
+            for p, h in ((position, quaternion), (seen, turned))
+        ]
+        mse, rotation = pose_mse(*poses), rotation_rmse(*poses)
     return Evaluation(
         tip_dtw=dtw_distance(position[known, -1], seen[known, -1]),
         tip_rmse=float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),

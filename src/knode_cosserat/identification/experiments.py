@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, States
-from knode_cosserat.identification.model import Model
+from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.steps import steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -130,16 +130,16 @@ def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto2
     measured = [it for it in rows if isinstance(it, Measurements)]
     same_steps(measured)
     names = iter(names_of(measured))
-    found = [
+    experiments = [
         it if isinstance(it, Experiment)
         else of_measurements(it, model, next(names), space) if isinstance(it, Measurements)
         else of_trajectory(it, model.nominal, f"trajectory {k}")
         for k, it in enumerate(rows)
     ]  # fmt: skip
     if len(measured) < len(rows):
-        return found
-    longest = max(len(it.control) for it in found)
-    return [it.padded(longest) for it in found]
+        return experiments
+    longest = max(len(it.control) for it in experiments)
+    return [it.padded(longest) for it in experiments]
 
 
 def _listed(data: Any) -> list[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import logging
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,16 +14,16 @@ import numpy as np
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import States
-from knode_cosserat.identification.effects import parameter_effects
+from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.identification.effects import library_model, parameter_effects
 from knode_cosserat.identification.experiments import Experiment, experiments_of, measured_rows
-from knode_cosserat.identification.journal import Journal
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.identification.model import Model
 from knode_cosserat.identification.result import Identified, correlation_of, estimates_of
 from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import held_out, improved, selected, sizes
+from knode_cosserat.identification.selection import Selection, held_out, improved, selected, sizes
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.identification.undetermined import gap_of, unexplained
+from knode_cosserat.learning.training.checkpoint import Checkpoints
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError
@@ -103,7 +104,7 @@ def identify(
     system: Any = robot
     if not isinstance(system, System) or np.ndim(robot.length):
         raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")
-    tell, journal = progress or log.info, None if checkpoint is None else Journal(checkpoint)
+    tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
     plain = [] if parameters is None else parameter_effects(robot, parameters)
     if effects is None and parameters is not None:
         model = Model(robot, plain)
@@ -116,25 +117,24 @@ def identify(
         )
     measured = measured_rows(data)
 
-    def searched(robot: Any) -> Search:
-        tension = np.concatenate([rows.tension for rows in measured])
-        model = Model.of_library(robot, tension, measured[0].fractions, plain)
-        misfit = Misfit(model, experiments_of(measured, model, space))
-        return Search(misfit, tell, journal=journal)
+    tension = np.concatenate([rows.tension for rows in measured])
 
-    search = searched(robot)
+    def searched(robot: Any) -> Search:
+        model = library_model(robot, tension, measured[0].fractions, plain)
+        return Search(Misfit(model, experiments_of(measured, model, space)), tell, journal=journal)
+
+    search = far = searched(robot)
     model = search.misfit.model
-    far = search
     if any(it.steps > 1 for it in search.misfit.data):
         far = Search(Misfit(model, [it.replace(steps=1) for it in search.misfit.data]), tell, journal=journal)
-    steps: list[str] = []
     try:
         if effects is not None:
             names = _known([*effects, *(effect.name for effect in plain)], model)
-            point = far.from_far(model.mask(names))
+            selection = Selection(names, far.from_far(model.mask(names)))
         else:
-            names, point, taken = selected(far, tell)
-            steps += taken
+            selection = selected(far, tell)
+        names, point, steps = selection
+        assert point is not None
         if search is not far:
             point = search.run(point.x, model.mask(names))
         for _ in range(REFINEMENTS):
@@ -145,13 +145,13 @@ def identify(
             tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
             search = searched(model.nominal.replace(nodes=nodes))
             point = search.run(point.x, search.misfit.model.mask(names))
-            steps.append(f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
+            steps = (*steps, f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
+        selection = Selection(names, point, steps)
         if effects is None and search is not far:
-            names, point, taken = improved(search, names, point, tell, ", by the final steps")
-            steps += taken
+            selection = improved(search, selection, tell, ", by the final steps")
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
-    return _accepted(search, names, point, steps, space)
+    return _accepted(search, selection, space)
 
 
 # plain parameters
@@ -167,7 +167,8 @@ def _with_parameters(search: Search) -> Identified:
         try:
             gap = None
             with contextlib.suppress(SearchError):  # whole motions of a distant robot may have no solution
-                gap = gap_of(search, search.run(np.zeros(model.size), model.mask(names), None, 0), False)
+                start = search.run(np.zeros(model.size), model.mask(names), effort=(0, 0.0))
+                gap = gap_of(search, start, False)
             if gap is None:
                 point = _from_far(search, model.mask(names))
                 gap = gap_of(search, point, True)
@@ -176,19 +177,21 @@ def _with_parameters(search: Search) -> Identified:
             raise IdentificationError(str(error)) from None
         if gap is None:
             break
-        steps.append(gap.reason)
-        search.tell(gap.reason)
-        names = tuple(name for name in names if name not in gap.names)
+        missing, reason = gap
+        steps.append(reason)
+        search.tell(reason)
+        names = tuple(name for name in names if name not in missing)
     _require_start(search, point.x)
     if not point.converged:
         raise IdentificationError("the search did not converge; begin closer to the data")
     _require_range(model, names, point)
-    left = tuple(name for name in model.names if name not in names)
-    return _result(search, model.reduced(point.x, names), names, point, steps, undetermined=left)
+    result = _result(search, model.reduced(point.x, names), Selection(names, point, tuple(steps)))
+    undetermined = tuple(name for name in model.names if name not in names)
+    return dataclasses.replace(result, undetermined=undetermined)
 
 
 def _from_far(search: Search, free: np.ndarray) -> Point:
-    """Return the end of the first search that leaves only noise, or else of the best of some searches.
+    """Return the end of the first search whose remaining differences are noise, or of the best search.
 
     With noise the first rows of a motion may mislead a search, while another number of rows does not.
     """
@@ -249,53 +252,47 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
     return tuple(name for name in model.names if name in wanted)
 
 
-def _accepted(
-    search: Search, names: tuple[str, ...], point: Point, steps: list[str], space: str | SpaceScheme
-) -> Identified:
+def _accepted(search: Search, selection: Selection, space: str | SpaceScheme) -> Identified:
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails."""
     model, data = search.misfit.model, search.misfit.data
+    names, point, steps = selection.names, selection.point, list(selection.steps)
+    assert point is not None
     while True:
-        found = model.reduced(point.x, names)
-        reason = failed_trial(found, data, space)
+        robot = model.reduced(point.x, names)
+        reason = failed_trial(robot, data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
         search.tell(f"not accepted: {reason}")
         if not added:
             steps.append(f"the nominal robot is returned: {reason}")
-            return _result(search, model.nominal, (), None, steps)
-
-        def cost(name: str, point: Point = point, names: tuple[str, ...] = names) -> float:
-            """Return the cost without an effect, by the equations linear about the point."""
-            return held_out(point.problem, point.x, model.mask(set(names) - {name}), model)
-
-        fewest = min(added, key=cost)
-        steps.append(f"without {fewest}: {reason}")
-        names = tuple(name for name in names if name != fewest and fewest not in model.effect(name).needs)
-        point = search.run(np.where(model.mask(names), point.x, 0.0), model.mask(names), scale=point.scale)
-    left_out, folds = _held_out(search, point)
-    nominal = [np.inf if error is None else error for error in _errors(search, np.zeros(model.size))]
-    unseen = [np.inf if error is None else error for error in left_out]
-    if len(data) > 1 and np.mean(unseen) >= np.mean(nominal):
-        steps.append("the nominal robot is returned: it predicts held-out recordings as well")
-        return _result(search, model.nominal, (), None, steps)
-    found = found.replace(trained=trained_range(found, data, space))
-    return _result(search, found, names, point, steps, left_out, folds)
-
-
-def _held_out(search: Search, point: Point) -> tuple[list[float | None], list[np.ndarray]]:
-    """Return the error (m) of each recording, predicted by a search that did not see it, and its end."""
-    count = len(search.misfit.data)
-    if count == 1:
-        return [None], []
-    errors: list[float | None] = []
+            return _result(search, model.nominal, Selection((), None, tuple(steps)))
+        # costs without an effect, by the equations linear about the point
+        costs = {
+            name: held_out(point.problem, point.x, model.mask({*names} - {name}), model.bounds)
+            for name in added
+        }
+        weakest = min(costs, key=lambda name: costs[name])
+        steps.append(f"without {weakest}: {reason}")
+        names = tuple(name for name in names if name != weakest and weakest not in model.effect(name).needs)
+        free = model.mask(names)
+        point = search.run(np.where(free, point.x, 0.0), free, scale=point.scale)
+    errors: list[float | None] = [None]
     folds = []
-    for k in range(count):
-        fold = search.without(point, k, *FOLD)
-        errors.append(None if fold is None else _errors(search, fold.x, [k])[0])
-        if fold is not None:
-            folds.append(fold.x)
-    return errors, folds
+    if len(data) > 1:
+        ends = [search.without(point, k, FOLD) for k in range(len(data))]
+        errors = [None if end is None else _errors(search, end.x, [k])[0] for k, end in enumerate(ends)]
+        folds = [end.x for end in ends if end is not None]
+        nominal = _errors(search, np.zeros(model.size))
+        unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
+        if np.mean(unseen) >= np.mean(before):
+            steps.append("the nominal robot is returned: it predicts held-out recordings as well")
+            return _result(search, model.nominal, Selection((), None, tuple(steps)))
+    robot = robot.replace(trained=trained_range(robot, data, space))
+    result = _result(search, robot, Selection(names, point, tuple(steps)), folds)
+    return dataclasses.replace(
+        result, held_out_error={it.name: error for it, error in zip(data, errors, strict=True)}
+    )
 
 
 # errors of the tip
@@ -341,23 +338,21 @@ def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -
 
 
 def _result(
-    search: Search, robot: System, names: tuple[str, ...], point: Point | None, steps: Sequence[str],
-    left_out: Sequence[float | None] = (), folds: Sequence[np.ndarray] = (),
-    undetermined: tuple[str, ...] = (),
-) -> Identified:  # fmt: skip
-    model = search.misfit.model
+    search: Search, robot: System, selection: Selection, folds: Sequence[np.ndarray] = ()
+) -> Identified:
+    """Return the result with an identified robot; `folds` are ends of searches without one recording each."""
+    model, (names, point, steps) = search.misfit.model, selection
     recordings = [data.name for data in search.misfit.data]
-    nominal = _errors(search, np.zeros(model.size))
-    found = nominal if point is None else _errors(search, point.x)
+    nominal = dict(zip(recordings, _errors(search, np.zeros(model.size)), strict=True))
+    if point is None:
+        return Identified(robot, nominal_error=nominal, error=nominal, steps=steps)
     return Identified(
         robot=robot,
         effects=names,
-        estimates=() if point is None else tuple(estimates_of(model, names, point, folds)),
-        correlation=np.zeros((0, 0)) if point is None else correlation_of(model, names, point),
-        nominal_error=dict(zip(recordings, nominal, strict=True)),
-        error=dict(zip(recordings, found, strict=True)),
-        held_out_error=dict(zip(recordings, left_out, strict=False)),
-        undetermined=undetermined,
-        unexplained=() if point is None else unexplained(search, point),
-        steps=tuple(steps),
+        estimates=tuple(estimates_of(model, names, point, folds)),
+        correlation=correlation_of(model, names, point),
+        nominal_error=nominal,
+        error=dict(zip(recordings, _errors(search, point.x), strict=True)),
+        unexplained=unexplained(search, point),
+        steps=steps,
     )

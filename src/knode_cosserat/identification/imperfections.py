@@ -8,7 +8,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.identification.model import Model
+from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.identification.effects import library_model
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.virtual import commands
 from knode_cosserat.rods.parameters import ParameterError
@@ -53,31 +54,29 @@ def imperfect_robot(
     to 1.5 standard deviations of their priors from their nominal values.
 
     Args:
-        nominal: the robot as its data sheet has it.
-        tension: tensions (N) that it will be pulled with: some effects' sizes depend on them.
+        nominal: the robot of the data sheet.
+        tension: tensions (N) of its motions, which set the sizes of some effects.
         seed: a whole number from 0 to 2**32 - 1.
-        bodies: places of bodies that may be on ribs, as parts of the length.
+        bodies: places of bodies, which may be on ribs, as parts of the length.
 
     Raises:
         ParameterError: a seed out of range.
     """
     if not 0 <= seed < 2**32:
         raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
-    model, random = Model.of_library(nominal, tension, bodies), np.random.default_rng(seed)
+    model, random = library_model(nominal, tension, bodies), np.random.default_rng(seed)
     names: list[str] = []
-    own = [effect for effect in model.effects if not effect.of_recordings]
-    for effect in own:
+    for effect in (it for it in model.effects if not it.of_recordings):
         present = bool(random.uniform() < SHARE) or effect.basic
         if present and set(effect.needs) <= set(names):
             names.append(effect.name)
     sizes = random.uniform(*SIZES, model.size) * random.choice([-1.0, 1.0], model.size)
     low, high = model.bounds
-    # numbers that are not negative, say, and nominally zero
+    # numbers with a bound at zero have one sign
     sizes = np.where((low >= 0.0) | (high <= 0.0), np.abs(sizes) * np.where(high <= 0.0, -1.0, 1.0), sizes)
     x = np.where(model.mask(names), np.clip(sizes, low, high), 0.0)
-    values = dict(zip((each.label for each in model.numbers), model.values(x), strict=True))
-    mask = model.mask(names)
-    kept = {each.label: values[each.label] for each, on in zip(model.numbers, mask, strict=True) if on}
+    mask, values = model.mask(names), model.values(x)
+    kept = {label: value for label, value, on in zip(model.labels, values, mask, strict=True) if on}
     return Imperfect(model.reduced(x, names), tuple(names), kept, model, x)
 
 
@@ -91,5 +90,5 @@ def nominal_robot() -> TendonRod:
 def drawn_robot(seed: int) -> Imperfect:
     """Return the virtual robot of a seed: the paper's robot with random imperfections."""
     tension = np.concatenate([commands(signal, END).tension for signal in TRAINING.values()])
-    bodies = [each.fraction for each in RecordingConfig.paper_robot().markers]
+    bodies = [marker.fraction for marker in RecordingConfig.paper_robot().markers]
     return imperfect_robot(nominal_robot(), tension, seed, bodies)

@@ -18,8 +18,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.online import errors_along, errors_of
+from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
-from knode_cosserat.identification.model import Model, ParametrisedRobot
 from knode_cosserat.identification.steps import stepped
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.tendons import LoadCells
@@ -35,6 +35,7 @@ from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, static_tangents, tangent_time_loop
+from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
 
 #: seconds that recovery of one simulation may take
@@ -111,12 +112,12 @@ class Misfit:
             task = Equilibria(dataclasses.replace(data.settings, time=None), max(steps, 1), RECOVERY)
         else:
             acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
-        found, _, cause = run_one(task, system, acting, start.state, start.before)
+        solved_rows, _, cause = run_one(task, system, acting, start.state, start.before)
         if cause:
             return None
         size = system.y_layout.size + system.z_layout.size
         compared = slice(data.steps - 1, steps, data.steps)
-        records = np.concatenate([start.record[None], found.records[compared, :, :size]])
+        records = np.concatenate([start.record[None], solved_rows.records[compared, :, :size]])
 
         def every(rows: np.ndarray) -> np.ndarray:
             """Fill to all rows: one compiled program serves all horizons."""
@@ -132,7 +133,7 @@ class Misfit:
             d_controls = np.zeros((*controls.shape, len(x)))
             if slope is not None:
                 d_controls = slope[:steps, :, None] * np.asarray(by_latency)
-            solved = tuple(part[: steps * stages] for part in found.every_stage)
+            solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             d_records = np.zeros((0, *records.shape[1:], len(x)))
             if steps and data.static:
                 d_rows, *_ = static_tangents(task.settings, solved, (system, controls), (moves, d_controls))
@@ -159,14 +160,14 @@ class Misfit:
             np.zeros(system.control_layout.size) if data.held is None else np.asarray(data.held, dtype=float)
         )
         still = dataclasses.replace(settings, time=None)
-        found, y, cause = static_run(Equilibria(still, 1, RECOVERY), system, control[None])
+        rest, y, cause = static_run(Equilibria(still, 1, RECOVERY), system, control[None])
         if cause:
             return None
-        record = np.asarray(found.records[0][:, :size])
+        record = np.asarray(rest.records[0][:, :size])
         past = None if data.static else at_one_state(system, settings, record, control)
 
         def tangents(moves: SystemMoves) -> Any:
-            held, solved = control[None], (found.records, found.unknowns)
+            held, solved = control[None], (rest.records, rest.unknowns)
             changes = moves, np.zeros((*held.shape, len(x)))
             d_rows, _, d_records = static_tangents(still, solved, (system, held), changes)
             return d_rows[0], past, (np.stack([d_records] * data.settings.memory), np.zeros_like(d_records))
@@ -180,12 +181,14 @@ class Misfit:
             at_start, rows = initial_state(system, settings), None
         else:
             at_start = continued_state(system, data.initial, settings, data.dt)
-            rows = at_start.record, at_start.control
+            # a control acts on the history only where that is one state
+            one_state = at_start.state.known(settings) == 1
+            rows = (at_start.record, at_start.control) if one_state else (at_start.record,)
         known, past = at_start.state.known(settings), at_start.state.history
         record = np.asarray(at_start.record)[:, : system.y_layout.size + system.z_layout.size]
 
         def tangents(moves: SystemMoves) -> Any:
-            begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings, known == 1)
+            begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings)
             return np.asarray(d_record), begun, d_past
 
         return _Start(record, past, np.asarray(at_start.control), known, at_start.state.dt is None, tangents)
@@ -199,7 +202,7 @@ def _cells(system: Any) -> LoadCells | None:
 def _acting(system: Any, data: Experiment) -> tuple[np.ndarray, np.ndarray | None]:
     """Return the controls of all steps by the load cells' latency, and their derivative by it (N/s).
 
-    The derivative is over one step: between steps it jumps, and at no latency it is of both sides.
+    The derivative is a central difference over one step, because it jumps between steps.
     """
     cells, dt = _cells(system), data.dt / data.steps
     before = data.control[0] if data.held is None else data.held
@@ -232,15 +235,18 @@ def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
     return jax.vmap(along)(jnp.eye(len(x)))
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "one_state"))
-def _begun(robot, x, rows, past, settings, one_state):  # type: ignore[no-untyped-def]
-    """Return the history of an unstressed robot or of rows, and tangents of record and history."""
+@functools.partial(jax.jit, static_argnames="settings")
+def _begun(robot: ParametrisedRobot, x: Any, rows: Any, past: Any, settings: Settings) -> Any:
+    """Return the history of an unstressed robot or of rows, and tangents of record and history.
+
+    `rows` are the record of the last row and, if it is the whole history, its control; None: unstressed.
+    """
 
     def begun(x: Any) -> Any:
         system = robot(x)
         if rows is None:
             return rest_record(system), resting_history(system, settings)
-        if system.mixed and one_state:
+        if system.mixed and len(rows) == 2:
             return rows[0], constant_history(system, settings, *rows, past.t0)
         return rows[0], past
 

@@ -9,37 +9,40 @@ robot and residual, and another finds a robot without a residual, for comparison
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.estimation.parameters import RESIDUAL, Effect, Model, Number, Replace
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.identification.residual_model import ResidualModel
 from knode_cosserat.identification.search import (
     FINE,
     Point,
     Problem,
     Search,
     SearchError,
+    Subset,
     normal_equations,
 )
 from knode_cosserat.identification.selection import held_out
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.passive import PARTS
+from knode_cosserat.learning.passive import PARTS, POSITIVE, Passive
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.space import SpaceScheme
 
-#: widths of priors that are tried, as multiples of those in `residual_model`
+#: standard deviation of a number's prior, by the part of the residual
+WIDTHS = {"stiffness": 0.2, "levers": 0.3, "energy": 0.2, "damping": 1.0, "dissipation": 1.0}
+#: widths of priors that are tried, as multiples of `WIDTHS`
 TRIED = (0.3, 1.0, 3.0)
 #: least expected reduction of the held-out cost by a part
 PROMISE = 4.0
-#: parts of the way to the residual that are tried beside all of it
+#: fractions of the residual that are tried beside all of it
 SHRUNK = (0.5, 0.25)
-#: most corrections of a search without one recording
+#: evaluations of a search without one recording, and the fall of the cost at its end
 FOLD = (5, 1e-2)
 #: part by which a residual has to lower held-out errors on average, and standard errors of that average
 LOWERS, ERRORS = 0.02, 2.0
@@ -51,6 +54,39 @@ LEVEL, NORMAL = 0.9, 1.645
 MOST_INFLATED = 30.0
 
 
+@dataclasses.dataclass(frozen=True)
+class _OfKnowledge:
+    """A change of the nominal model within a KNODE."""
+
+    change: Callable[..., Any]
+
+    def __call__(self, model: KNODE, *values: Any) -> KNODE:
+        return model.around(self.change(model.knowledge, *values))
+
+
+def residual_model(
+    model: Model, names: Sequence[str], residual: Passive, widths: Mapping[str, float] = WIDTHS
+) -> Model:
+    """Return a model of the named effects, followed by the parts of a residual whose numbers are all zero.
+
+    Args:
+        model: the robot with its effects.
+        names: the identified effects.
+        residual: the residual; its parts are effects with names such as "residual.damping".
+        widths: standard deviations of the priors of the residual's numbers, by part.
+    """
+    effects = [
+        dataclasses.replace(it, apply=_OfKnowledge(it.apply), part=it.part and _OfKnowledge(it.part))
+        for it in model.effects
+        if it.name in names
+    ]
+    for part, value in residual.coefficients().items():
+        name, low = f"{RESIDUAL}.{part}", 0.0 if part in POSITIVE else -np.inf
+        numbers = [Number(f"{name}[{k}]", "", 0.0, widths[part], low) for k in range(np.size(value))]
+        effects.append(Effect(name, part, tuple(numbers), Replace((name,), "coefficients")))
+    return Model(KNODE(model.nominal, residual), effects)
+
+
 class PositionErrors(NamedTuple):
     """Root mean square errors of a recording's positions (m): of the last body, and of all."""
 
@@ -58,48 +94,56 @@ class PositionErrors(NamedTuple):
     bodies: float
 
 
+FAILED = PositionErrors(np.inf, np.inf)
+
+
 @dataclasses.dataclass(frozen=True)
 class LearnedResidual:
     """Result of the search for a residual.
 
     Attributes:
-        robot: the identified robot, with the residual if it is kept.
-        kept: true if the residual is kept.
-        without: by recording, the held-out errors of the robot without a residual.
-        with_residual: the same with it; empty if none was promising.
-        steps: the steps of the search, in words.
+        model: the model that defines the coordinates.
         x: coordinates of robot and residual.
         covariance: covariance of the coordinates, widened until held-out recordings lie within the spread.
-        model: the model that defines the coordinates.
+        kept: true if the residual is kept.
+        without: by recording, the held-out errors of the robot without a residual.
+        with_residual: the same with it; empty if no part was promising.
+        steps: the steps of the search, in words.
     """
 
-    robot: System
-    kept: bool
-    without: dict[str, PositionErrors]
-    with_residual: dict[str, PositionErrors]
-    steps: tuple[str, ...]
+    model: Model
     x: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n n"]
-    model: ResidualModel
+    kept: bool = True
+    without: Mapping[str, PositionErrors] = dataclasses.field(default_factory=dict)
+    with_residual: Mapping[str, PositionErrors] = dataclasses.field(default_factory=dict)
+    steps: tuple[str, ...] = ()
+
+    @property
+    def robot(self) -> System:
+        """The identified robot, with the residual if it is kept."""
+        if self.kept:
+            return self.model.robot(self.x)
+        identified = [name for name in self.model.names if not name.startswith(RESIDUAL)]
+        return self.model.reduced(self.x, identified).knowledge
 
     def member(self, seed: int) -> System:
         """Return a random sample of the robots that agree with the recordings."""
         rng = np.random.default_rng(seed)
         values, vectors = np.linalg.eigh(self.covariance)
         drawn = vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.normal(size=len(values)))
-        low, high = self.model.bounds
-        return self.model.robot(np.clip(self.x + drawn, low, high))
+        return self.model.robot(np.clip(self.x + drawn, *self.model.bounds))
 
 
 def learn_residual(
-    model: ResidualModel, x: Float[np.ndarray, " m"], data: Sequence[Experiment], space: str | SpaceScheme,
+    model: Model, begin: Float[np.ndarray, " n"], data: Sequence[Experiment], space: str | SpaceScheme,
     tell: Callable[[str], None],
 ) -> LearnedResidual:  # fmt: skip
     """Learn a residual on an identified robot from at least two recordings.
 
     Args:
-        model: the robot with the residual.
-        x: coordinates of all effects of the identified robot.
+        model: the robot with the residual (`residual_model`).
+        begin: coordinates of the identified robot without a residual.
         data: recordings of one length.
         space: the scheme along the rod.
         tell: called with a line of progress.
@@ -107,78 +151,79 @@ def learn_residual(
     Raises:
         SearchError: the identified robot cannot be simulated.
     """
-    misfit = Misfit(model, data)  # type: ignore[arg-type]  # it offers what a Model does
-    begin = model.begun(x)
-    rollouts = _solved(misfit, begin)
+    misfit = Misfit(model, data)
     search = Search(misfit, tell)
+    rollouts = search.solved(begin)
+    if rollouts is None:
+        raise SearchError("the identified robot cannot be simulated")
     misfit.differentiated(rollouts)
     scale = search.scales_of(rollouts)
     problem = normal_equations(rollouts, search.units(scale), search.thinned())
-    point = Point(begin, scale, problem, problem, model.mask(()), search.prior)
+    identified = [name for name in model.names if not name.startswith(RESIDUAL)]
+    point = Point(begin, scale, problem, problem, model.mask(identified), search.prior)
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
-    before, steps = [each.errors for each in without], []
+    before, steps = [fold.errors for fold in without], list[str]()
+    recordings = [experiment.name for experiment in data]
     tested: dict[float, list[PositionErrors]] = {}
+
+    def learned(x: np.ndarray, end: Point, folds: Sequence[_Fold], fraction: float) -> LearnedResidual:
+        """Return the result with this fraction of the residual; 0: without."""
+        after = tested.get(fraction or 1.0, ())
+        without_it, with_it = (dict(zip(recordings, it, strict=False)) for it in (before, after))
+        covariance = _widened(end, folds)
+        return LearnedResidual(model, x, covariance, fraction > 0.0, without_it, with_it, tuple(steps))
+
     if not widths:
-        steps.append("no part of a residual promises anything for held-out recordings")
+        steps.append("no part of a residual promises a lower error of held-out recordings")
     while widths:
-        named = ", ".join(f"{part} x {width:g}" for part, width in widths.items())
-        own = _with_widths(misfit, widths, tell)
-        free = dataclasses.replace(point, free=model.mask(widths), prior=own.prior)
-        folds = [_fold(own, free, k, from_=each.point.x) for k, each in enumerate(without) if each.point]
-        tested = _in_parts(misfit, without, folds) if len(folds) == len(without) else {}
-        part, words = _verdict(before, tested)
-        steps.append(f"residual ({named}): {words}")
+        prior = np.ones(model.size)
+        for part, width in widths.items():
+            prior[model.slice(f"{RESIDUAL}.{part}")] = width**-2
+        wider = Search(misfit, tell, prior)
+        mask = model.mask([*identified, *(f"{RESIDUAL}.{part}" for part in widths)])
+        free = dataclasses.replace(point, free=mask, prior=wider.prior)
+        folds = [
+            _fold(wider, dataclasses.replace(free, x=fold.point.x), k)
+            for k, fold in enumerate(without)
+            if fold.point
+        ]
+        tested = _shrunk_errors(search, without, folds) if len(folds) == len(without) else {}
+        fraction, words = _verdict(before, tested)
+        listed = ", ".join(f"{part} x {width:g}" for part, width in widths.items())
+        steps.append(f"residual ({listed}): {words}")
         tell(steps[-1])
-        if part:
-            learned = own.run(begin, free.free, None, *FINE, scale=scale)
-            there = begin + part * (learned.x - begin)
-            reason = failed_trial(model.robot(there), data, space)
+        if fraction:
+            end = wider.run(begin, mask, effort=FINE, scale=scale)
+            x = begin + fraction * (end.x - begin)
+            reason = failed_trial(model.robot(x), data, space)
             if reason is None:
-                wide = _widened(learned, folds)
-                return _learned(model, model.robot(there), data, before, tested[part], steps, there, wide)
+                return learned(x, end, folds, fraction)
             steps.append(f"not accepted: {reason}")
         widths = dict(list(widths.items())[: len(widths) // 2])
-    alone = model.model.reduced(x, model.names)
-    wide = _widened(point, without)
-    return _learned(model, alone, data, before, tested.get(1.0), steps, begin, wide)
-
-
-def _learned(
-    model: ResidualModel, robot: System, data: Sequence[Experiment], before: Sequence[PositionErrors],
-    after: Sequence[PositionErrors] | None, steps: list[str], x: np.ndarray, covariance: np.ndarray,
-) -> LearnedResidual:  # fmt: skip
-    names = [each.name for each in data]
-    without, found = (dict(zip(names, each or (), strict=False)) for each in (before, after))
-    return LearnedResidual(
-        robot, isinstance(robot, KNODE), without, found, tuple(steps), x, covariance, model
-    )
-
-
-def _solved(misfit: Misfit, x: np.ndarray) -> list[Rollout]:
-    found = misfit.differences(x)
-    solved = [each for each in found if each is not None]
-    if len(solved) < len(found):
-        raise SearchError("the identified robot cannot be simulated")
-    return solved
+    return learned(begin, point, without, 0.0)
 
 
 # parts that promise an improvement
 
 
-class _Scaled(NamedTuple):
-    """Members of a model that `held_out` uses."""
-
-    bounds: tuple[np.ndarray, np.ndarray]
-
-
-def promising(problem: Problem, x: Float[np.ndarray, " n"], model: ResidualModel) -> dict[str, float]:
+def promising(problem: Problem, x: Float[np.ndarray, " n"], model: Model) -> dict[str, float]:
     """Return the parts that promise a lower held-out cost, the most promising first, and their widths."""
+    identified = [name for name in model.names if not name.startswith(RESIDUAL)]
+
+    def cost_of(widths: dict[str, float]) -> float:
+        """Return the held-out cost, in coordinates in which all priors are alike."""
+        by, names = np.ones(model.size), [f"{RESIDUAL}.{part}" for part in widths]
+        for name, width in zip(names, widths.values(), strict=True):
+            by[model.slice(name)] = width
+        scaled = problem._replace(gradient=problem.gradient * by, matrix=problem.matrix * np.outer(by, by))
+        return held_out(scaled, x / by, model.mask([*identified, *names]), model.bounds / by)
+
     widths: dict[str, float] = {}
-    cost = _promised(problem, x, model, widths)
+    cost = cost_of(widths)
     while True:
         options = [
-            (_promised(problem, x, model, {**widths, part: width}), part, width)
+            (cost_of({**widths, part: width}), part, width)
             for part in PARTS
             if part not in widths
             for width in TRIED
@@ -187,16 +232,6 @@ def promising(problem: Problem, x: Float[np.ndarray, " n"], model: ResidualModel
             return widths
         cost, part, width = min(options)
         widths[part] = width
-
-
-def _promised(problem: Problem, x: np.ndarray, model: ResidualModel, widths: dict[str, float]) -> float:
-    """Return the held-out cost, in coordinates in which all priors are alike."""
-    by = np.ones(model.size)
-    for part, width in widths.items():
-        by[model.slice(part)] = width
-    low, high = model.bounds
-    scaled = problem._replace(gradient=problem.gradient * by, matrix=problem.matrix * np.outer(by, by))
-    return held_out(scaled, x / by, model.mask(widths), _Scaled((low / by, high / by)))  # type: ignore[arg-type]
 
 
 # acceptance
@@ -213,59 +248,46 @@ class _Fold(NamedTuple):
     over: Float[np.ndarray, " m"]
 
 
-def _with_widths(misfit: Misfit, widths: dict[str, float], tell: Callable[[str], None]) -> Search:
-    prior = np.ones(misfit.model.size)
-    for part, width in widths.items():
-        prior[misfit.model.slice(part)] = width**-2
-    return Search(misfit, tell, prior)
-
-
-def _fold(search: Search, point: Point, k: int, from_: Any = None) -> _Fold:
+def _fold(search: Search, point: Point, k: int) -> _Fold:
     """Leave recording k out."""
-    begin = point if from_ is None else dataclasses.replace(point, x=from_)
-    fold = search.without(begin, k, *FOLD)
-    (found,) = [None] if fold is None else search.misfit.differences(fold.x, which=[k])
-    if fold is None or found is None:
-        return _Fold(None, PositionErrors(np.inf, np.inf), np.zeros(0))
-    return _Fold(fold, _errors(found), _over_spread(found, fold))
+    end = search.without(point, k, FOLD)
+    rollouts = None if end is None else search.solved(end.x, Subset(None, [k]))
+    if end is None or rollouts is None:
+        return _Fold(None, FAILED, np.zeros(0))
+    values, bodies = rollouts[0].values, (len(rollouts[0].values), -1, 6)
+    off = values.reshape(bodies)[1:, :, :3]
+    slopes = rollouts[0].derivatives[end.free].reshape(int(end.free.sum()), *bodies)[:, 1:, :, :3]
+    covariance = end.covariance()[np.ix_(end.free, end.free)]
+    spread = np.sqrt(np.einsum("i...,ij,j...->...", slopes, covariance, slopes))
+    known = np.isfinite(off)
+    return _Fold(end, _errors(rollouts[0]), np.abs(off[known]) / np.maximum(spread[known], 1e-9))
 
 
-def _in_parts(
-    misfit: Misfit, without: Sequence[_Fold], folds: Sequence[_Fold]
-) -> dict[float, list[PositionErrors]]:
-    """Return the held-out errors of parts of the way from the robots without to those with a residual."""
-    found: dict[float, list[PositionErrors]] = {1.0: [each.errors for each in folds]}
-    for part in SHRUNK:
-        found[part] = []
-        for k, (one, other) in enumerate(zip(without, folds, strict=True)):
-            if one.point is None or other.point is None:
-                found[part].append(PositionErrors(np.inf, np.inf))
-                continue
-            x = one.point.x + part * (other.point.x - one.point.x)
-            (rollout,) = misfit.differences(x, which=[k])
-            found[part].append(PositionErrors(np.inf, np.inf) if rollout is None else _errors(rollout))
-    return found
-
-
-def _errors(found: Rollout) -> PositionErrors:
-    square = np.sum(found.values.reshape(len(found.values), -1, 6)[..., :3] ** 2, axis=-1)
+def _errors(rollout: Rollout) -> PositionErrors:
+    square = np.sum(rollout.values.reshape(len(rollout.values), -1, 6)[..., :3] ** 2, axis=-1)
     return PositionErrors(float(np.sqrt(np.nanmean(square[:, -1]))), float(np.sqrt(np.nanmean(square))))
 
 
-def _over_spread(found: Rollout, fold: Point) -> Float[np.ndarray, " m"]:
-    bodies = (*found.values.shape[:1], -1, 6)
-    values = found.values.reshape(bodies)[1:, :, :3]
-    slopes = found.derivatives[fold.free].reshape(int(fold.free.sum()), *bodies)[:, 1:, :, :3]
-    covariance = fold.covariance()[np.ix_(fold.free, fold.free)]
-    spread = np.sqrt(np.einsum("i...,ij,j...->...", slopes, covariance, slopes))
-    known = np.isfinite(values)
-    return np.abs(values[known]) / np.maximum(spread[known], 1e-9)
+def _shrunk_errors(
+    search: Search, without: Sequence[_Fold], folds: Sequence[_Fold]
+) -> dict[float, list[PositionErrors]]:
+    """Return the held-out errors with fractions of the residual."""
+    errors = {1.0: [fold.errors for fold in folds]}
+    for fraction in SHRUNK:
+        errors[fraction] = []
+        for k, (one, other) in enumerate(zip(without, folds, strict=True)):
+            rollouts = None
+            if one.point is not None and other.point is not None:
+                x = one.point.x + fraction * (other.point.x - one.point.x)
+                rollouts = search.solved(x, Subset(None, [k]))
+            errors[fraction].append(FAILED if rollouts is None else _errors(rollouts[0]))
+    return errors
 
 
 def _verdict(
     without: Sequence[PositionErrors], tested: dict[float, list[PositionErrors]]
 ) -> tuple[float, str]:
-    """Return the part of the residual that is kept, 0 for none, and why, in words.
+    """Return the fraction of the residual that is kept, 0 for none, and the reason in words.
 
     It must raise no held-out error, of tip or bodies, and lower them by more than two standard errors of
     their mean change, as an effect must.
@@ -275,21 +297,21 @@ def _verdict(
         ratios = np.array(errors) / np.array(without)
         if not np.all(np.isfinite(ratios)):
             continue
-        told = ", ".join(f"{100.0 * (ratio - 1.0):+.1f} %" for ratio in ratios[:, 0])
+        text = ", ".join(f"{100.0 * (ratio - 1.0):+.1f} %" for ratio in ratios[:, 0])
         changes = np.log(ratios).mean(axis=1)
         doubt = np.std(changes, ddof=1) / np.sqrt(len(changes)) if len(changes) > 1 else np.inf
         enough = np.mean(changes) < -max(LOWERS, ERRORS * doubt) and np.max(ratios) <= 1.0 + RAISES
         if not best and (part == 1.0 or enough):
-            words = f"{'kept' if enough else 'not kept'}: held-out errors of the tip change by {told}"
+            words = f"{'kept' if enough else 'not kept'}: held-out errors of the tip change by {text}"
         if enough and np.mean(changes) < gain:
             best, gain = part, float(np.mean(changes))
-            words = f"kept by a part of {part:g}: held-out errors of the tip change by {told}"
+            words = f"kept by a part of {part:g}: held-out errors of the tip change by {text}"
     return best, words
 
 
 def _widened(point: Point, folds: Sequence[_Fold]) -> Float[np.ndarray, "n n"]:
     """Return the covariance of the free coordinates, as wide as held-out positions are spread."""
-    over = np.concatenate([each.over for each in folds])
+    over = np.concatenate([fold.over for fold in folds])
     ratio = np.quantile(over, LEVEL) / NORMAL if len(over) else 1.0
     fixed = ~point.free
     covariance = point.covariance()

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._reprs import robot_text, wrapped
-from knode_cosserat.identification.model import Model
+from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.search import Point
 from knode_cosserat.rods.system import System
 
@@ -135,8 +135,8 @@ class Identified:
             )
         errors: list[tuple[str, ...]] = [("tip error (mm)", "nominal", "identified", "held out")]
         for name in self.error:
-            found = (self.nominal_error.get(name), self.error[name], self.held_out_error.get(name))
-            errors.append((name, *("-" if error is None else f"{1e3 * error:.3g}" for error in found)))
+            row = (self.nominal_error.get(name), self.error[name], self.held_out_error.get(name))
+            errors.append((name, *("-" if error is None else f"{1e3 * error:.3g}" for error in row)))
         lines += ["", *_table(errors)] if self.error else []
         lines += [f"- {step}" for step in self.steps]
         return "\n".join(lines)
@@ -175,22 +175,21 @@ def estimates_of(
     amount = float(np.sum(point.problem.amount)) - float(np.sum(point.free))
     reach = float(stdtrit(max(amount, 1.0), 0.5 + LEVEL / 2.0))
     low, high = model.bounds
-    found = []
+    estimates = []
     for name in names:
         for k in range(*model.slice(name).indices(model.size)):
             number = model.numbers[k]
             ends = np.clip([x[k] - reach * spread[k], x[k] + reach * spread[k]], low[k], high[k])
-            value, first, last = (float(number.value(np.asarray(at))) for at in (x[k], *ends))
-            value = float(np.clip(value, number.low, number.high))
+            first, last = map(number.value, ends)
+            value = float(np.clip(number.value(x[k]), number.low, number.high))
             held = bool(not number.flat and spread[k] > HELD and abs(x[k]) < 1.0)
-            slope = number.width * (value if number.logarithmic else 1.0)
-            found.append(
+            error = float(abs(number.slope(value)) * spread[k])
+            estimates.append(
                 Estimate(
-                    name, number.label, number.unit, number.nominal, value, (first, last), held,
-                    float(abs(slope) * spread[k]),
+                    name, number.label, number.unit, number.nominal, value, (first, last), held, error
                 )
             )  # fmt: skip
-    return found
+    return estimates
 
 
 def correlation_of(model: Model, names: Sequence[str], point: Point) -> Float[np.ndarray, "n n"]:

@@ -12,13 +12,15 @@ import logging
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from knode_cosserat._files.writing import package_version
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.experiments import Experiment
-from knode_cosserat.identification.journal import Journal, hashed, identity
 from knode_cosserat.identification.misfit import Misfit, Rollout
+from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, hashed
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +52,12 @@ PASS, PASSES, SETTLED = 5, 8, 0.05
 METHOD: Literal["trf"] = "trf"
 
 
+class SearchError(KnodeCosseratError, RuntimeError):
+    """A search cannot go on; one line says why."""
+
+    code = "search"
+
+
 class Problem(NamedTuple):
     """Normal equations at a point: robust cost, gradient and Gauss-Newton matrix of each recording."""
 
@@ -60,6 +68,16 @@ class Problem(NamedTuple):
     matrix: Float[np.ndarray, "R n n"]
 
 
+class Subset(NamedTuple):
+    """Part of the data: rows after the first in motion, and numbers of experiments; None: all."""
+
+    rows: int | None = None
+    which: Sequence[int] | None = None
+
+
+ALL = Subset()
+
+
 @dataclasses.dataclass(frozen=True)
 class Point:
     """End of a search: coordinates, scales of the differences, and the normal equations there."""
@@ -67,7 +85,7 @@ class Point:
     x: Float[np.ndarray, " n"]
     #: by experiment and field; of poses in m
     scale: Float[np.ndarray, "R G"]
-    #: rows of each part that is left out together, and of the blocks of each part (equally many), in order
+    #: of the rows that are left out together, and of their blocks (equally many in each part), in order
     problem: Problem
     blocks: Problem
     free: Bool[np.ndarray, " n"]
@@ -75,23 +93,15 @@ class Point:
     prior: Float[np.ndarray, " n"]
     converged: bool = True
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """Return its arrays by name, for a file."""
-        names = ("x", "scale", "free", "prior", "converged")
-        found = {name: np.asarray(getattr(self, name)) for name in names}
-        for name in ("problem", "blocks"):
-            found |= {f"{name}.{part}": array for part, array in getattr(self, name)._asdict().items()}
-        return found
+    def facts(self) -> dict[str, Any]:
+        """Return its attributes, for a file."""
+        return {**vars(self), "problem": self.problem._asdict(), "blocks": self.blocks._asdict()}
 
     @classmethod
-    def of(cls, arrays: dict[str, np.ndarray]) -> Self:
-        """Return the point of these arrays: the inverse of `arrays`."""
-        problem, blocks = (
-            Problem(**{part: arrays[f"{name}.{part}"] for part in Problem._fields})
-            for name in ("problem", "blocks")
-        )
-        converged = bool(arrays["converged"])
-        return cls(arrays["x"], arrays["scale"], problem, blocks, arrays["free"], arrays["prior"], converged)
+    def of(cls, facts: dict[str, Any]) -> Self:
+        """Return the point with these attributes: the inverse of `facts`."""
+        problems = {name: Problem(**facts[name]) for name in ("problem", "blocks")}
+        return cls(**{**facts, **problems})
 
     @property
     def cost(self) -> float:
@@ -144,21 +154,32 @@ class Search:
         misfit: the recordings and the model.
         tell: called with a line of progress.
         prior: precision of each coordinate's prior, about zero; by default 1.
-        journal: where the ends of finished searches are kept, and looked up.
+        journal: keeps the ends of finished searches, so that an interrupted identification resumes.
     """
 
     def __init__(
         self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
-        prior: Float[np.ndarray, " n"] | None = None, journal: Journal | None = None,
+        prior: Float[np.ndarray, " n"] | None = None, journal: Checkpoints | None = None,
     ):  # fmt: skip
         self.misfit, self.tell, self.journal = misfit, tell, journal
         self.prior = np.asarray(misfit.model.prior if prior is None else prior)
         #: True if no number has a prior: the equations are taken to be exact, and noise to be white
         self.exact = not np.any(self.prior)
-        self._identity = "" if journal is None else identity(misfit, self.prior)
+        self._identity = "" if journal is None else self._hash()
         self.length = float(np.asarray(misfit.model.nominal.length))
         self.low, self.high = misfit.model.bounds
         self.least = [self._least_scale(data) for data in misfit.data]
+
+    def _hash(self) -> str:
+        """Return a hash of everything that a search depends on: model, recordings, settings, this package."""
+        model = self.misfit.model
+        words = [package_version(), repr(model.numbers), repr(model.names)]
+        arrays = [self.prior, *jax.tree.leaves(model.robot)]
+        for it in self.misfit.data:
+            words.append(f"{it.name} {it.dt!r} {it.moves} {it.static} {it.continuous} {it.steps}")
+            words += [repr(it.settings), repr(it.output)]
+            arrays += [np.zeros(0) if it.held is None else it.held, it.control, it.data]
+        return hashed(*words, *arrays)
 
     def _least_scale(self, data: Experiment) -> np.ndarray:
         """Return the smallest scale (G,) of the differences of an experiment."""
@@ -174,7 +195,7 @@ class Search:
 
     @property
     def folds(self) -> list[slice]:
-        """Rows that are left out together: of a recording that is alone, one piece after the other."""
+        """Rows that are left out together: a whole recording, or one piece of a single recording."""
         first = self.misfit.data[0]
         if len(self.misfit.data) > 1:
             return [slice(None)]
@@ -184,14 +205,14 @@ class Search:
         return [slice(low, high) for low, high in itertools.pairwise(edges)]
 
     def blocks(self, count: int) -> list[Int[np.ndarray, " m"]]:
-        """Return which of so many rows are in the blocks of each fold, one fold after the other."""
+        """Return the indices of rows in the blocks of each fold, one fold after the other."""
         first = self.misfit.data[0]
         rows = [np.arange(count)[fold] for fold in self.folds]
         pieces = FOLDS if first.static else max(2, round(min(map(len, rows)) * first.dt / BLOCK))
-        return [block for each in rows for block in np.array_split(each, pieces)]
+        return [block for fold in rows for block in np.array_split(fold, pieces)]
 
     def thinned(self) -> float:
-        """Return how many differences count as one: they are correlated in time, and between bodies."""
+        """Return the number of differences that count as one, for correlation in time and between bodies."""
         data = self.misfit.data[0]
         if self.exact:
             return 1.0
@@ -214,76 +235,86 @@ class Search:
         rows = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
         for horizon in [*dict.fromkeys(rows)][skipped:]:
             if horizon < 0.8 * longest:
-                x = self.run(x, free, horizon, *(FIRST if self.exact else ROUGH)).x
-        return self.run(x, free, None, *(EXACT if self.exact else FINE))
+                x = self.run(x, free, Subset(horizon), FIRST if self.exact else ROUGH).x
+        return self.run(x, free, effort=EXACT if self.exact else FINE)
 
     def run(
-        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None = None,
-        most: int = FINE[0], fall: float = FINE[1], which: Sequence[int] | None = None,
-        scale: Float[np.ndarray, "R G"] | None = None,
+        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset = ALL,
+        effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None,
     ) -> Point:  # fmt: skip
-        """Return the end of a search (Levenberg-Marquardt) from a point, by some recordings and rows.
+        """Return the end of a search (Levenberg-Marquardt) from a point.
+
+        Args:
+            x: the point.
+            free: coordinates that are searched.
+            subset: recordings and rows.
+            effort: most evaluations, and the relative fall of the cost at which the search ends.
+            scale: fixed scales of the differences; None: they follow the differences.
 
         Raises:
             SearchError: the robot at that point cannot be simulated.
         """
         if self.journal is None:
-            return self._searched(x, free, rows, most, fall, which, scale)
-        given = repr((rows, most, fall, None if which is None else tuple(which), scale is None))
-        key = hashed(self._identity, given, x, free, np.zeros(0) if scale is None else scale)
-        kept = self.journal.load(key)
+            return self._searched(x, free, subset, effort, scale)
+        options = repr((subset.rows, subset.which and tuple(subset.which), effort, scale is None))
+        key = hashed(self._identity, options, x, free, np.zeros(0) if scale is None else scale)
+        try:
+            kept = self.journal.load(key)
+        except CheckpointError:  # a damaged file counts as missing
+            kept = None
         if kept is None:
             try:
-                kept = self._searched(x, free, rows, most, fall, which, scale).arrays()
+                kept = self._searched(x, free, subset, effort, scale).facts()
             except SearchError as error:
-                kept = {"failed": np.array(str(error))}
+                kept = {"failed": str(error)}
             self.journal.save(key, kept)
         if "failed" in kept:
-            raise SearchError(str(kept["failed"]))
+            raise SearchError(kept["failed"])
         return Point.of(kept)
 
-    def without(self, point: Point, k: int, most: int, fall: float) -> Point | None:
+    def without(self, point: Point, k: int, effort: tuple[int, float]) -> Point | None:
         """Return the end of a search from a point without recording k; None if it fails.
 
-        A recording that is alone is kept.
+        A single recording is not left out.
         """
         others = [j for j in range(len(self.misfit.data)) if j != k] or [k]
         try:
-            return self.run(point.x, point.free, None, most, fall, others, point.scale[others])
+            return self.run(point.x, point.free, Subset(None, others), effort, point.scale[others])
         except SearchError:
             return None
 
     def _searched(
-        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], rows: int | None, most: int,
-        fall: float, which: Sequence[int] | None, scale: Float[np.ndarray, "R G"] | None,
+        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset,
+        effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None,
     ) -> Point:  # fmt: skip
-        now = self._solved(x, rows, which)
-        if now is None:
+        (most, fall), which = effort, subset.which
+        rollouts = self.solved(x, subset)
+        if rollouts is None:
             raise SearchError("the robot that the search begins from cannot be simulated")
-        remaining, converged, sizes = most, False, scale
+        remaining, converged = most, False
         for _ in range(PASSES if most else 0):
-            sizes = self.scales_of(now, which) if scale is None else scale
+            sizes = self.scales_of(rollouts, which) if scale is None else scale
             budget = remaining if scale is not None else min(PASS if not self.exact else most, remaining)
-            descent = _Descent(self, x, free, rows, which, sizes, now)
+            descent = _Descent(self, subset, x, free, rollouts, sizes)
             used, converged = descent.run(budget, fall)
-            x, now, remaining = descent.x, descent.rollouts, remaining - used
-            after = self.scales_of(now, which)
+            x, rollouts, remaining = descent.x, descent.rollouts, remaining - used
+            after = self.scales_of(rollouts, which)
+            horizon = "all rows" if subset.rows is None else f"{subset.rows} rows"
             text = ", ".join(f"{1e3 * size:.2f}" for size in after[:, 0])
-            told = "all rows" if rows is None else f"{rows} rows"
-            self.tell(f"{told}, {most - remaining} evaluations: {text} mm")
+            self.tell(f"{horizon}, {most - remaining} evaluations: {text} mm")
             settled = np.all(np.abs(after - sizes) <= SETTLED * sizes)
             if scale is not None or (converged and settled) or remaining <= 0:
                 break
-        sizes = self.scales_of(now, which) if scale is None else scale
+        sizes = self.scales_of(rollouts, which) if scale is None else scale
         units = self.units(sizes, which)
-        self.misfit.differentiated(now)
+        self.misfit.differentiated(rollouts)
         if self.exact:
-            problem = normal_equations(now, units, self.thinned())
+            problem = normal_equations(rollouts, units, self.thinned())
             return Point(x, sizes, problem, problem, free, self.prior, converged)
         # a short horizon has fewer rows of a recording that rests for less time
-        rows_of_all = min(len(rollout.values) for rollout in now)
-        blocks = normal_equations(now, units, self.thinned(), self.blocks(rows_of_all))
-        parts = len(now) * len(self.folds)
+        count = min(len(rollout.values) for rollout in rollouts)
+        blocks = normal_equations(rollouts, units, self.thinned(), self.blocks(count))
+        parts = len(rollouts) * len(self.folds)
         problem = Problem(*(part.reshape(parts, -1, *part.shape[1:]).sum(axis=1) for part in blocks))
         return Point(x, sizes, problem, blocks, free, self.prior, converged)
 
@@ -293,8 +324,8 @@ class Search:
         Each experiment is weighted by its residual, so one that cannot be explained does not spoil others.
         """
         chosen = range(len(self.misfit.data)) if which is None else which
-        found = np.ones((len(rollouts), max(len(self.least[k]) for k in chosen)))
-        for row, rollout, k in zip(found, rollouts, chosen, strict=True):
+        scales = np.ones((len(rollouts), max(len(self.least[k]) for k in chosen)))
+        for row, rollout, k in zip(scales, rollouts, chosen, strict=True):
             for field, least in enumerate(self.least[k]):
                 values = rollout.values[:, self.misfit.data[k].groups == field]
                 sizes = np.abs(values[np.isfinite(values)])
@@ -304,55 +335,58 @@ class Search:
                 row[field] = max(usual, least)
         if self.exact and len({self.misfit.data[k].fields for k in chosen}) == 1:
             # white noise of one sensor; separate weights would drift where the model is wrong
-            found[:] = np.sqrt(np.mean(found**2, axis=0))
-        return found
+            scales[:] = np.sqrt(np.mean(scales**2, axis=0))
+        return scales
 
     def units(self, scale: np.ndarray, which: Sequence[int] | None = None) -> list[np.ndarray]:
         """Return the unit (e,) of every number of a difference."""
         chosen = range(len(self.misfit.data)) if which is None else which
         return [sizes[self.misfit.data[k].groups] for sizes, k in zip(scale, chosen, strict=True)]
 
-    def _solved(self, x: np.ndarray, rows: int | None, which: Sequence[int] | None) -> list[Rollout] | None:
-        found = self.misfit.differences(x, rows, which)
-        return None if any(rollout is None for rollout in found) else found  # type: ignore[return-value]
+    def solved(self, x: np.ndarray, subset: Subset = ALL) -> list[Rollout] | None:
+        """Return the rollouts at a point; None if one failed."""
+        rollouts = self.misfit.differences(x, *subset)
+        return None if any(it is None for it in rollouts) else rollouts  # type: ignore[return-value]
 
 
+@dataclasses.dataclass
 class _Descent:
     """One run of least squares with fixed sizes of the differences, from a point whose rollouts are known."""
 
-    def __init__(
-        self, search: Search, x: np.ndarray, free: np.ndarray, rows: int | None, which: Any,
-        sizes: np.ndarray, rollouts: list[Rollout],
-    ):  # fmt: skip
-        self.search, self.free, self.rows, self.which = search, free, rows, which
-        self.begin, self.x, self.rollouts = x, x, rollouts
-        self.units, self.thinned = search.units(sizes, which), np.sqrt(search.thinned())
-        self.known = [np.isfinite(rollout.values) for rollout in rollouts]
-        self.last: tuple[bytes, list[Rollout] | None] = (x[free].tobytes(), rollouts)
-        self.best = np.inf
+    search: Search
+    subset: Subset
+    x: Float[np.ndarray, " n"]
+    free: Bool[np.ndarray, " n"]
+    rollouts: list[Rollout]
+    sizes: Float[np.ndarray, "R G"]
+
+    def __post_init__(self) -> None:
+        search, free = self.search, self.free
+        self.begin, self.low, self.high = self.x, search.low[free], search.high[free]
+        self.units, self.thinned = search.units(self.sizes, self.subset.which), np.sqrt(search.thinned())
+        self.known = [np.isfinite(rollout.values) for rollout in self.rollouts]
+        self.last: tuple[bytes, list[Rollout] | None] = (self.x[free].tobytes(), self.rollouts)
+        self.prior = np.sqrt(search.prior[free])
 
     def run(self, most: int, fall: float) -> tuple[int, bool]:
         """Minimise; return the number of evaluations and a flag of convergence."""
         from scipy.optimize import least_squares  # imported here: it takes a third of a second
 
-        search, free = self.search, self.free
-        begin = self.x[free]
-        low, high = search.low[free], search.high[free]
-        self.unit = 1.0 / np.sqrt(len(begin))
+        begin, exact = self.x[self.free], self.search.exact
+        unit = 1.0 / np.sqrt(len(begin))
         self.origin, self.reach = begin, np.ones(len(begin))
-        if search.exact:
+        if exact:
             self.reach = self._reach(begin)
         # numbers of length one: the first step is at most that long, and tolerances are relative to it
-        self.origin = begin - self.reach * self.unit
-        low, high = ((end - self.origin) / self.reach for end in (low, high))
+        self.origin = begin - self.reach * unit
+        low, high = ((end - self.origin) / self.reach for end in (self.low, self.high))
         ended = least_squares(
-            self.values, np.clip(self.unit, low, high), self.slopes, (low, high), method=METHOD,
-            ftol=fall, xtol=1e-9 if search.exact else 1e-4, gtol=1e-15, max_nfev=most,
+            self.values, np.clip(unit, low, high), self.slopes, (low, high), method=METHOD,
+            ftol=fall, xtol=1e-9 if exact else 1e-4, gtol=1e-15, max_nfev=most,
         )  # fmt: skip
-        self._at(ended.x)
-        self.x = self._whole(ended.x)
-        assert self.last[1] is not None
-        self.rollouts = self.last[1]
+        solved = self._at(ended.x)
+        assert solved is not None
+        self.x, self.rollouts = self._whole(ended.x), solved
         return int(ended.nfev), bool(ended.status > 0)
 
     def _reach(self, begin: np.ndarray) -> np.ndarray:
@@ -367,54 +401,39 @@ class _Descent:
 
     def _whole(self, step: np.ndarray) -> np.ndarray:
         x = self.begin.copy()
-        moved = self.origin + self.reach * step
-        x[self.free] = np.clip(moved, self.search.low[self.free], self.search.high[self.free])
+        x[self.free] = np.clip(self.origin + self.reach * step, self.low, self.high)
         return x
 
     def _at(self, step: np.ndarray) -> list[Rollout] | None:
         x = self._whole(step)
         key = x[self.free].tobytes()
         if self.last[0] != key:
-            self.last = key, self.search._solved(x, self.rows, self.which)
+            self.last = key, self.search.solved(x, self.subset)
         return self.last[1]
-
-    def _priors(self) -> np.ndarray:
-        return np.sqrt(self.search.prior[self.free])
 
     def values(self, step: np.ndarray) -> np.ndarray:
         """Return square roots of Huber's costs, with signs, and the priors; infinite without a solution."""
-        found, prior = self._at(step), self._priors()
-        count = sum(int(known.sum()) for known in self.known) + len(prior)
-        if found is None:
-            return np.full(count, np.inf)
-        scaled = self._scaled(found)
+        rollouts = self._at(step)
+        if rollouts is None:
+            return np.full(sum(int(known.sum()) for known in self.known) + len(self.prior), np.inf)
+        scaled = self._scaled(rollouts)
         roots = np.sign(scaled) * np.sqrt(huber(scaled)[0]) / self.thinned
-        return np.concatenate([roots, prior * self._whole(step)[self.free]])
+        return np.concatenate([roots, self.prior * self._whole(step)[self.free]])
 
     def slopes(self, step: np.ndarray) -> np.ndarray:
         """Return the derivatives of the values."""
-        found, prior = self._at(step), self._priors()
-        assert found is not None
-        self.search.misfit.differentiated(found)
-        scaled = self._scaled(found)
+        rollouts = self._at(step)
+        assert rollouts is not None
+        self.search.misfit.differentiated(rollouts)
+        scaled = self._scaled(rollouts)
         size = np.abs(scaled)
         # of the square root of the cost
         factor = np.where(size <= ROBUST, 1.0, ROBUST / np.sqrt(np.maximum(huber(scaled)[0], 1.0)))
-        rows = np.concatenate(
-            [
-                (rollout.derivatives[self.free] / unit)[:, known].T
-                for rollout, unit, known in zip(found, self.units, self.known, strict=True)
-            ]
-        )
-        rows = rows * (factor / self.thinned)[:, None]
-        return np.concatenate([rows, np.diag(prior)]) * self.reach
+        parts = zip(rollouts, self.units, self.known, strict=True)
+        rows = [(rollout.derivatives[self.free] / unit)[:, known].T for rollout, unit, known in parts]
+        scaled_rows = np.concatenate(rows) * (factor / self.thinned)[:, None]
+        return np.concatenate([scaled_rows, np.diag(self.prior)]) * self.reach
 
     def _scaled(self, rollouts: list[Rollout]) -> np.ndarray:
         parts = zip(rollouts, self.units, self.known, strict=True)
         return np.concatenate([(rollout.values / unit)[known] for rollout, unit, known in parts])
-
-
-class SearchError(KnodeCosseratError, RuntimeError):
-    """A search cannot go on; one line says why."""
-
-    code = "search"

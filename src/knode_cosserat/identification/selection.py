@@ -8,8 +8,15 @@ from typing import NamedTuple, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat.identification.model import Model
-from knode_cosserat.identification.search import Point, Problem, Search, SearchError, normal_equations
+from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.identification.search import (
+    Point,
+    Problem,
+    Search,
+    SearchError,
+    Subset,
+    normal_equations,
+)
 
 #: least reduction of the held-out cost by an effect, for each of its parameters
 WORTH = 4.0
@@ -27,16 +34,19 @@ FOLD = (4, 1e-2)
 TRIED = (12, 5e-3)
 
 
-class Chosen(NamedTuple):
-    """Selected effects, the end of their search, and the steps of the selection, in words."""
+class Selection(NamedTuple):
+    """Selected effects, the end of their search (None: nominal), and the steps of the selection, in words."""
 
     names: tuple[str, ...]
-    point: Point
-    steps: tuple[str, ...]
+    point: Point | None
+    steps: tuple[str, ...] = ()
 
 
 def held_out(
-    problem: Problem, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], model: Model
+    problem: Problem,
+    x: Float[np.ndarray, " n"],
+    free: Bool[np.ndarray, " n"],
+    bounds: Float[np.ndarray, "2 n"],
 ) -> float:
     """Return the cost of recordings that were each left out of a search, linearised about a point.
 
@@ -44,73 +54,33 @@ def held_out(
     that are not free are nominal. A single recording is divided into pieces, which are left out in turn.
     """
     total = 0.0
-    for k, move in enumerate(_moves(problem, x, free, model)):
-        left = problem.cost[k] + 2.0 * problem.gradient[k] @ move + move @ problem.matrix[k] @ move
-        total += problem.amount[k] * np.log(max(left, LEAST_LEFT * problem.cost[k]) / problem.amount[k])
+    for k, move in enumerate(_moves(problem, x, free, bounds)):
+        cost = problem.cost[k] + 2.0 * problem.gradient[k] @ move + move @ problem.matrix[k] @ move
+        total += problem.amount[k] * np.log(max(cost, LEAST_LEFT * problem.cost[k]) / problem.amount[k])
     return float(total)
 
 
 def _moves(
-    problem: Problem, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], model: Model
+    problem: Problem,
+    x: Float[np.ndarray, " n"],
+    free: Bool[np.ndarray, " n"],
+    bounds: Float[np.ndarray, "2 n"],
 ) -> list[Float[np.ndarray, " n"]]:
     """Return the moves of searches that leave out one part each, linearised about a point."""
-    low, high = model.bounds
     count = len(problem.cost)
-    found = []
+    moves = []
     for k in range(count):
         others = [j for j in range(count) if j != k] or [k]
         gradient, matrix = problem.gradient[others].sum(axis=0), problem.matrix[others].sum(axis=0)
-        found.append(_linear(x, free, gradient, matrix, low, high))
-    return found
-
-
-class Left(NamedTuple):
-    """Robust costs (m²) of the blocks of parts that were each left out of a search."""
-
-    cost: Float[np.ndarray, "parts blocks"]
-    #: independent differences of each part
-    amount: Float[np.ndarray, " parts"]
-
-    @classmethod
-    def of(cls, point: Point, names: Iterable[str], model: Model) -> Self:
-        """Return the remaining differences with the named effects, linearised about the end of a search."""
-        free, blocks, count = model.mask(names), point.blocks, len(point.problem.cost)
-        each = [part.reshape(count, -1, *part.shape[1:]) for part in blocks]
-        scale = np.repeat(point.scale[:, 0], count // len(point.scale)) ** 2
-        costs = []
-        for k, move in enumerate(_moves(point.problem, point.x, free, model)):
-            now, gradient, matrix = each[0][k], each[2][k], each[3][k]
-            left = now + 2.0 * gradient @ move + np.einsum("i,bij,j->b", move, matrix, move)
-            # linearised equations may predict more than the whole cost
-            costs.append(scale[k] * np.maximum(left, LEAST_LEFT * now.sum() / len(now)))
-        return cls(np.array(costs), point.problem.amount)
-
-    def worth(self, more: Left) -> tuple[float, float]:
-        """Return the reduction of the held-out cost by more effects, and its standard error.
-
-        The cost is -2 times the logarithm of the likelihood of differences of unknown size, by part. The
-        error comes from the scatter of the blocks' shares, because model errors are not random.
-        """
-        without, with_them = self.cost.sum(axis=1), more.cost.sum(axis=1)
-        fall = np.log(without / with_them)
-        even = np.abs(fall) < 1e-9
-        mean = np.where(even, without, (without - with_them) / np.where(even, 1.0, fall))
-        shares = self.amount[:, None] * (self.cost - more.cost) / mean[:, None]
-        scatter = np.sum((shares - shares.mean(axis=1, keepdims=True)) ** 2)
-        return float(shares.sum()), float(np.sqrt(scatter))
-
-    def promise(self, more: Left, count: int) -> float:
-        """Return the expected reduction of the cost by more parameters, over the least reduction."""
-        worth, error = self.worth(more)
-        return worth / max(WORTH * count, ERRORS * error)
+        moves.append(_linear(x, free, gradient, matrix, bounds))
+    return moves
 
 
 def _linear(
-    x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, low: np.ndarray,
-    high: np.ndarray,
-) -> np.ndarray:  # fmt: skip
+    x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, bounds: np.ndarray
+) -> np.ndarray:
     """Return the move to the least cost, with the prior, of the free numbers within their bounds."""
-    fixed = np.where(free, 0.0, -x)
+    fixed, (low, high) = np.where(free, 0.0, -x), bounds
     active = free.copy()
     for _ in range(len(x)):
         where = np.ix_(active, active)
@@ -125,33 +95,83 @@ def _linear(
     return fixed
 
 
+class HeldOutCosts(NamedTuple):
+    """Robust costs (m²) of the blocks of parts that were each left out of a search."""
+
+    cost: Float[np.ndarray, "parts blocks"]
+    #: independent differences of each part
+    amount: Float[np.ndarray, " parts"]
+
+    @classmethod
+    def of(cls, point: Point, names: Iterable[str], model: Model) -> Self:
+        """Return the costs with the named effects, linearised about the end of a search."""
+        count = len(point.problem.cost)
+        cost, _, gradient, matrix = (part.reshape(count, -1, *part.shape[1:]) for part in point.blocks)
+        scale = np.repeat(point.scale[:, 0], count // len(point.scale)) ** 2
+        costs = []
+        for k, move in enumerate(_moves(point.problem, point.x, model.mask(names), model.bounds)):
+            blocks = cost[k] + 2.0 * gradient[k] @ move + np.einsum("i,bij,j->b", move, matrix[k], move)
+            # linearised equations may predict more than the whole cost
+            costs.append(scale[k] * np.maximum(blocks, LEAST_LEFT * cost[k].sum() / len(cost[k])))
+        return cls(np.array(costs), point.problem.amount)
+
+    def worth(self, more: HeldOutCosts) -> tuple[float, float]:
+        """Return the reduction of the held-out cost by more effects, and its standard error.
+
+        The cost is -2 times the logarithm of the likelihood of differences of unknown size, by part. The
+        error comes from the scatter of the blocks' shares, because model errors are not random.
+        """
+        without, with_them = self.cost.sum(axis=1), more.cost.sum(axis=1)
+        fall = np.log(without / with_them)
+        even = np.abs(fall) < 1e-9
+        mean = np.where(even, without, (without - with_them) / np.where(even, 1.0, fall))
+        shares = self.amount[:, None] * (self.cost - more.cost) / mean[:, None]
+        scatter = np.sum((shares - shares.mean(axis=1, keepdims=True)) ** 2)
+        return float(shares.sum()), float(np.sqrt(scatter))
+
+    def promise(self, more: HeldOutCosts, count: int) -> float:
+        """Return the expected reduction of the cost by more parameters, over the least reduction."""
+        worth, error = self.worth(more)
+        return worth / max(WORTH * count, ERRORS * error)
+
+
 def _with_needs(names: Iterable[str], model: Model) -> tuple[str, ...]:
-    """Return the effects that have all that they need, in the model's order."""
-    found = set(names)
+    """Return the effects whose required effects are present, in the model's order."""
+    present = set(names)
     while True:
-        kept = {name for name in found if set(model.effect(name).needs) <= found}
-        if kept == found:
-            return tuple(name for name in model.names if name in found)
-        found = kept
+        kept = {name for name in present if set(model.effect(name).needs) <= present}
+        if kept == present:
+            return tuple(name for name in model.names if name in kept)
+        present = kept
 
 
-def selected(search: Search, tell: Callable[[str], None]) -> Chosen:
+def selected(search: Search, tell: Callable[[str], None]) -> Selection:
     """Return the selected effects, and the end of their common search.
 
     One search from the nominal robot uses few effects, another uses all. A search with few effects converges
     more reliably; the selection continues from all effects only if few leave a much larger error.
     """
     model = search.misfit.model
-    usual = tuple(effect.name for effect in model.effects if effect.basic or effect.usual)
-    names, point = _better(search, usual, model.names, tell)
-    found = improved(search, names, point, tell)
-    return found._replace(steps=(f"from {len(names)} effects: {sizes(point)}", *found.steps))
+    few = tuple(effect.name for effect in model.effects if effect.basic or effect.usual)
+    ends: dict[tuple[str, ...], Point] = {}
+    for names in (few, model.names):
+        try:
+            ends[names] = search.from_far(model.mask(names))
+        except SearchError as error:
+            tell(f"{len(names)} effects: {error}")
+            continue
+        tell(f"{len(names)} effects: {sizes(ends[names])}")
+    if not ends:
+        raise SearchError("the robot that the search begins from cannot be simulated")
+    names = few if few in ends else model.names
+    if len(ends) == 2 and np.mean(np.log(ends[few].scale / ends[model.names].scale)) > np.log(MUCH_MORE):
+        names = model.names
+    first = f"from {len(names)} effects: {sizes(ends[names])}"
+    return improved(search, Selection(names, ends[names], (first,)), tell)
 
 
-def improved(
-    search: Search, names: tuple[str, ...], point: Point, tell: Callable[[str], None], why: str = ""
-) -> Chosen:
-    """Return better effects than the given ones, and the end of their common search.
+def improved(search: Search, selection: Selection, tell: Callable[[str], None], why: str = "") -> Selection:
+    """Return a selection with better effects.
 
     Effects without a significant improvement are removed one by one, and absent effects with the largest
     expected improvement of held-out recordings are added. The next search decides if a change is kept, and
@@ -159,41 +179,23 @@ def improved(
     be linear about one end only. An added effect stays, and a refused one is not tried again, so that the
     selection ends.
     """
-    steps: list[str] = []
+    names, point, steps = selection.names, selection.point, list(selection.steps)
+    assert point is not None
     added: set[str] = set()
     refused: set[str] = set()
     while True:
-        names, point, gone = without_idle(search, names, point, added)
-        if gone:
-            steps.append(f"without {', '.join(gone)}{why}: {sizes(point)}")
+        names, point, removed = without_idle(search, names, point, added)
+        if removed:
+            steps.append(f"without {', '.join(removed)}{why}: {sizes(point)}")
             tell(steps[-1])
-        found = _with_another(search, names, point, refused)
-        if found is None:
-            return Chosen(names, point, tuple(steps))
-        more = [name for name in found[0] if name not in names]
-        names, point = found
+        extension = _extended(search, names, point, refused)
+        if extension is None:
+            return Selection(names, point, tuple(steps))
+        more = [name for name in extension[0] if name not in names]
+        names, point = extension
         added |= set(more)
         steps.append(f"with {', '.join(more)}{why}: {sizes(point)}")
         tell(steps[-1])
-
-
-def _better(
-    search: Search, few: tuple[str, ...], many: tuple[str, ...], tell: Callable[[str], None]
-) -> tuple[tuple[str, ...], Point]:
-    """Return few effects and the end of their search, or many if few leave a much larger error."""
-    ends: dict[tuple[str, ...], Point] = {}
-    for names in (few, many):
-        try:
-            ends[names] = search.from_far(search.misfit.model.mask(names))
-        except SearchError as error:
-            tell(f"{len(names)} effects: {error}")
-            continue
-        tell(f"{len(names)} effects: {sizes(ends[names])}")
-    if not ends:
-        raise SearchError("the robot that the search begins from cannot be simulated")
-    much_more = len(ends) == 2 and np.mean(np.log(ends[few].scale / ends[many].scale)) > np.log(MUCH_MORE)
-    names = many if much_more or few not in ends else few
-    return names, ends[names]
 
 
 def sizes(point: Point) -> str:
@@ -201,48 +203,52 @@ def sizes(point: Point) -> str:
     return ", ".join(f"{1e3 * size:.1f}" for size in point.scale[:, 0]) + " mm"
 
 
-def _with_another(
+def _extended(
     search: Search, names: tuple[str, ...], point: Point, refused: set[str]
 ) -> tuple[tuple[str, ...], Point] | None:
-    """Return the effects with the most promising one that keeps its promise; None if there is none.
+    """Return the effects with one more, and the end of their search; None if no effect improves enough.
 
-    Effects that do not are added to `refused`.
+    The effect with the largest expected improvement that a search confirms is added; effects whose
+    improvement is not confirmed are added to `refused`.
     """
     model = search.misfit.model
-    left, without = Left.of(point, names, model), None
-    for promise, name, more in _promises(point, names, left, model)[:MOST_TRIES]:
+    costs, without = HeldOutCosts.of(point, names, model), None
+    options = []
+    for name in model.names:
+        if name not in names:
+            more = _with_needs([*names, name, *model.effect(name).needs], model)
+            count = _count(model, set(more) - set(names))
+            options.append((costs.promise(HeldOutCosts.of(point, more, model), count), name, more, count))
+    for promise, name, more, count in sorted(options, reverse=True)[:MOST_TRIES]:
         if promise <= 1.0:
             break
         if name in refused:
             continue
-        there = _searched(search, point, more)
-        count = _count(model, set(more) - set(names))
-        if there is not None and left.promise(Left.of(there, more, model), count) >= 1.0:
-            if len(search.misfit.data) == 1:  # nothing else is left out
-                return more, there
-            without = left_out(search, point) if without is None else without
-            if left_out(search, there) < without - WORTH * count:
-                return more, there
+        end = _searched(search, point, more)
+        if end is not None and costs.promise(HeldOutCosts.of(end, more, model), count) >= 1.0:
+            if len(search.misfit.data) == 1:  # there is no other recording to leave out
+                return more, end
+            without = held_out_cost(search, point) if without is None else without
+            if held_out_cost(search, end) < without - WORTH * count:
+                return more, end
         refused.add(name)
     return None
 
 
-def left_out(search: Search, point: Point) -> float:
+def held_out_cost(search: Search, point: Point) -> float:
     """Return the cost of recordings that were each left out of a search from a point, as `held_out`.
 
     It is infinite if a search fails.
     """
     total = 0.0
     for k in range(len(search.misfit.data)):
-        fold = search.without(point, k, *FOLD)
-        if fold is None:
-            return np.inf
-        (rollout,) = search.misfit.differences(fold.x, which=[k])
-        if rollout is None:
+        fold = search.without(point, k, FOLD)
+        rollouts = None if fold is None else search.solved(fold.x, Subset(None, [k]))
+        if rollouts is None:
             return np.inf
         units = search.units(point.scale[[k]], [k])
-        found = normal_equations([rollout], units, search.thinned(), derivatives=False)
-        cost, amount = float(found.cost[0]), float(found.amount[0])
+        problem = normal_equations(rollouts, units, search.thinned(), derivatives=False)
+        cost, amount = float(problem.cost[0]), float(problem.amount[0])
         # costs are in units of the scale, and each point has its own
         total += amount * np.log(cost * point.scale[k, 0] ** 2 / amount)
     return total
@@ -252,34 +258,20 @@ def _count(model: Model, names: Iterable[str]) -> int:
     return sum(len(model.effect(name).numbers) for name in names)
 
 
-def _promises(
-    point: Point, names: tuple[str, ...], left: Left, model: Model
-) -> list[tuple[float, str, tuple[str, ...]]]:
-    """Return absent effects by expected over required reduction of the cost, the largest first."""
-    found = []
-    for name in model.names:
-        if name in names:
-            continue
-        more = _with_needs([*names, name, *model.effect(name).needs], model)
-        count = _count(model, set(more) - set(names))
-        found.append((left.promise(Left.of(point, more, model), count), name, more))
-    return sorted(found, reverse=True)
-
-
 def _searched(search: Search, point: Point, names: tuple[str, ...]) -> Point | None:
     """Return the end of a search with these effects; None if there is none.
 
-    It begins where the linearised equations have their least cost without the effects that are removed, and
-    with new effects where those begin.
+    It begins at the least cost of the linearised equations without the removed effects; new effects begin at
+    their own initial coordinates.
     """
     model = search.misfit.model
     free = model.mask(names)
     total = point.problem.gradient.sum(axis=0), point.problem.matrix.sum(axis=0)
-    nearest = point.x + _linear(point.x, free & point.free, *total, *model.bounds)
+    nearest = point.x + _linear(point.x, free & point.free, *total, model.bounds)
     for old, begin in ((nearest, model.begin), (point.x, 0.1 * model.begin)):
         x = np.where(free, np.where(point.free, old, begin), 0.0)
         try:
-            return search.run(x, free, None, *TRIED)
+            return search.run(x, free, effort=TRIED)
         except SearchError:
             continue
     return None
@@ -294,19 +286,19 @@ def without_idle(
     it fails, half as many are removed.
     """
     model = search.misfit.model
-    gone: list[str] = []
+    removed: list[str] = []
     stay = set(kept)
     most = len(names)
     while True:
         fewer = _without_least(point, names, stay, model, most)
         dropped = [name for name in names if name not in fewer]
         if not dropped:
-            return names, point, gone
-        there = _searched(search, point, fewer)
-        left, count = Left.of(point, names, model), _count(model, dropped)
-        if there is not None and Left.of(there, fewer, model).promise(left, count) < 1.0:
-            gone += dropped
-            names, point = fewer, there
+            return names, point, removed
+        end = _searched(search, point, fewer)
+        costs, count = HeldOutCosts.of(point, names, model), _count(model, dropped)
+        if end is not None and HeldOutCosts.of(end, fewer, model).promise(costs, count) < 1.0:
+            removed += dropped
+            names, point = fewer, end
         elif most > 1:
             most = max(1, min(most, len(dropped)) // 2)
         else:
@@ -318,15 +310,16 @@ def _without_least(
 ) -> tuple[str, ...]:
     """Return the effects without the weakest ones, at most so many of them."""
     for _ in range(most):
-        left = Left.of(point, names, model)
+        costs = HeldOutCosts.of(point, names, model)
         options = []
         for name in names:
             if name in stay or model.effect(name).basic:
                 continue
-            fewer = _with_needs([each for each in names if each != name], model)
-            count = _count(model, set(names) - set(fewer))
-            if not stay & (set(names) - set(fewer)):
-                options.append((Left.of(point, fewer, model).promise(left, count), name, fewer))
+            fewer = _with_needs([it for it in names if it != name], model)
+            dropped = set(names) - set(fewer)
+            if not stay & dropped:
+                fewer_costs = HeldOutCosts.of(point, fewer, model)
+                options.append((fewer_costs.promise(costs, _count(model, dropped)), name, fewer))
         if not options or min(options)[0] >= 1.0:
             break
         names = min(options)[2]

@@ -61,8 +61,8 @@ def stepped(
         return np.repeat(tension, count, axis=0)
     before = np.concatenate([np.asarray(initial)[None], tension[:-1]])
     parts = (np.arange(count) + 1.0) / count
-    each = before[:, None] + parts[:, None] * (tension - before)[:, None]
-    return np.asarray(each.reshape(-1, tension.shape[1]))
+    steps = before[:, None] + parts[:, None] * (tension - before)[:, None]
+    return np.asarray(steps.reshape(-1, tension.shape[1]))
 
 
 def simulated_rows(
@@ -77,7 +77,7 @@ def simulated_rows(
         tension: from each row to the next.
         dt: time from row to row (s).
         start: equilibrium from which it moves; None: rest.
-        initial: tension before the first row; None: that of the first.
+        initial: tension before the first row; None: the first tension.
         continuous: tensions vary continuously; `Measurements.continuous`.
         space: the scheme along the rod.
         recovery: seconds that recovery from failed steps may take; None: the usual budget.
@@ -88,8 +88,8 @@ def simulated_rows(
     count = steps_per_row(dt, continuous)
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
     acting = undelayed(robot, tension, dt / count, initial)
-    found = simulate(
+    motion = simulate(
         robot, acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
         initial=start, recovery_budget=recovery,
     )  # fmt: skip
-    return found[::count] if count > 1 else found
+    return motion[::count] if count > 1 else motion

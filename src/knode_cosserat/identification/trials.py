@@ -30,23 +30,27 @@ RECOVERY = 2.0
 
 
 def failed_trial(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> str | None:
-    """Return why a robot is not accepted, or None if it passes all trials.
+    """Return the reason why a robot is not accepted; None if it passes all trials.
 
     It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
     tensions within the recordings' range, without a step that cannot be solved.
     """
-    pulls = robot.control_layout.names[0] == "tension"
-    for each in data:
-        for amplitude in AMPLITUDES:
-            tension = each.held + amplitude * (each.control - each.held)
-            # a tendon does not push; a motor turns either way
-            tension = np.maximum(tension, 0.0) if pulls else tension
-            reason = _failure(robot, tension, each, space)
-            if reason:
-                return f"tensions of {each.name} at {amplitude:g} times their amplitude: {reason}"
-    first = data[0]
-    reason = _failure(robot, _random(data), first, space)
-    return f"random tensions: {reason}" if reason else None
+    # a tendon does not push; a motor turns either way
+    low = 0.0 if robot.control_layout.names[0] == "tension" else -np.inf
+    trials = [
+        (f"tensions of {it.name} at {amplitude:g} times their amplitude", it,
+         np.maximum(it.held + amplitude * (it.control - it.held), low))
+        for it in data
+        for amplitude in AMPLITUDES
+    ]  # fmt: skip
+    for words, like, tension in [*trials, ("random tensions", data[0], _random(data))]:
+        try:
+            _, motion = _moved(robot, tension, like, space)
+        except SimulationError as error:
+            return f"{words}: {error}"
+        if not np.all(np.isfinite(np.asarray(motion.y))):
+            return f"{words}: a state is not finite"
+    return None
 
 
 def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> bool:
@@ -54,40 +58,28 @@ def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | Spac
 
     A robot that cannot be simulated is not too coarse: `failed_trial` reports it.
     """
-    for each in data:
+    for it in data:
         try:
-            _, found = _moved(robot, each.control, each, space)
+            _, motion = _moved(robot, it.control, it, space)
         except SimulationError:
             return False
-        if np.mean(np.asarray(found.result) == Result.COARSE) > FEW:
+        if np.mean(np.asarray(motion.result) == Result.COARSE) > FEW:
             return True
     return False
 
 
 def trained_range(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> TrainedRange | None:
     """Return the range of controls, strains and strain rates of the robot in its recordings."""
-    return TrainedRange.of(part for each in data for part in _moved(robot, each.control, each, space))
+    return TrainedRange.of(part for it in data for part in _moved(robot, it.control, it, space))
 
 
 def _random(data: Sequence[Experiment]) -> Float[np.ndarray, "T c"]:
-    low = np.min([each.control.min(axis=0) for each in data], axis=0)
-    high = np.max([each.control.max(axis=0) for each in data], axis=0)
+    low = np.min([it.control.min(axis=0) for it in data], axis=0)
+    high = np.max([it.control.max(axis=0) for it in data], axis=0)
     dt = data[0].dt
     count, hold = max(round(SECONDS / dt), 1), max(round(HELD / dt), 1)
     drawn = np.random.default_rng(0).uniform(low, high, (-(-count // hold), len(low)))
     return np.repeat(drawn, hold, axis=0)[:count]
-
-
-def _failure(
-    robot: System, tension: Float[np.ndarray, "T c"], like: Experiment, space: str | SpaceScheme
-) -> str | None:
-    try:
-        _, found = _moved(robot, tension, like, space)
-    except SimulationError as error:
-        return str(error)
-    if not np.all(np.isfinite(np.asarray(found.y))):
-        return "a state is not finite"
-    return None
 
 
 def _moved(
@@ -101,7 +93,6 @@ def _moved(
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
         if like.static:
             tension = np.concatenate([initial[None], undelayed(robot, tension, dt, initial)])
-            found = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
-            return still, dataclasses.replace(found, time=dt * found.time)
-        moved = simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)
-        return still, moved
+            rows = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
+            return still, dataclasses.replace(rows, time=dt * rows.time)
+        return still, simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)

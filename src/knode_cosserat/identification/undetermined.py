@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from knode_cosserat.identification.effects import Effect
 from knode_cosserat.identification.search import Point, Search
 
 #: a combination of numbers is undetermined if its relative effect is below this
@@ -22,18 +19,11 @@ NEAR = 10.0
 PART = 0.1
 
 
-class Gap(NamedTuple):
-    """Parameters that the data do not determine together, and the reason in words."""
+def gap_of(search: Search, point: Point, at_end: bool) -> tuple[tuple[str, ...], str] | None:
+    """Return parameters with flat priors that the data do not determine, and the reason in words; None: none.
 
-    names: tuple[str, ...]
-    reason: str
-
-
-def gap_of(search: Search, point: Point, at_end: bool) -> Gap | None:
-    """Return parameters with flat priors that the data do not determine, if any.
-
-    At the start only those without an effect, and combinations: there a symmetry that hides a parameter is
-    exact, and noise breaks it later.
+    At the start these are only parameters without an effect, and combinations: there a symmetry that hides a
+    parameter is exact, and noise breaks it later.
     """
     model, free = search.misfit.model, point.free & (search.prior == 0.0)
     if not free.any():
@@ -44,46 +34,42 @@ def gap_of(search: Search, point: Point, at_end: bool) -> Gap | None:
     if np.any(lengths == 0.0):
         idle = tuple(dict.fromkeys(names[lengths == 0.0].tolist()))
         verb = "has" if len(idle) == 1 else "have"
-        return Gap(idle, f"{', '.join(idle)} {verb} no effect on these data")
+        return idle, f"{', '.join(idle)} {verb} no effect on these data"
     scaled = matrix / np.outer(lengths, lengths)
     squares, directions = np.linalg.eigh(scaled)
     if squares[0] < FLAT**2 * squares[-1]:
-        return _together(names, np.abs(directions[:, 0]))
+        return _combination(names, np.abs(directions[:, 0]))
     if not at_end:
         return None
     covariance = np.linalg.inv(scaled) / np.outer(lengths, lengths)
-    errors, largest = np.sqrt(np.diag(covariance)), _largest(model.effects, point.x)[free]
-    beyond = errors / largest
+    errors, largest = np.sqrt(np.diag(covariance)), []
+    for effect in model.effects:
+        # the largest accepted standard error of every coordinate
+        values = [
+            number.value(at)
+            for number, at in zip(effect.numbers, point.x[model.slice(effect.name)], strict=True)
+        ]
+        size = max(abs(it) for it in [*values, *(number.nominal for number in effect.numbers)])
+        size = size or effect.numbers[0].high - effect.numbers[0].low
+        largest += [VAGUE if it.logarithmic else POOR * size / it.width for it in effect.numbers]
+    beyond = errors / np.array(largest)[free]
     k = int(np.argmax(beyond))
     if beyond[k] <= 1.0:
         return None
-    return _together(names, np.abs(covariance[k] / errors / errors[k]) ** 20)
+    return _combination(names, np.abs(covariance[k] / errors / errors[k]) ** 20)
 
 
-def _largest(effects: tuple[Effect, ...], x: np.ndarray) -> np.ndarray:
-    """Return the largest accepted standard error of every coordinate."""
-    found, first = [], 0
-    for effect in effects:
-        numbers = effect.numbers
-        values = [float(number.value(at)) for number, at in zip(numbers, x[first:], strict=False)]
-        size = max(abs(it) for it in [*values, *(number.nominal for number in numbers)])
-        size = size or numbers[0].high - numbers[0].low
-        found += [VAGUE if number.logarithmic else POOR * size / number.width for number in numbers]
-        first += len(numbers)
-    return np.array(found)
-
-
-def _together(names: np.ndarray, parts: np.ndarray) -> Gap:
+def _combination(names: np.ndarray, parts: np.ndarray) -> tuple[tuple[str, ...], str]:
     involved = tuple(dict.fromkeys(names[parts > PART * parts.max()].tolist()))
     if len(involved) == 1:
-        return Gap(involved, f"these data do not determine {involved[0]}")
+        return involved, f"these data do not determine {involved[0]}"
     listed = f"{', '.join(involved[:-1])} and {involved[-1]}"
-    return Gap(involved[-1:], f"these data determine only a combination of {listed}")
+    return involved[-1:], f"these data determine only a combination of {listed}"
 
 
 def unexplained(search: Search, point: Point) -> tuple[str, ...]:
     """Return the fields whose remaining differences are not noise: rows are correlated at large lags."""
-    found: dict[str, None] = {}
+    fields: dict[str, None] = {}
     rollouts = search.misfit.differences(point.x)
     for k, (data, rollout) in enumerate(zip(search.misfit.data, rollouts, strict=True)):
         if rollout is None or data.static:
@@ -101,6 +87,6 @@ def unexplained(search: Search, point: Point) -> tuple[str, ...]:
                 count = max(int(np.sum(known[lag:, data.groups == field])), 1)
                 if np.abs(np.sum(one * other)) > max(ALIKE, 5.0 / np.sqrt(count)) * size:
                     several = len(search.misfit.data) > 1 and data.readings
-                    found[f"{name} in {data.name}" if several else name] = None
+                    fields[f"{name} in {data.name}" if several else name] = None
                     break
-    return tuple(found)
+    return tuple(fields)

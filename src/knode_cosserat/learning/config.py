@@ -6,7 +6,7 @@ import dataclasses
 import difflib
 import reprlib
 from collections.abc import Callable
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 
@@ -19,13 +19,24 @@ class ConfigError(KnodeCosseratError, ValueError):
     code = "fit-config"
 
 
-# accepted values: their description, and a test that returns the value, or None if it is not accepted
+class FitError(KnodeCosseratError, ValueError):
+    """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
 
-_Allowed = tuple[str, Callable[[Any], Any]]
+    code = "fit"
+
+
+class _Allowed(NamedTuple):
+    """Accepted values: in words, and a function that returns the value to keep, or None to refuse it."""
+
+    words: str
+    kept: Callable[[Any], Any]
+    #: classes of options within options
+    parts: tuple[Any, ...] = ()
 
 
 def _whole(low: int, high: int = 10_000_000) -> _Allowed:
-    return f"a whole number from {low} to {high}", lambda x: int(x) if _is_whole(x, low, high) else None
+    words = f"a whole number from {low} to {high}"
+    return _Allowed(words, lambda x: int(x) if _is_whole(x, low, high) else None)
 
 
 def _is_whole(value: Any, low: int, high: float) -> bool:
@@ -34,26 +45,38 @@ def _is_whole(value: Any, low: int, high: float) -> bool:
 
 
 def _number(low: float, high: float, *, above: bool = False) -> _Allowed:
-    def test(value: Any) -> float | None:
+    def kept(value: Any) -> float | None:
         if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             return None
         return float(value) if (low < value if above else low <= value) and value <= high else None
 
-    return f"a number {'above' if above else 'from'} {low:g} up to {high:g}", test
+    return _Allowed(f"a number {'above' if above else 'from'} {low:g} up to {high:g}", kept)
 
 
 def _choice(*names: str) -> _Allowed:
     words = ", ".join(f'"{name}"' for name in names)
-    return words, lambda x: x if isinstance(x, str) and x in names else None
+    return _Allowed(words, lambda x: x if isinstance(x, str) and x in names else None)
 
 
 def _several(words: str, test: Callable[[Any], bool]) -> _Allowed:
-    def tested(value: Any) -> Any:
+    def kept(value: Any) -> Any:
         parts = tuple(value) if isinstance(value, list | tuple) else ()
         good = parts and len(set(map(str, parts))) == len(parts) and all(test(part) for part in parts)
         return tuple(part if isinstance(part, str) else int(part) for part in parts) if good else None
 
-    return words, tested
+    return _Allowed(words, kept)
+
+
+def _seeds() -> _Allowed:
+    words = "a whole number from 0 to 4294967295, or several different ones"
+    one = _whole(0, 2**32 - 1).kept
+    several = _several(words, lambda x: one(x) is not None).kept
+    return _Allowed(words, lambda x: one(x) if several(x) is None else several(x))
+
+
+def _part(*kinds: type) -> _Allowed:
+    words = " or ".join(kind.__name__ for kind in kinds)
+    return _Allowed(words, lambda x: x if isinstance(x, kinds) else None, kinds)
 
 
 def _option(default: Any, allowed: _Allowed, *, none: str = "") -> Any:
@@ -62,20 +85,23 @@ def _option(default: Any, allowed: _Allowed, *, none: str = "") -> Any:
 
 
 def _flag(default: bool) -> Any:
-    return _option(default, ("true or false", lambda x: x if isinstance(x, bool) else None))
+    return _option(default, _Allowed("true or false", lambda x: x if isinstance(x, bool) else None))
 
 
 @dataclasses.dataclass(frozen=True)
-class Options:
+class _Options:
     """Settings of one kind. Raises `ConfigError` if a value is not accepted."""
+
+    #: name in a mapping, where several kinds are accepted
+    kind: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         for field in dataclasses.fields(self):
-            (words, test), none = field.metadata["allowed"], field.metadata["none"]
+            (words, kept, _), none = field.metadata["allowed"], field.metadata["none"]
             value = getattr(self, field.name)
             if none and value is None:
                 continue
-            accepted = test(value)
+            accepted = kept(value)
             if accepted is None:
                 words = f"{words}, or None: {none}" if none else words
                 name = f"{type(self).__name__}.{field.name}"
@@ -84,32 +110,46 @@ class Options:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as JSON values."""
-        values = dataclasses.asdict(self)
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        values: dict[str, Any] = {"kind": self.kind} if self.kind else {}
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            value = value.to_dict() if isinstance(value, _Options) else value
+            values[field.name] = list(value) if isinstance(value, tuple) else value
+        return values
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
         """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
-        names = [field.name for field in dataclasses.fields(cls)]
-        return cls(**_checked_keys(cls.__name__, values, names))
-
-
-def _checked_keys(what: str, values: Any, names: list[str]) -> dict[str, Any]:
-    if not isinstance(values, dict):
-        raise ConfigError(f"{what} is {reprlib.repr(values)}; allowed is a mapping of {', '.join(names)}")
-    for key in values:
-        if key not in names:
-            close = difflib.get_close_matches(str(key), names, n=1)
-            hint = f"; did you mean {close[0]}?" if close else ""
-            raise ConfigError(f"{what} has no option {reprlib.repr(key)}; there are {', '.join(names)}{hint}")
-    return dict(values)
+        fields = {field.name: field for field in dataclasses.fields(cls)}
+        names = ", ".join(fields)
+        if not isinstance(values, dict):
+            raise ConfigError(f"{cls.__name__} is {reprlib.repr(values)}; allowed is a mapping of {names}")
+        options = {key: value for key, value in values.items() if key != "kind" or not cls.kind}
+        for key, value in options.items():
+            if key not in fields:
+                close = difflib.get_close_matches(str(key), list(fields), n=1)
+                hint = f"; did you mean {close[0]}?" if close else ""
+                raise ConfigError(
+                    f"{cls.__name__} has no option {reprlib.repr(key)}; there are {names}{hint}"
+                )
+            parts = fields[key].metadata["allowed"].parts
+            if not parts or value is None:
+                continue
+            kinds = {part.kind: part for part in parts}
+            kind = value.get("kind") if isinstance(value, dict) else None
+            if len(kinds) > 1 and kind not in kinds:
+                raise ConfigError(
+                    f"{cls.__name__}.{key} has the kind {reprlib.repr(kind)}; allowed is {', '.join(kinds)}"
+                )
+            options[key] = (kinds[kind] if len(kinds) > 1 else parts[0]).from_dict(value)
+        return cls(**options)
 
 
 # residuals
 
 
 @dataclasses.dataclass(frozen=True)
-class StructuredOptions(Options):
+class StructuredOptions(_Options):
     """A structured residual, found by sparse regression (`learning.structured`)."""
 
     kind: ClassVar[str] = "structured"
@@ -121,7 +161,7 @@ class StructuredOptions(Options):
 
 
 @dataclasses.dataclass(frozen=True)
-class NetworkOptions(Options):
+class NetworkOptions(_Options):
     """A network with one hidden layer, added to y_s and z (`learning.residual.Network`)."""
 
     kind: ClassVar[str] = "network"
@@ -138,7 +178,7 @@ class NetworkOptions(Options):
 
 
 @dataclasses.dataclass(frozen=True)
-class PassiveOptions(Options):
+class PassiveOptions(_Options):
     """A passive residual, with a linear path and a network (`learning.passive`).
 
     It is trained through rollouts, and only needs measured poses.
@@ -154,7 +194,7 @@ class PassiveOptions(Options):
 
 
 @dataclasses.dataclass(frozen=True)
-class Training(Options):
+class Training(_Options):
     """Gradient training on one-segment samples: Adam, all samples in every epoch."""
 
     epochs: int = _option(1000, _whole(1))
@@ -186,7 +226,7 @@ class Training(Options):
 
 
 @dataclasses.dataclass(frozen=True)
-class RolloutTraining(Options):
+class RolloutTraining(_Options):
     """Fine-tuning through whole simulations: only the compared fields of the trajectories must be known."""
 
     updates: int = _option(100, _whole(1))
@@ -211,7 +251,7 @@ class RolloutTraining(Options):
 
 
 @dataclasses.dataclass(frozen=True)
-class FitConfig:
+class FitConfig(_Options):
     """Settings of `fit`. `FitConfig()` is the best preset.
 
     Attributes:
@@ -224,18 +264,17 @@ class FitConfig:
         ConfigError: a value is not allowed.
     """
 
-    residual: StructuredOptions | NetworkOptions | PassiveOptions = StructuredOptions()
-    segments: Training | None = None
-    rollouts: RolloutTraining | None = None
-    seed: int | tuple[int, ...] = 0
+    residual: StructuredOptions | NetworkOptions | PassiveOptions = _option(  # noqa: RUF009
+        StructuredOptions(), _part(StructuredOptions, NetworkOptions, PassiveOptions)
+    )
+    segments: Training | None = _option(None, _part(Training), none="no such training")  # noqa: RUF009
+    rollouts: RolloutTraining | None = _option(  # noqa: RUF009
+        None, _part(RolloutTraining), none="no such training"
+    )
+    seed: int | tuple[int, ...] = _option(0, _seeds())
 
     def __post_init__(self) -> None:
-        for name, kinds in _PARTS.items():
-            value = getattr(self, name)
-            if not isinstance(value, kinds) and not (value is None and name != "residual"):
-                words = " or ".join(kind.__name__ for kind in kinds)
-                raise ConfigError(f"FitConfig.{name} is {reprlib.repr(value)}; allowed is {words}")
-        object.__setattr__(self, "seed", _checked_seed(self.seed))
+        super().__post_init__()
         if isinstance(self.residual, NetworkOptions) and self.segments is None and self.rollouts is None:
             raise ConfigError("FitConfig has a network but neither segments nor rollouts to train it by")
         if isinstance(self.residual, PassiveOptions) and self.rollouts is None:
@@ -293,48 +332,3 @@ class FitConfig:
     def seeds(self) -> tuple[int, ...]:
         """Seeds as a tuple, also for a single seed."""
         return self.seed if isinstance(self.seed, tuple) else (self.seed,)
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON values."""
-        return {
-            "residual": {"kind": self.residual.kind, **self.residual.to_dict()},
-            "segments": None if self.segments is None else self.segments.to_dict(),
-            "rollouts": None if self.rollouts is None else self.rollouts.to_dict(),
-            "seed": list(self.seed) if isinstance(self.seed, tuple) else self.seed,
-        }
-
-    @classmethod
-    def from_dict(cls, values: Any) -> Self:
-        """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
-        parts = _checked_keys("FitConfig", values, [field.name for field in dataclasses.fields(cls)])
-        if "residual" in parts:
-            kinds = {kind.kind: kind for kind in _PARTS["residual"]}
-            options = dict(parts["residual"]) if isinstance(parts["residual"], dict) else {}
-            kind = options.pop("kind", None)
-            if kind not in kinds:
-                raise ConfigError(
-                    f"FitConfig.residual has the kind {reprlib.repr(kind)}; allowed is {', '.join(kinds)}"
-                )
-            parts["residual"] = kinds[kind].from_dict(options)
-        for name in ("segments", "rollouts"):
-            if parts.get(name) is not None:
-                parts[name] = _PARTS[name][0].from_dict(parts[name])
-        return cls(**parts)
-
-
-#: accepted types of the parts of a `FitConfig`
-_PARTS: dict[str, tuple[Any, ...]] = {
-    "residual": (StructuredOptions, NetworkOptions, PassiveOptions),
-    "segments": (Training,),
-    "rollouts": (RolloutTraining,),
-}
-
-
-def _checked_seed(seed: Any) -> int | tuple[int, ...]:
-    allowed = "a whole number from 0 to 4294967295, or several different ones"
-    several = isinstance(seed, list | tuple)
-    parts = tuple(seed) if several else (seed,)
-    whole = bool(parts) and all(_is_whole(part, 0, 2**32 - 1) for part in parts)
-    if not whole or len(set(parts)) < len(parts):
-        raise ConfigError(f"FitConfig.seed is {reprlib.repr(seed)}; allowed is {allowed}")
-    return tuple(int(part) for part in parts) if several else int(parts[0])

@@ -118,10 +118,10 @@ class Prediction:
     @property
     def quaternion(self) -> Float[np.ndarray, "T N 4"]:
         """Mean of the members' orientations (T, N, 4), scalar first, of length one."""
-        each = np.stack([np.asarray(member.quaternion) for member in self.members])
-        each = each / np.linalg.norm(each, axis=-1, keepdims=True)
-        each = each * np.where(np.sum(each * each[:1], axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
-        mean = _mean(each)
+        h = np.stack([np.asarray(member.quaternion) for member in self.members])
+        h = h / np.linalg.norm(h, axis=-1, keepdims=True)
+        h = h * np.where(np.sum(h * h[:1], axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+        mean = _mean(h)
         return mean / np.linalg.norm(mean, axis=-1, keepdims=True)
 
     @property
@@ -132,9 +132,9 @@ class Prediction:
     @property
     def spread(self) -> Float[np.ndarray, "T N 3"]:
         """Standard deviation of the members' positions (T, N, 3) in m; NaN with fewer than two members."""
-        each = self._positions()
-        count = np.sum(np.isfinite(each), axis=0)
-        square = np.nansum((each - self.position) ** 2, axis=0)
+        positions = self._positions()
+        count = np.sum(np.isfinite(positions), axis=0)
+        square = np.nansum((positions - self.position) ** 2, axis=0)
         return np.sqrt(np.where(count > 1, square / np.maximum(count - 1, 1), np.nan))
 
     def interval(self, level: float = 0.9) -> tuple[Float[np.ndarray, "T N 3"], Float[np.ndarray, "T N 3"]]:
@@ -167,6 +167,6 @@ class Prediction:
         return float(np.mean(inside[1:, 1:]))
 
 
-def _mean(each: Any) -> Any:
-    count = np.sum(np.isfinite(each), axis=0)
-    return np.where(count > 0, np.nansum(each, axis=0) / np.maximum(count, 1), np.nan)
+def _mean(values: Any) -> Any:
+    count = np.sum(np.isfinite(values), axis=0)
+    return np.where(count > 0, np.nansum(values, axis=0) / np.maximum(count, 1), np.nan)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from knode_cosserat.learning.structured.residual import (
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_of
-from knode_cosserat.rods.system import System
+
+#: powers of the inputs in a function; 1 for all others
+POWERS = {"square": 2, "square_norm": 2, "cube": 3, "cube_norm": 3}
 
 
 class ExplainedTerm(NamedTuple):
@@ -52,24 +54,23 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     residual, knowledge = model.residual, strand_of(model.knowledge)
     if not isinstance(residual, Structured):
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")
-    found = []
+    terms = []
     if float(residual.stretch) != 0.0:
-        found.append(ExplainedTerm("length", "", "of the knowledge's length", float(residual.stretch), "1"))
+        terms.append(ExplainedTerm("length", "", "of the knowledge's length", float(residual.stretch), "1"))
     strain = knowledge.z_layout
     rates = Layout(
         *((f"{name}_t", size, f"{unit}/s", meaning) for name, size, unit, meaning, *_ in strain.fields)
     )
-    found += _terms("stress", strain, residual.stress, strain + rates)
+    terms += _terms("stress", strain, residual.stress, strain + rates)
     whole = model.knowledge
-    parts: list[tuple[str, System, Layout, Any]] = [
+    for part, system, targets, load in (
         ("load", knowledge, loaded(knowledge), residual.load),
         ("tip", whole, Ends.of(whole).layout, residual.tip_load),
-    ]
-    for part, system, targets, load in parts:
+    ):
         if load is not None:
-            found += _terms(part, targets, load.material, material_layout(system))
-            found += _terms(f"{part}*", targets, load.ambient, ambient_layout(system))
-    return found
+            terms += _terms(part, targets, load.material, material_layout(system))
+            terms += _terms(f"{part}*", targets, load.ambient, ambient_layout(system))
+    return terms
 
 
 def _terms(part: str, targets: Layout, expansion: Expansion | None, inputs: Layout) -> list[ExplainedTerm]:
@@ -78,24 +79,21 @@ def _terms(part: str, targets: Layout, expansion: Expansion | None, inputs: Layo
     rows = [
         (field, f"{field.name}{_axis(field.size, i)}") for field in targets.fields for i in range(field.size)
     ]
-    found: list[tuple[float, ExplainedTerm]] = []
-    weights = np.asarray(expansion.weights)
-    for (field, target), row in zip(rows, weights, strict=True):
+    terms: list[tuple[float, ExplainedTerm]] = []
+    for (field, target), row in zip(rows, np.asarray(expansion.weights), strict=True):
         base = field.load or field.unit
         if row[0] != 0.0:
-            found.append((abs(float(row[0])), ExplainedTerm(part, target, "1", float(row[0]), base)))
+            terms.append((abs(float(row[0])), ExplainedTerm(part, target, "1", float(row[0]), base)))
         for term, where in expansion.columns():
             unit = inputs.fields[inputs.names.index(term.name)].unit
+            power = POWERS.get(term.form, 1)
+            divided = f"{base} / ({unit}){'' if power == 1 else f'^{power}'}"
             for axis, k in enumerate(where):
                 if row[k] != 0.0:
-                    power = {"linear": 1, "square": 2, "square_norm": 2, "cube": 3, "cube_norm": 3}.get(
-                        term.form, 1
-                    )
                     size = float(row[k]) / float(expansion.scales[term.scale]) ** power
                     shape = _function(term, axis, expansion)
-                    divided = f"{base} / ({unit}){'' if power == 1 else f'^{power}'}"
-                    found.append((abs(float(row[k])), ExplainedTerm(part, target, shape, size, divided)))
-    return [finding for _, finding in sorted(found, key=lambda pair: -pair[0])]
+                    terms.append((abs(float(row[k])), ExplainedTerm(part, target, shape, size, divided)))
+    return [term for _, term in sorted(terms, key=lambda pair: -pair[0])]
 
 
 def _axis(size: int, i: int) -> str:

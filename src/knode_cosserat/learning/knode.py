@@ -111,8 +111,8 @@ class KNODE(Wrapped):
     def corrections(self) -> tuple[Any, ...]:
         """Corrections of [y_s; z]: the nominal model's, then the residual's (paper eq. 7, KNODE model)."""
         correction = self.residual.correction
-        own = () if correction is None else (functools.partial(correction, self.adapted),)
-        return (*super().corrections, *own)
+        learned = () if correction is None else (functools.partial(correction, self.adapted),)
+        return (*super().corrections, *learned)
 
     def coefficients(self) -> dict[str, Any]:
         """Return the numbers in which the residual is linear; `replace` knows them as "residual.NAME"."""
@@ -126,12 +126,12 @@ class KNODE(Wrapped):
         Raises:
             ParameterError: a name that does not exist, a value that is not allowed.
         """
-        own = {name: changes.pop(name) for name in list(changes) if name.startswith("residual.")}
-        found = super().replace(**changes) if changes else self
-        if not own:
-            return found
-        numbers = {name.removeprefix("residual."): value for name, value in own.items()}
-        return type(self)(found.knowledge, self.residual.with_coefficients(numbers), self.about, self.trained)
+        names = [name for name in changes if name.startswith("residual.")]
+        numbers = {name.removeprefix("residual."): changes.pop(name) for name in names}
+        model = super().replace(**changes) if changes else self
+        if not numbers:
+            return model
+        return type(self)(model.knowledge, self.residual.with_coefficients(numbers), self.about, self.trained)
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the model's file. Raises `ModelFileError`."""

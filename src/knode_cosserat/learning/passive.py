@@ -165,7 +165,7 @@ class Passive(Residual):
     def clamped(self) -> Self:
         """Return the nearest residual with nonnegative damping coefficients."""
         return eqx.tree_at(
-            lambda own: [getattr(own, name) for name in POSITIVE if getattr(own, name) is not None],
+            lambda it: [getattr(it, name) for name in POSITIVE if getattr(it, name) is not None],
             self,
             replace_fn=_not_negative,
         )
@@ -181,42 +181,12 @@ class Passive(Residual):
         parts = [n / sizes.force, m / sizes.moment, q / sizes.velocity, turned, lost[None]]
         return jnp.concatenate(parts)
 
-    # as numbers
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Number of learned numbers in each part."""
-        parts = {name: getattr(self, name) for name in PARTS}
-        return {name: int(np.size(part)) for name, part in parts.items() if part is not None}
-
-    @property
-    def size(self) -> int:
-        """Total number of learned numbers."""
-        return sum(self.counts.values())
-
-    @property
-    def slices(self) -> dict[str, slice]:
-        """Slice of each part in `numbers`."""
-        ends = np.cumsum(list(self.counts.values())).tolist()
-        counted = zip(self.counts.items(), ends, strict=True)
-        return {name: slice(end - count, end) for (name, count), end in counted}
-
-    def numbers(self) -> Float[np.ndarray, " size"]:
-        """Return all learned numbers as one vector."""
-        return np.concatenate([np.ravel(getattr(self, name)) for name in self.counts])
-
-    def with_numbers(self, numbers: Float[Any, " size"]) -> Self:
-        """Return a copy with other numbers; they may be traced."""
-        names = list(self.counts)
-        parts = [numbers[self.slices[name]].reshape(np.shape(getattr(self, name))) for name in names]
-        return eqx.tree_at(lambda own: [getattr(own, name) for name in names], self, parts)
-
     def pruned(self) -> Self:
         """Return a copy without the damping network if that is zero."""
         if self.dissipation is None or np.any(np.asarray(self.dissipation) > 0.0):
             return self
         none = [None, None]
-        return eqx.tree_at(lambda own: [own.dissipation, own.damping_weights], self, none)
+        return eqx.tree_at(lambda it: [it.dissipation, it.damping_weights], self, none)
 
 
 def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0, hidden: int = 4) -> Passive:

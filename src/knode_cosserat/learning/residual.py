@@ -64,9 +64,9 @@ class Residual(eqx.Module):
         return self
 
     def coefficients(self) -> dict[str, Float[Any, "..."]]:
-        """Return the arrays of `linear_in` by their paths; those that do not exist are left out."""
-        found = {path: _at(self, path) for path in self.linear_in}
-        return {path: value for path, value in found.items() if value is not None}
+        """Return the arrays of `linear_in` by their paths; missing ones are left out."""
+        parts = {path: _at(self, path) for path in self.linear_in}
+        return {path: value for path, value in parts.items() if value is not None}
 
     def with_coefficients(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with other coefficients, which may be traced.
@@ -84,7 +84,7 @@ class Residual(eqx.Module):
                     f"residual.{path} has shape {np.shape(value)}; allowed is {np.shape(known[path])}"
                 )
         names = list(changes)
-        return eqx.tree_at(lambda own: [_at(own, name) for name in names], self, [*changes.values()])
+        return eqx.tree_at(lambda it: [_at(it, name) for name in names], self, [*changes.values()])
 
 
 def _at(owner: Any, path: str) -> Any:
@@ -134,7 +134,7 @@ class Network(Residual):
     convex: bool = eqx.field(static=True, default=True)
     #: c0 of the training's time steps (1/s), for the paper's inputs ʰy = y_t - c0 y and ʰz = z_t - c0 z; None
     #: without them. It is stored because ʰ of a problem depends on the time scheme, and is zero at rest:
-    #: with that of the training's steps the model is the same everywhere
+    #: with the c0 of the training's steps the model is the same everywhere
     c0: Float[Any, ""] | None = None
     #: first and last + 1 place in y of a quaternion whose length the correction leaves as it is, or None
     quaternion: tuple[int, int] | None = eqx.field(static=True, default=None)
@@ -164,9 +164,9 @@ class Network(Residual):
         """
         if self.quaternion is None:
             return added
-        own = slice(*self.quaternion)
-        h, h_s = y[own], added[own]
-        return added.at[own].add(-h * (jnp.sum(h * h_s, axis=0) / jnp.sum(h * h, axis=0)))
+        where = slice(*self.quaternion)
+        h, h_s = y[where], added[where]
+        return added.at[where].add(-h * (jnp.sum(h * h_s, axis=0) / jnp.sum(h * h, axis=0)))
 
     def clamped(self) -> Self:
         """Return a convex network with its negative weights set to zero; any other unchanged."""
@@ -179,7 +179,7 @@ class Network(Residual):
 def network(knowledge: System, options: NetworkOptions, key: Any, c0: Any = None) -> Network:
     """Return a network with random initial weights; inputs and outputs are not scaled.
 
-    `c0` (1/s) is that of the training's time steps, for a network with history inputs.
+    `c0` (1/s), of the training's time steps, is for a network with history inputs.
 
     A convex network starts like the paper's: weights |N(0.01, 0.01)|, biases N(0, 0.01). Any other starts
     with N(0, 1/√inputs) and N(0, 0.1/√hidden), and is therefore close to the nominal model.

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, Training
-from knode_cosserat.learning.fit import fit
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training.checkpoint import (
     CheckpointError,
     Checkpoints,
@@ -37,11 +37,6 @@ LONG = FitConfig(
     RolloutTraining(updates=150, horizon=6),
     seed=(2, 5),
 )
-
-
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
 
 
 def assert_same(one, other):
@@ -86,23 +81,23 @@ def interrupted(monkeypatch):
 @pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 7, 40, 1000])
 def test_interrupted_and_resumed(bars, tmp_path, interrupted, monkeypatch, every):
-    expected = fit(WRONG, bars, CONFIG)
+    expected = fit_states(WRONG, bars, CONFIG)
     for _ in range(3):
         with monkeypatch.context():
             interrupted(4)
             with contextlib.suppress(Interruption):
-                fit(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every)
+                fit_states(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every)
             monkeypatch.undo()
-    found = fit(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every)
+    found = fit_states(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every)
     assert_same(found, expected)
     assert len(found.about.facts["segments"]["loss"]) == 130
     # all is done now: nothing is left to do
     interrupted(0)
-    assert_same(fit(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every), expected)
+    assert_same(fit_states(WRONG, bars, CONFIG, checkpoint=tmp_path, checkpoint_every=every), expected)
 
 
 @pytest.mark.slow
-def test_resumed_with_early_stopping(bars, tmp_path, interrupted, monkeypatch):
+def test_resumed_with_early_stopping(bars, unseen, tmp_path, interrupted, monkeypatch):
     """The best weights so far, and what was seen of the held-out rollouts, are kept too."""
     training = Training(epochs=400, learning_rate=0.02, schedule="constant", stop_after=40, check_every=10)
     config = FitConfig(
@@ -111,16 +106,16 @@ def test_resumed_with_early_stopping(bars, tmp_path, interrupted, monkeypatch):
         RolloutTraining(updates=6, horizon=6, stop_after=4, check_every=2),
         seed=(0, 1),
     )
-    held_out = [pulled(1.4)]
-    expected = fit(WRONG, bars, config, held_out=held_out)
+    held_out = [unseen]
+    expected = fit_states(WRONG, bars, config, held_out=held_out)
     assert len(expected[0].about.facts["segments"]["loss"]) < 400
     for count in (3, 9, 2):
         with monkeypatch.context():
             interrupted(count)
             with contextlib.suppress(Interruption):
-                fit(WRONG, bars, config, held_out=held_out, checkpoint=tmp_path, checkpoint_every=10)
+                fit_states(WRONG, bars, config, held_out=held_out, checkpoint=tmp_path, checkpoint_every=10)
             monkeypatch.undo()
-    assert_same(fit(WRONG, bars, config, held_out=held_out, checkpoint=tmp_path), expected)
+    assert_same(fit_states(WRONG, bars, config, held_out=held_out, checkpoint=tmp_path), expected)
 
 
 # killed
@@ -128,7 +123,7 @@ def test_resumed_with_early_stopping(bars, tmp_path, interrupted, monkeypatch):
 
 def long_fit(folder):
     """What the process that is killed does; a checkpoint after every few steps keeps it busy."""
-    fit(WRONG, [pulled(1.0), pulled(0.7)], LONG, checkpoint=folder, checkpoint_every=4)
+    fit_states(WRONG, [pulled(1.0), pulled(0.7)], LONG, checkpoint=folder, checkpoint_every=4)
 
 
 def kill_during(stage, folder, delay):
@@ -161,17 +156,17 @@ _newest: dict[Path, int] = {}
 
 @pytest.mark.campaign
 def test_killed_and_resumed(bars, tmp_path):
-    expected = fit(WRONG, bars, LONG)
+    expected = fit_states(WRONG, bars, LONG)
     random.seed(3)
     killed = [kill_during(stage, tmp_path, random.uniform(0.0, 0.15)) for stage in ("segments", "rollouts")]
     assert killed == [True, True]
-    assert_same(fit(WRONG, bars, LONG, checkpoint=tmp_path), expected)
+    assert_same(fit_states(WRONG, bars, LONG, checkpoint=tmp_path), expected)
     assert not list(tmp_path.glob(".*"))  # what a killed process left half written is gone
 
 
 @pytest.mark.campaign
 def test_killed_many_times(bars, tmp_path):
-    expected = fit(WRONG, bars, LONG)
+    expected = fit_states(WRONG, bars, LONG)
     count = 0
     for round_ in range(4):
         folder = tmp_path / str(round_)
@@ -180,7 +175,7 @@ def test_killed_many_times(bars, tmp_path):
         for _ in range(3):
             count += kill_during("segments", folder, random.uniform(0.0, 1.0))
         count += kill_during("rollouts", folder, random.uniform(0.0, 0.3))
-        assert_same(fit(WRONG, bars, LONG, checkpoint=folder), expected)
+        assert_same(fit_states(WRONG, bars, LONG, checkpoint=folder), expected)
     assert count >= 10
 
 
@@ -189,7 +184,7 @@ def test_killed_many_times(bars, tmp_path):
 
 @pytest.fixture
 def kept(bars, tmp_path):
-    fit(WRONG, bars, CONFIG, checkpoint=tmp_path)
+    fit_states(WRONG, bars, CONFIG, checkpoint=tmp_path)
     return tmp_path / "segments-0.checkpoint"
 
 
@@ -206,19 +201,19 @@ def test_another_fit_is_refused(bars, kept):
         ((WRONG, [bars[0][:-1], bars[1]], CONFIG), "other trajectories"),
     ):
         with pytest.raises(CheckpointError, match=words) as caught:
-            fit(*arguments, checkpoint=kept.parent)
+            fit_states(*arguments, checkpoint=kept.parent)
         assert str(kept) in str(caught.value) and "\n" not in str(caught.value)
     with pytest.raises(CheckpointError, match="other held-out trajectories"):
-        fit(WRONG, bars, CONFIG, held_out=bars, checkpoint=kept.parent)
+        fit_states(WRONG, bars, CONFIG, held_out=bars, checkpoint=kept.parent)
     # another seed has a file of its own; the same knowledge written otherwise is the same
-    found = fit(WRONG, bars, dataclasses.replace(CONFIG, seed=1), checkpoint=kept.parent)
+    found = fit_states(WRONG, bars, dataclasses.replace(CONFIG, seed=1), checkpoint=kept.parent)
     assert found.about.facts["seed"] == 1
     assert sorted(file.name for file in kept.parent.iterdir()) == [
         "segments-0.checkpoint", "segments-1.checkpoint",
     ]  # fmt: skip
     kept.with_name("segments-1.checkpoint").rename(kept)
     with pytest.raises(CheckpointError, match="it is of 'segments-1'"):
-        fit(WRONG, bars, CONFIG, checkpoint=kept.parent)
+        fit_states(WRONG, bars, CONFIG, checkpoint=kept.parent)
 
 
 def test_a_damaged_checkpoint_is_refused(bars, kept):
@@ -230,7 +225,7 @@ def test_a_damaged_checkpoint_is_refused(bars, kept):
     for data in (*damaged, whole + b"x", b"PK\x03\x04"):
         kept.write_bytes(data)
         with pytest.raises(CheckpointError, match="delete it to start again") as caught:
-            fit(WRONG, bars, CONFIG, checkpoint=kept.parent)
+            fit_states(WRONG, bars, CONFIG, checkpoint=kept.parent)
         assert str(kept) in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -248,16 +243,16 @@ def test_a_checkpoint_with_other_content_is_refused(bars, kept):
     ):
         checkpoints.save("segments-0", {**good, **change})
         with pytest.raises(CheckpointError, match="delete it to start again") as caught:
-            fit(WRONG, bars, CONFIG, checkpoint=kept.parent)
+            fit_states(WRONG, bars, CONFIG, checkpoint=kept.parent)
         assert "\n" not in str(caught.value)
     checkpoints.save("segments-0", good)
-    fit(WRONG, bars, CONFIG, checkpoint=kept.parent)
+    fit_states(WRONG, bars, CONFIG, checkpoint=kept.parent)
 
 
 def test_a_folder_that_cannot_be(bars, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(CheckpointError, match="cannot be made a folder"):
-        fit(WRONG, bars, CONFIG, checkpoint=tmp_path / "file")
+        fit_states(WRONG, bars, CONFIG, checkpoint=tmp_path / "file")
 
 
 def test_unpacked_checks_type_and_shape():

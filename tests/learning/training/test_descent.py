@@ -43,11 +43,6 @@ def moved(robot):
     ]
 
 
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
-
-
 # losses
 
 
@@ -217,7 +212,7 @@ def trained(data, net, training, seeds=(0,)):
     losses, rates = [], []
     while state.epoch < training.epochs:
         done = int(state.epoch)
-        state, loss, rate = program.run_epochs(*given, state, training.epochs)
+        state, loss, rate = program.run_epochs(given, state, training.epochs)
         losses.append(np.asarray(loss)[: int(state.epoch) - done])
         rates.append(np.asarray(rate)[: int(state.epoch) - done])
     return state.weights, np.concatenate(losses), np.concatenate(rates)
@@ -265,7 +260,7 @@ def test_plateau_is_that_of_pytorch():
     rng = np.random.default_rng(0)
     losses = np.minimum.accumulate(rng.exponential(size=400)) * (1.0 + 1e-4 * rng.normal(size=400))
     losses[100:200] = losses[100] * (1.0 - 0.9e-4) ** np.arange(100)  # falls, but never by enough at once
-    numbers = program.Numbers(0.01, 7, 0.5, 0.0, 400.0)
+    numbers = {"patience": 7, "factor": 0.5}
     rate, best, bad = 0.01, np.inf, 0
     state = (jnp.array(0.01), jnp.array(np.inf), jnp.array(0))
     step = jax.jit(program.plateau)

@@ -8,30 +8,29 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, RolloutTraining, StructuredOptions
-from knode_cosserat.learning.fit import fit
+from knode_cosserat.learning.config import (
+    FitConfig,
+    FitError,
+    NetworkOptions,
+    RolloutTraining,
+    StructuredOptions,
+)
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
+from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training import rollouts as module
 from knode_cosserat.learning.training.rollouts import (
     RolloutRun,
-    RolloutTargets,
     held_out_batches,
     loss_and_slope,
-    scales,
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, split
+from knode_cosserat.learning.training.runs import ProgressMonitor, split
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, WRONG, pulled
 
 OPTIONS = RolloutTraining(horizon=6, updates=60, learning_rate=5e-3)
-
-
-@pytest.fixture(scope="module")
-def bars():
-    return [pulled(1.0), pulled(0.7)]
 
 
 @pytest.fixture(scope="module")
@@ -40,14 +39,8 @@ def residual():
     return dataclasses.replace(net, output_scale=jnp.full(4, 0.3, dtype=float))
 
 
-def aim_of(along, residual):
-    weights, rest = split(residual)
-    return weights, RolloutTargets(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
-
-
-def evaluated(along, residual):
-    weights, aim = aim_of(along, residual)
-    return loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
+def evaluated(batches, residual):
+    return loss_and_slope(*split(residual), WRONG, batches)
 
 
 def only_positions(trajectory):
@@ -143,7 +136,7 @@ def test_it_learns_from_positions_alone():
     config = FitConfig(NetworkOptions(hidden=5, convex=False), None, options)
     # stages are not known in measured rows, whose rates are differences of the rows
     moved = {period: pulled(period, time="bdf2", start="paper") for period in (1.0, 0.7, 1.4)}
-    model = fit(WRONG, [only_positions(moved[period]) for period in (1.0, 0.7)], config)
+    model = fit_states(WRONG, [only_positions(moved[period]) for period in (1.0, 0.7)], config)
     history = model.about.facts["rollouts"]
     assert history["loss"].shape == (401,) and history["learning_rate"].shape == (400,)
     assert history["loss"].min() < 1e-5 * history["loss"][0]
@@ -158,13 +151,10 @@ def test_any_residual_is_fine_tuned(bars):
     config = FitConfig(
         StructuredOptions(curved=False), None, dataclasses.replace(OPTIONS, learning_rate=1e-3)
     )
-    model = fit(WRONG, bars, config)
+    model = fit_states(WRONG, bars, config)
     loss = model.about.facts["rollouts"]["loss"]
     assert loss[0] > 1e-9 and loss.min() < 0.7 * loss[0]
-    along = trajectory_batches(WRONG, bars, OPTIONS)
-    weights, rest = split(model.residual)
-    aim = RolloutTargets(WRONG, rest, along.parts, np.array(scales(along, WRONG.y_layout)))
-    found, _ = loss_and_slope(weights, aim, along.compared, along.settings, along.dt)
+    found, _ = evaluated(trajectory_batches(WRONG, bars, OPTIONS), model.residual)
     np.testing.assert_allclose(found, loss.min(), rtol=1e-9)
 
 
@@ -189,7 +179,7 @@ def bumpy_run(bars, residual, monkeypatch, wall, **options):
     monkeypatch.setattr(RolloutRun, "_evaluated", lambda run, weights: bumpy(run, weights))
     start = dataclasses.replace(residual, input_biases=jnp.zeros(5))
     options = dataclasses.replace(OPTIONS, **options)
-    return bumpy, RolloutRun(WRONG, start, trajectory_batches(WRONG, bars, options), options, 0, None)
+    return bumpy, RolloutRun(KNODE(WRONG, start), trajectory_batches(WRONG, bars, options), options, 0, None)
 
 
 def to_its_end(run):
@@ -233,18 +223,17 @@ def test_a_model_that_cannot_be_simulated(bars):
     with pytest.raises(
         FitError, match=r"cannot be simulated over the trajectories.*nothing was kept"
     ) as caught:
-        fit(Torn(length=1.0, density=1.0, stiffness=30.0, nodes=6), bars, config)
+        fit_states(Torn(length=1.0, density=1.0, stiffness=30.0, nodes=6), bars, config)
     assert "\n" not in str(caught.value)
 
 
-def test_best_held_out_weights_are_kept(bars):
+def test_best_held_out_weights_are_kept(bars, unseen):
     config = FitConfig(
         NetworkOptions(hidden=5, convex=False),
         None,
         dataclasses.replace(OPTIONS, updates=200, learning_rate=0.05, stop_after=10, check_every=5),
     )
-    unseen = pulled(1.4)
-    model = fit(WRONG, bars, config, held_out=[unseen])
+    model = fit_states(WRONG, bars, config, held_out=[unseen])
     history = model.about.facts["rollouts"]
     errors = history["held_out_error"]
     best = np.argmin(errors[:, 1])

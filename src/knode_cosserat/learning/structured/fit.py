@@ -27,14 +27,7 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.structured.regression import (
-    folds,
-    held_out_error,
-    moments,
-    refined_slopes,
-    relevant,
-    selected_groups,
-)
+from knode_cosserat.learning.structured import regression
 from knode_cosserat.learning.structured.residual import (
     CURVED,
     DRAG,
@@ -119,7 +112,7 @@ def _solved(
     return [shared.residual(seeds[0])] * len(seeds)
 
 
-class Counting(NamedTuple):
+class _Counting(NamedTuple):
     """Sample weights (on average one) and cross-validation folds."""
 
     shares: Float[Any, " S"]
@@ -138,8 +131,8 @@ class _Sides(NamedTuple):
     """Layout of a load, its features, and the rotations (S, 3, 3) of its fields."""
 
     layout: Layout
-    material: list[Offer]
-    ambient: Offer
+    material: list[_Offer]
+    ambient: _Offer
     frames: dict[str, Any]
 
 
@@ -165,27 +158,27 @@ class _Regressions:
         load = _load(sides, -tip, TOLERANCE * np.asarray(self.knowledge.scales().tip), tips)
         return dataclasses.replace(residual, tip_load=load)
 
-    def _counting(self, data: Samples | TipSamples, seed: int) -> Counting:
+    def _counting(self, data: Samples | TipSamples, seed: int) -> _Counting:
         shares = data.weight
         if self.options.resample:  # random weights of rows (Bayesian bootstrap)
             rows, which = np.unique(data.origin, axis=0, return_inverse=True)
             shares = shares * np.random.default_rng(seed).exponential(size=len(rows))[which.ravel()]
-        return Counting(shares / np.mean(shares), folds(data.origin))
+        return _Counting(shares / np.mean(shares), regression.folds(data.origin))
 
     @functools.cached_property
-    def _law(self) -> tuple[list[Offer], list[Target]]:
+    def _law(self) -> tuple[list[_Offer], list[_Target]]:
         """Features and targets of the constitutive law."""
         values, size, inputs = map(np.asarray, _law_residual(self.strand, self.data.segments))
         layout = self.strand.z_layout
         both = layout + Layout(*((f"{name}_t", *rest) for name, *rest in layout.fields))
         offers = [
-            Offer(expansion(both, inputs, dict.fromkeys(both.names, forms), layout.size), inputs)
+            _Offer(expansion(both, inputs, dict.fromkeys(both.names, forms), layout.size), inputs)
             for forms in ((LINEAR, CURVED) if self.options.curved else (LINEAR,))
         ]
         floors = _floors(layout, size)
         # nonlinear in the strain itself and its rate only; other strains have a linear coupling
         targets = [
-            Target(values[:, where], None, floors[where], (name, f"{name}_t"))
+            _Target(values[:, where], None, floors[where], (name, f"{name}_t"))
             for name in layout.names
             for where in [layout.slice(name)]
         ]
@@ -204,7 +197,7 @@ class _Regressions:
             self._along = views, rates, sides
         return self._along
 
-    def _with_loads(self, residual: Structured, counting: Counting) -> Structured:
+    def _with_loads(self, residual: Structured, counting: _Counting) -> Structured:
         """Return the residual with its stretch and its loads."""
         knowledge, data, (views, rates, sides) = self.strand, self.data, self.along(residual)
         segments, length = data.segments, float(knowledge.length)
@@ -271,13 +264,16 @@ def _points(knowledge: System, residual: Structured, data: Dataset) -> tuple[Any
     return jax.tree.map(lambda *parts: np.concatenate(parts), starts, ends)
 
 
+_rotations = jax.jit(jax.vmap(rotation_matrix))
+
+
 def _starts(knowledge: System, data: Samples) -> tuple[Any, Any]:
     return jax.vmap(lambda sample: start_point(knowledge, sample))(data), data.z
 
 
-@jax.jit
-def _corrected_strains(model: System, points: Any) -> Any:
-    return jax.vmap(lambda point: semi_discrete.strains(model, point))(points)
+_corrected_strains = jax.jit(jax.vmap(semi_discrete.strains, in_axes=(None, 0)))
+#: y_s of the nominal model at the true strains
+_rates = jax.jit(jax.vmap(semi_discrete.rates, in_axes=(None, 0, 0)))
 
 
 @jax.jit
@@ -294,12 +290,6 @@ def _views(knowledge: System, points: Any, z: Any) -> _Views:
 
 
 @jax.jit
-def _rates(knowledge: System, points: Any, z: Any) -> Any:
-    """Return y_s of the nominal model at the true strains."""
-    return jax.vmap(lambda point, z: semi_discrete.rates(knowledge, point, z))(points, z)
-
-
-@jax.jit
 def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
     """Return the residual of the conditions at the true tip, and the inputs of a load there."""
 
@@ -313,9 +303,6 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
     return jax.vmap(one)(data)
 
 
-_rotations = jax.jit(jax.vmap(rotation_matrix))
-
-
 def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) -> _Sides:
     """Return the material and ambient features of a load of this layout, and its frames."""
     stated = Observed.of(system).velocities or Observed.of(system).layout.names
@@ -325,7 +312,7 @@ def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) 
     ]
     inputs = material_layout(system)
     material = [
-        Offer(expansion(inputs, views.material, form, layout.size), views.material)
+        _Offer(expansion(inputs, views.material, form, layout.size), views.material)
         for form in forms[: 2 if curved else 1]
     ]
     ambient = expansion(ambient_layout(system), views.ambient, {}, layout.size)
@@ -334,13 +321,13 @@ def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) 
         for name in {field.frame for field in layout.fields if field.frame}
     }
     frames = {field.name: rotations[field.frame] for field in layout.fields if field.frame}
-    return _Sides(layout, material, Offer(ambient, views.ambient), frames)
+    return _Sides(layout, material, _Offer(ambient, views.ambient), frames)
 
 
-def _load(sides: _Sides, missing: Any, floors: Any, counting: Counting) -> Load | None:
+def _load(sides: _Sides, missing: Any, floors: Any, counting: _Counting) -> Load | None:
     """Return the load that explains the missing loads (S, l), from observables and inputs."""
     targets = [
-        Target(missing[:, where], sides.frames.get(name), floors[where])
+        _Target(missing[:, where], sides.frames.get(name), floors[where])
         for name in sides.layout.names
         for where in [sides.layout.slice(name)]
     ]
@@ -381,7 +368,7 @@ def _longer(knowledge: System, moved: Any, rates: Any, shares: Any) -> float:
 # regressions of a load or a stress
 
 
-class Target(NamedTuple):
+class _Target(NamedTuple):
     """One target field of a regression: its values, and the floors below which they are noise.
 
     `turn` has the rotation matrices from the material frame to the values' frame, at every point; None if
@@ -400,7 +387,7 @@ def mean_of_ends(values: Float[np.ndarray, "P ..."], count: int) -> Float[np.nda
     return values if len(values) == count else values.reshape(-1, count, *values.shape[1:]).mean(axis=0)
 
 
-class Offer:
+class _Offer:
     """An expansion with unknown weights, and its inputs at every point."""
 
     def __init__(self, part: Expansion, inputs: Float[Any, "P x"]):
@@ -411,14 +398,12 @@ class Offer:
         """Values of the functions; independent of sample weights, so that seeds share them."""
         return np.asarray(_features_of(self.part, self.inputs))
 
-    def with_slopes(self, slopes: Any) -> Offer:
+    def with_slopes(self, slopes: Any) -> _Offer:
         """Return a copy with other slopes."""
-        return Offer(dataclasses.replace(self.part, slopes=slopes), self.inputs)
+        return _Offer(dataclasses.replace(self.part, slopes=slopes), self.inputs)
 
 
-@eqx.filter_jit
-def _features_of(part: Expansion, inputs: Any) -> Any:
-    return jax.vmap(part.features)(inputs)
+_features_of = eqx.filter_jit(lambda part, inputs: jax.vmap(part.features)(inputs))
 
 
 class _Fit(NamedTuple):
@@ -440,7 +425,7 @@ class _Problem:
     regression; a column is a feature of one of the material's numbers, or an ambient one.
     """
 
-    def __init__(self, target: Target, material: Any, ambient: Any, counting: Counting):
+    def __init__(self, target: _Target, material: Any, ambient: Any, counting: _Counting):
         self.target, self.ambient, self.size = target, ambient, target.values.shape[1]
         self.turned, self.count = target.turn is not None, material.shape[1]
         self.columns = self.arranged(material)
@@ -472,7 +457,9 @@ class _Problem:
         """Return the fit with these columns (by default all)."""
         among = np.ones(self.columns.shape[1], dtype=bool) if among is None else among
         weights = np.zeros((len(self.floors), len(among)))
-        weights[:, among], remainder = relevant(self.columns[:, among], self.values, self.floors, self.shares)
+        weights[:, among], remainder = regression.relevant(
+            self.columns[:, among], self.values, self.floors, self.shares
+        )
         if self.turned:
             parts = np.split(weights[0], [self.size * self.count])
             material, ambient = (part.reshape(self.size, -1) for part in parts)
@@ -500,16 +487,16 @@ class _Problem:
         ambient = np.arange(self.count * (self.size if self.turned else 1), self.columns.shape[1])
         groups += [ambient] if len(ambient) else []
         root = np.sqrt(self.shares)[:, None]
-        parts = moments(self.columns * root, self.values * root, self.fold)
+        parts = regression.moments(self.columns * root, self.values * root, self.fold)
         floor = float(np.mean(np.square(self.floors))) * self.values.size
-        best, error = selected_groups(parts, groups, floor)
-        if error > WORTH * held_out_error(parts, np.flatnonzero(simple)):
+        best, error = regression.selected_groups(parts, groups, floor)
+        if error > WORTH * regression.held_out_error(parts, np.flatnonzero(simple)):
             return None
         return np.isin(np.arange(self.columns.shape[1]), np.concatenate([[-1], *(groups[k] for k in best)]))
 
 
 def _best(
-    candidates: Sequence[Offer], ambient: Any, targets: Sequence[Target], counting: Counting
+    candidates: Sequence[_Offer], ambient: Any, targets: Sequence[_Target], counting: _Counting
 ) -> tuple[Expansion | None, list[Any]]:
     """Return the expansion of the fields' best fits, and their ambient weights."""
     simple, rich = candidates[0], candidates[-1]
@@ -539,8 +526,8 @@ def _best(
 
 
 def _with_slopes(
-    rich: Offer, ambient: Any, targets: Sequence[Target], selections: dict[int, Any], counting: Counting
-) -> Offer:
+    rich: _Offer, ambient: Any, targets: Sequence[_Target], selections: dict[int, Any], counting: _Counting
+) -> _Offer:
     """Return `rich` with refined slopes of the saturating functions, fitted on the worst explained field."""
     part = rich.part
     if not part.slopes.size:
@@ -559,7 +546,7 @@ def _with_slopes(
     free = [k for k in sorted(owners) if np.any(problem.mask(np.isin(features, owners[k][1])) & fit.used)]
     kinds = [(owners[k][0].name, owners[k][0].form) for k in free]
     target = problem.values[:, int(np.argmax(fit.remainder))] * root
-    return rich.with_slopes(refined_slopes(build, target, part.slopes, free, kinds))
+    return rich.with_slopes(regression.refined_slopes(build, target, part.slopes, free, kinds))
 
 
 # refinement on the segments

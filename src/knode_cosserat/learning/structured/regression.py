@@ -112,7 +112,7 @@ def _posterior(X: Any, y: Any, alpha: Any, beta: float) -> tuple[Any, Any, float
 # selection by held-out error
 
 
-class Moments(NamedTuple):
+class _Moments(NamedTuple):
     """Sums over the samples of one fold: features by features, features by values, values by values."""
 
     G: Float[Any, "k k"]
@@ -129,15 +129,15 @@ def folds(origin: Any) -> Any:
     return np.minimum(PARTS * (rows - rows.min()) // max(np.ptp(rows) + 1, 1), PARTS - 1)
 
 
-def moments(features: Float[Any, "S k"], values: Float[Any, "S n"], fold: Any) -> list[Moments]:
+def moments(features: Float[Any, "S k"], values: Float[Any, "S n"], fold: Any) -> list[_Moments]:
     """Return the moments of every fold."""
     parts = [(features[fold == k], values[fold == k]) for k in np.unique(fold)]
-    return [Moments(X.T @ X, X.T @ y, np.sum(y * y, axis=0)) for X, y in parts]
+    return [_Moments(X.T @ X, X.T @ y, np.sum(y * y, axis=0)) for X, y in parts]
 
 
-def held_out_error(parts: Sequence[Moments], columns: Any) -> float:
+def held_out_error(parts: Sequence[_Moments], columns: Any) -> float:
     """Return the cross-validated sum of squared errors: each fold is predicted from the others."""
-    total = Moments(*(sum(sums) for sums in zip(*parts, strict=True)))
+    total = _Moments(*(sum(sums) for sums in zip(*parts, strict=True)))
     square, error = np.ix_(columns, columns), 0.0
     for part in parts:
         G, b = (total.G - part.G)[square], (total.b - part.b)[columns]
@@ -153,7 +153,9 @@ def held_out_error(parts: Sequence[Moments], columns: Any) -> float:
     return max(error, 0.0)
 
 
-def selected_groups(parts: Sequence[Moments], groups: Sequence[Any], floor: float) -> tuple[list[int], float]:
+def selected_groups(
+    parts: Sequence[_Moments], groups: Sequence[Any], floor: float
+) -> tuple[list[int], float]:
     """Return the selected groups of columns, and their held-out error; stops at the error `floor`."""
     selected: list[int] = []
     columns = np.zeros(0, dtype=int)

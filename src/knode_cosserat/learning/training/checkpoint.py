@@ -1,8 +1,8 @@
-"""Checkpoints of a fit: after an interruption at any time it resumes from the last one.
+"""Checkpoints of a fit or an identification: after an interruption it resumes from the last ones.
 
-A checkpoint identifies its fit by settings, data and nominal model. A checkpoint of another fit is refused,
-and so is a truncated or damaged one. Files are `container`s: they are written atomically, and reading one
-runs no code.
+A checkpoint of a fit identifies it by settings, data and nominal model. A checkpoint of another fit is
+refused, and so is a truncated or damaged one. Files are `container`s: they are written atomically, and
+reading one runs no code.
 """
 
 from __future__ import annotations
@@ -66,15 +66,15 @@ class Identity:
             ("knowledge", "another knowledge"), ("trajectories", "other trajectories"),
             ("held_out", "other held-out trajectories"),
         ):  # fmt: skip
-            own = getattr(self, name)
-            if (list(own) if isinstance(own, tuple) else own) != other.get(name):
+            value = getattr(self, name)
+            if (list(value) if isinstance(value, tuple) else value) != other.get(name):
                 return f"of {words}"
         return ""
 
 
 def data_hash(trajectory: Trajectory) -> str:
     """Return the SHA-256 of a trajectory's times, states, strains and controls."""
-    return _hash([np.asarray(getattr(trajectory, name)) for name in ("time", "y", "z", "control")])
+    return hashed(*(getattr(trajectory, name) for name in ("time", "y", "z", "control")))
 
 
 def _knowledge_hash(knowledge: System) -> str:
@@ -82,37 +82,44 @@ def _knowledge_hash(knowledge: System) -> str:
     leaves, _ = jax.tree_util.tree_flatten_with_path(knowledge)
     names = [type(knowledge).__qualname__, type(residual).__qualname__, str(knowledge.nodes)]
     names += [jax.tree_util.keystr(path) for path, _ in leaves]
-    return _hash([np.array(list("\n".join(names).encode())), *(np.asarray(leaf) for _, leaf in leaves)])
+    return hashed(*names, *(leaf for _, leaf in leaves))
 
 
-def _hash(arrays: Sequence[np.ndarray]) -> str:
+def hashed(*values: Any) -> str:
+    """Return the SHA-256 of texts and arrays."""
     digest = hashlib.sha256()
-    for array in arrays:
+    for value in values:
+        if isinstance(value, str):
+            digest.update(value.encode() + b"\0")
+            continue
+        array = np.asarray(value)
         digest.update(f"{array.dtype.str} {array.shape}\n".encode())
         digest.update(np.ascontiguousarray(array).tobytes())
     return digest.hexdigest()
 
 
-def _first_change(own: Any, other: Any, where: str = "") -> str:
-    if isinstance(own, dict) and isinstance(other, dict):
-        for key in sorted({*own, *other}):
-            changed = _first_change(own.get(key), other.get(key), f"{where}.{key}" if where else key)
-            if changed:
-                return changed
+def _first_change(here: Any, there: Any, where: str = "") -> str:
+    if isinstance(here, dict) and isinstance(there, dict):
+        keys = sorted({*here, *there})
+        changes = (_first_change(here.get(key), there.get(key), f"{where}.{key}".strip(".")) for key in keys)
+        return next(filter(None, changes), "")
+    if here == there:
         return ""
-    if own == other:
-        return ""
-    return f"{where} is {json.dumps(other)[:60]} there and {json.dumps(own)[:60]} here"
+    return f"{where} is {json.dumps(there)[:60]} there and {json.dumps(here)[:60]} here"
 
 
 class Checkpoints:
-    """Checkpoints of one fit in a folder: one file for each independent part.
+    """Checkpoints in a folder: one file for each independent part.
+
+    Args:
+        folder: created if it does not exist.
+        identity: of the fit to which all files belong; None: their names identify them.
 
     Raises:
         CheckpointError: the folder cannot be created.
     """
 
-    def __init__(self, folder: str | Path, identity: Identity):
+    def __init__(self, folder: str | Path, identity: Identity | None = None):
         self.folder = Path(folder)
         self.identity = identity
         try:
@@ -127,7 +134,7 @@ class Checkpoints:
 
     def save(self, name: str, snapshot: dict[str, Any]) -> None:
         """Write the state of a part; replaces its earlier file. Raises `CheckpointError`."""
-        identity = json.loads(json.dumps(dataclasses.asdict(self.identity)))
+        identity = json.loads(json.dumps(dataclasses.asdict(self.identity))) if self.identity else {}
         with KIND.naming(self.path(name)):
             content = container.encoded(KIND, {"identity": identity, "name": name, "snapshot": snapshot})
         container.write(self.path(name), content, KIND)
@@ -143,7 +150,8 @@ class Checkpoints:
         try:
             content = container.read(path, KIND)
             with KIND.naming(path):
-                difference = self.identity.difference(content.fact("identity", dict))
+                identity = content.fact("identity", dict)
+                difference = self.identity.difference(identity) if self.identity else ""
                 if content.fact("name", str) != name:
                     difference = f"of {content.facts['name'][:60]!r}"
                 snapshot = content.fact("snapshot", dict)

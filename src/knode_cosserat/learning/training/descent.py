@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -20,11 +20,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.learning.config import Training
+from knode_cosserat.learning.config import FitError, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
 from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
-from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
+from knode_cosserat.learning.training.runs import (
+    ADAM,
+    DIVERGED,
+    NOTHING,
+    Best,
+    ProgressMonitor,
+    Run,
+    is_finite,
+    split,
+)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
@@ -45,8 +54,6 @@ PAPER_FIELDS = ("p", "h", "n", "m", "q", "w")
 LEAST_PART = 1e-3
 #: relative variation below which a field is constant
 ROUNDING = 1e-12
-#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
-DIVERGED, NOTHING = 1e6, 1e-6
 
 
 # losses
@@ -143,13 +150,13 @@ def value_scales(values: Float[Any, "S x"], fields: Sequence[int]) -> Float[np.n
         fields: size of each field, in order. A number that hardly varies, such as a force normal to the plane
             of motion, gets a part of its field's largest; the numbers of a constant field get one.
     """
-    found = []
+    scales = []
     for part in np.split(np.asarray(values), np.cumsum(fields)[:-1], axis=1):
         deviation = np.std(part, axis=0)
         largest = deviation.max(initial=0.0)
         varies = largest > ROUNDING * max(1e-3, np.abs(part).max(initial=0.0))
-        found.append(np.maximum(deviation, LEAST_PART * largest) if varies else np.ones_like(deviation))
-    return np.concatenate(found)
+        scales.append(np.maximum(deviation, LEAST_PART * largest) if varies else np.ones_like(deviation))
+    return np.concatenate(scales)
 
 
 def _mean_square(errors: Float[Any, "x S"]) -> Float[Any, " S"]:
@@ -159,7 +166,7 @@ def _mean_square(errors: Float[Any, "x S"]) -> Float[Any, " S"]:
 # predictions of the nominal model
 
 
-class NominalPredictions(NamedTuple):
+class _NominalPredictions(NamedTuple):
     """Predictions of the samples (S) by the nominal model alone, and a network's scaled inputs."""
 
     #: at the starts of segments, then at their ends if the scheme uses them; the last row is ones, for the
@@ -175,7 +182,7 @@ class NominalPredictions(NamedTuple):
 
 def nominal_predictions(
     net: Network, knowledge: System, samples: Samples, space: SpaceScheme
-) -> NominalPredictions:
+) -> _NominalPredictions:
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
@@ -194,10 +201,10 @@ def nominal_predictions(
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
     joined = jnp.concatenate(inputs, axis=1)
     states = jnp.concatenate([samples.y, samples.y_next][: len(inputs)]).T
-    return NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), states, y, z, steps)
+    return _NominalPredictions(jnp.concatenate([joined, jnp.ones_like(joined[:1])]), states, y, z, steps)
 
 
-def corrected(net: Network, known: NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
+def corrected(net: Network, known: _NominalPredictions) -> tuple[Float[Any, "y S"], Float[Any, "z S"]]:
     """Return the predictions of all samples by nominal model and network, as `segments.predict_segment`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
@@ -261,34 +268,21 @@ def _predicted(system: System, space: SpaceScheme, samples: Samples) -> Any:
 # the program
 
 
-class Numbers(NamedTuple):
-    """Numerical settings, which do not change the compiled program."""
-
-    learning_rate: Any
-    patience: Any
-    factor: Any
-    weight_decay: Any
-    epochs: Any
-
-
-class Recipe(NamedTuple):
-    """The settings that change the program."""
-
-    space: SpaceScheme
-    schedule: str
-
-
-class TrainingData(NamedTuple):
-    """Inputs of an epoch besides the weights: `known` if predictions are fixed, otherwise `samples`."""
+class _TrainingData(eqx.Module):
+    """Inputs of an epoch besides the state; `known` if predictions are fixed, otherwise `samples`."""
 
     knowledge: System
     rest: Any
     samples: Samples | None
-    known: NominalPredictions | None
+    known: _NominalPredictions | None
     loss: PaperLoss | StandardisedLoss
+    #: numbers of `Training`, which do not change the compiled program
+    numbers: dict[str, Any]
+    space: SpaceScheme = eqx.field(static=True)
+    schedule: str = eqx.field(static=True)
 
 
-class State(NamedTuple):
+class _State(NamedTuple):
     """State of the training; all fields but `epoch` have the seeds (G) as first axis."""
 
     epoch: Int[Any, ""]
@@ -300,50 +294,49 @@ class State(NamedTuple):
     waited: Int[Any, " G"]
 
 
-def _loss(weights: Any, recipe: Recipe, data: TrainingData) -> Any:
+def _loss(weights: Any, data: _TrainingData) -> Any:
     residual = eqx.combine(weights, data.rest)
     if data.known is not None:
         return data.loss(*corrected(residual, data.known))
-    model = KNODE(data.knowledge, residual)
-    return data.loss(*_predicted(model, recipe.space, data.samples))
+    return data.loss(*_predicted(KNODE(data.knowledge, residual), data.space, data.samples))
 
 
-def plateau(numbers: Numbers, loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
+def plateau(numbers: dict[str, Any], loss: Any, rate: Any, best: Any, waited: Any) -> tuple[Any, Any, Any]:
     """Return rate, best loss and epochs since then, after an epoch, as PyTorch's ReduceLROnPlateau."""
     better = loss < best * (1.0 - LEAST_GAIN)
     waited = jnp.where(better, 0, waited + 1)
-    enough = waited > numbers.patience
+    enough = waited > numbers["patience"]
     return (
-        jnp.where(enough, rate * numbers.factor, rate),
+        jnp.where(enough, rate * numbers["factor"], rate),
         jnp.where(better, loss, best),
         jnp.where(enough, 0, waited),
     )
 
 
-def _epoch(recipe: Recipe, numbers: Numbers, data: TrainingData, epoch: Any, of_seed: Any) -> Any:
+def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:
     """Run one update of one seed: return its new state, the loss before, and the rate."""
-    weights, adam, rate, best, waited = of_seed
-    loss, slope = jax.value_and_grad(_loss)(weights, recipe, data)
-    now = rate
-    if recipe.schedule == "cosine":
-        now = numbers.learning_rate * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers.epochs))
+    weights, adam, rate, best, waited = seed_state
+    loss, slope = jax.value_and_grad(_loss)(weights, data)
+    now, numbers = rate, data.numbers
+    if data.schedule == "cosine":
+        now = numbers["learning_rate"] * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers["epochs"]))
     direction, adam = ADAM.update(slope, adam)
 
     def updated(weight: Any, change: Any) -> Any:
-        decay = numbers.weight_decay * weight if weight.ndim >= 2 else 0.0
+        decay = numbers["weight_decay"] * weight if weight.ndim >= 2 else 0.0
         return weight - now * (change + decay)
 
     weights = jax.tree.map(updated, weights, direction)
     weights, _ = split(eqx.combine(weights, data.rest).clamped())
-    if recipe.schedule == "plateau":
+    if data.schedule == "plateau":
         rate, best, waited = plateau(numbers, loss, rate, best, waited)
     return (weights, adam, rate, best, waited), loss, now
 
 
-@functools.partial(jax.jit, static_argnames="recipe")
+@jax.jit
 def run_epochs(
-    recipe: Recipe, numbers: Numbers, data: TrainingData, state: State, stop: Any
-) -> tuple[State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
+    data: _TrainingData, state: _State, stop: Any
+) -> tuple[_State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
     """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
     The number of epochs is a value, not a shape. One program serves every piece, so that an interruption does
@@ -352,60 +345,52 @@ def run_epochs(
     first = state.epoch
 
     def one(carry: Any) -> Any:
-        state, losses, rates = carry
-        epoch, *of_seeds = state
-        update = functools.partial(_epoch, recipe, numbers, data, epoch)
-        of_seeds, loss, rate = _side_by_side(update, tuple(of_seeds))
+        (epoch, *seed_states), losses, rates = carry
+
+        def update(seed_state: Any) -> Any:
+            return _epoch(data, epoch, seed_state)
+
+        if state.rate.shape[0] > 1:
+            seed_states, loss, rate = jax.vmap(update)(tuple(seed_states))
+        else:  # without a batch axis, which would cost a third more
+            alone = update(jax.tree.map(lambda leaf: leaf[0], tuple(seed_states)))
+            seed_states, loss, rate = jax.tree.map(lambda leaf: leaf[None], alone)
         i = epoch - first
-        return State(epoch + 1, *of_seeds), losses.at[i].set(loss), rates.at[i].set(rate)
+        return _State(epoch + 1, *seed_states), losses.at[i].set(loss), rates.at[i].set(rate)
 
     nothing = jnp.full((PIECE, state.rate.shape[0]), jnp.nan)
     last = jnp.minimum(stop, first + PIECE)
     return jax.lax.while_loop(lambda carry: carry[0].epoch < last, one, (state, nothing, nothing))
 
 
-def _side_by_side(update: Any, of_seeds: Any) -> Any:
-    """Apply `update` to all seeds; without a batch axis for one seed, which would cost a third more."""
-    if jax.tree.leaves(of_seeds)[0].shape[0] > 1:
-        return jax.vmap(update)(of_seeds)
-    alone = update(jax.tree.map(lambda leaf: leaf[0], of_seeds))
-    return jax.tree.map(lambda leaf: leaf[None], alone)
-
-
 # before the first epoch
 
 
-def prepared(
-    knowledge: System, residual: Residual, dataset: Dataset, training: Training
-) -> tuple[Recipe, Numbers, TrainingData]:
+def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: Training) -> _TrainingData:
     """Return the program's inputs besides its state."""
     segments, space = dataset.segments, dataset.space
-    numbers = Numbers(
-        training.learning_rate, training.patience, training.factor, training.weight_decay,
-        float(training.epochs),
-    )  # fmt: skip
     # the prediction is the nominal model's plus a linear combination of the network's outputs
     divided = grid_of(knowledge).parts.shape[1] > 1
     adds = isinstance(residual, Network) and not space.formula.stages and not divided
     known = _known(residual, knowledge, segments, space) if adds else None
-    loss = loss_for(training.loss, knowledge, segments)
-    data = TrainingData(knowledge, split(residual)[1], None if adds else segments, known, loss)
-    return Recipe(space, training.schedule), numbers, jax.tree.map(jnp.asarray, data)
+    names = ("learning_rate", "patience", "factor", "weight_decay", "epochs")
+    data = _TrainingData(
+        knowledge, split(residual)[1], None if adds else segments, known,
+        loss_for(training.loss, knowledge, segments), {name: getattr(training, name) for name in names},
+        space, training.schedule,
+    )  # fmt: skip
+    return jax.tree.map(jnp.asarray, data)
 
 
-def started(residuals: Sequence[Residual], training: Training) -> State:
+def started(residuals: Sequence[Residual], training: Training) -> _State:
     """Return the state before the first epoch, with one residual for each seed."""
     every = [split(residual)[0] for residual in residuals]
     weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
     count = len(residuals)
-    return State(
-        jnp.zeros((), dtype=int),
-        weights,
-        jax.vmap(ADAM.init)(weights),
-        jnp.full(count, training.learning_rate),
-        jnp.full(count, jnp.inf),
-        jnp.zeros(count, dtype=int),
-    )
+    rate, best, waited = (
+        jnp.full(count, training.learning_rate), jnp.full(count, jnp.inf), jnp.zeros(count, dtype=int)
+    )  # fmt: skip
+    return _State(jnp.zeros((), dtype=int), weights, jax.vmap(ADAM.init)(weights), rate, best, waited)
 
 
 class SegmentRun(Run):
@@ -414,17 +399,20 @@ class SegmentRun(Run):
     stage = "segments"
 
     def __init__(
-        self, knowledge: System, residuals: Sequence[Residual], dataset: Dataset, training: Training,
-        seeds: tuple[int, ...], held_out: TrajectoryBatches | None,
+        self, knowledge: System, residuals: Mapping[int, Residual], dataset: Dataset, training: Training,
+        held_out: TrajectoryBatches | None,
     ):  # fmt: skip
-        state = started(residuals, training)
-        super().__init__(seeds, training.epochs, state, Best(state.weights, training.stop_after))
+        """Prepare the training of the residuals, by their seeds."""
+        first, *_ = residuals.values()
+        state = started([*residuals.values()], training)
+        best = Best(state.weights, training.stop_after)
+        super().__init__(tuple(residuals), training.epochs, state, best)
         self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
-        self._inputs = prepared(strand_of(knowledge), residuals[0], dataset, training)
+        self._data = prepared(strand_of(knowledge), first, dataset, training)
 
     def compile(self) -> None:
         """Compile the epochs' program without running one, and run one held-out rollout."""
-        run_epochs(*self._inputs, self.state, self.done)
+        run_epochs(self._data, self.state, self.done)
         if self._held_out:
             tip_error(KNODE(self._knowledge, self._residual(0)), self._held_out)
 
@@ -434,7 +422,7 @@ class SegmentRun(Run):
         stop = min(stop, first + PIECE, self.steps)
         if self._held_out:
             stop = min(stop, first - first % self._every + self._every)
-        state, losses, rates = run_epochs(*self._inputs, self.state, stop)
+        state, losses, rates = run_epochs(self._data, self.state, stop)
         losses, rates = (np.asarray(values)[: stop - first] for values in (losses, rates))
         self._require_sane(losses, state.weights)
         self.state = state
@@ -466,9 +454,9 @@ class SegmentRun(Run):
 
     def _residual(self, k: int) -> Residual:
         """Return the residual of seed k with its last weights."""
-        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._inputs[2].rest)
+        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._data.rest)
 
     def residuals(self) -> list[Residual]:
         """Return residuals with the last weights, or the best if training may stop early."""
         chosen = [self.best.chosen(k, self.state.weights) for k in range(len(self.seeds))]
-        return [eqx.combine(weights, self._inputs[2].rest) for weights in chosen]
+        return [eqx.combine(weights, self._data.rest) for weights in chosen]

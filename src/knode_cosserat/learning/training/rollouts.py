@@ -7,7 +7,6 @@ function theorem (`solvers.sensitivity`), so that any residual can be trained in
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -18,12 +17,20 @@ import numpy as np
 import optax  # type: ignore[import-untyped]
 from jaxtyping import Float
 
-from knode_cosserat.learning.config import RolloutTraining
+from knode_cosserat.learning.config import FitError, RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.training.runs import ADAM, Best, FitError, ProgressMonitor, Run, is_finite, split
+from knode_cosserat.learning.training.runs import (
+    ADAM,
+    DIVERGED,
+    NOTHING,
+    Best,
+    ProgressMonitor,
+    Run,
+    is_finite,
+    split,
+)
 from knode_cosserat.rods.aspects import Drawing
-from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.segments import DataError, samples, settings_of
 from knode_cosserat.solvers.settings import Settings
@@ -32,11 +39,9 @@ from knode_cosserat.trajectory import Trajectory
 
 #: fields compared by default, if the system has them
 POSE = ("p", "h")
-#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
-DIVERGED, NOTHING = 1e6, 1e-6
 
 
-class TrajectoryBatch(NamedTuple):
+class _TrajectoryBatch(NamedTuple):
     """Trajectories (B) of one length: controls and target states."""
 
     control: Float[Any, "B T c"]
@@ -44,14 +49,15 @@ class TrajectoryBatch(NamedTuple):
     y: Float[Any, "B T+1 nodes y"]
 
 
-@dataclasses.dataclass(frozen=True)
-class TrajectoryBatches:
+class TrajectoryBatches(eqx.Module):
     """All trajectories, grouped by length, with the settings of their simulation."""
 
-    parts: tuple[TrajectoryBatch, ...]
-    compared: tuple[str, ...]
-    settings: Settings
-    dt: float
+    parts: tuple[_TrajectoryBatch, ...]
+    #: scale of each compared field's errors: the rms of its motion
+    scales: Float[Any, " fields"]
+    compared: tuple[str, ...] = eqx.field(static=True)
+    settings: Settings = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
 
 
 def trajectory_batches(
@@ -68,7 +74,7 @@ def trajectory_batches(
         samples(knowledge, [_relevant(knowledge, one, compared) for one in trajectories])
     except DataError as error:
         raise DataError(f"{what}{error}") from None
-    by_length: dict[int, list[TrajectoryBatch]] = {}
+    by_length: dict[int, list[_TrajectoryBatch]] = {}
     for k, trajectory in enumerate(trajectories):
         if float(trajectory.time[0]) != 0.0:
             raise DataError(
@@ -77,10 +83,16 @@ def trajectory_batches(
             )
         rows = min(len(trajectory.time), 1 + (options.horizon or len(trajectory.time)))
         y, control = (np.asarray(part, dtype=float)[:rows] for part in (trajectory.y, trajectory.control))
-        by_length.setdefault(rows, []).append(TrajectoryBatch(control[1:], y))
-    joined = [jax.tree.map(lambda *leaves: np.stack(leaves), *parts) for parts in by_length.values()]
+        by_length.setdefault(rows, []).append(_TrajectoryBatch(control[1:], y))
+    parts = [jax.tree.map(lambda *leaves: np.stack(leaves), *several) for several in by_length.values()]
+    scales = []
+    for name in compared:
+        values = [knowledge.y_layout.get(part.y, name) for part in parts]
+        moves = [np.mean(np.var(value, axis=1)) * len(value) for value in values]
+        scale = float(np.sqrt(sum(moves) / sum(map(len, values))))
+        scales.append(scale if scale > 1e-12 else 1.0)
     settings = settings_of(trajectories[0])
-    return TrajectoryBatches(tuple(joined), compared, settings, trajectories[0].dt)
+    return TrajectoryBatches(tuple(parts), np.array(scales), compared, settings, trajectories[0].dt)
 
 
 def _checked_names(knowledge: System, compared: tuple[str, ...] | None) -> tuple[str, ...]:
@@ -111,25 +123,27 @@ def _relevant(knowledge: System, trajectory: Any, names: tuple[str, ...]) -> Any
 
 
 def simulated_batch(
-    model: System, course: TrajectoryBatch, settings: Settings, dt: float
+    model: System, batch: _TrajectoryBatch, batches: TrajectoryBatches
 ) -> Float[Any, "B T+1 nodes y"]:
     """Return y of all trajectories simulated by the model, one after the other; NaN in unsolved steps."""
+    settings = batches.settings
 
     def one(control: Any) -> Any:
         return simulate(
-            model, control, dt, space=settings.space, start=settings.start, newton=settings.newton,
+            model, control, batches.dt, space=settings.space, start=settings.start, newton=settings.newton,
             between=settings.between, time=settings.time,  # type: ignore[arg-type]  # None is refused there
         ).y  # fmt: skip
 
-    return jax.lax.map(one, course.control)
+    return jax.lax.map(one, batch.control)
 
 
-@functools.partial(jax.jit, static_argnames=("settings", "dt"))
-def _tip_errors(model: System, parts: tuple[TrajectoryBatch, ...], settings: Settings, dt: float) -> Any:
+@jax.jit
+def _tip_errors(model: System, batches: TrajectoryBatches) -> Any:
     errors = []
-    for course in parts:
-        found = Drawing.of(model).positions(simulated_batch(model, course, settings, dt)[:, :, -1])
-        distance = jnp.sum((found - Drawing.of(model).positions(course.y[:, :, -1])) ** 2, axis=-1)
+    positions = Drawing.of(model).positions
+    for batch in batches.parts:
+        tips = positions(simulated_batch(model, batch, batches)[:, :, -1])
+        distance = jnp.sum((tips - positions(batch.y[:, :, -1])) ** 2, axis=-1)
         errors.append(jnp.sqrt(jnp.mean(distance, axis=-1)))
     return jnp.concatenate(errors)
 
@@ -149,38 +163,18 @@ def held_out_batches(knowledge: System, trajectories: Sequence[Trajectory]) -> T
     return trajectory_batches(knowledge, trajectories, RolloutTraining(compared=places), what="held-out ")
 
 
-def tip_error(model: System, courses: TrajectoryBatches) -> float:
+def tip_error(model: System, batches: TrajectoryBatches) -> float:
     """Return the rms tip error (m), averaged over trajectories; infinite if a step is not solved."""
-    errors = np.asarray(_tip_errors(model, courses.parts, courses.settings, courses.dt))
+    errors = np.asarray(_tip_errors(model, batches))
     return float(np.mean(errors)) if np.all(np.isfinite(errors)) else float("inf")
 
 
 # the loss
 
 
-def scales(courses: TrajectoryBatches, layout: Layout) -> tuple[float, ...]:
-    """Return the scale of each compared field's errors: the rms of its motion."""
-    found = []
-    for name in courses.compared:
-        values = [layout.get(part.y, name) for part in courses.parts]
-        moves = [np.mean(np.var(value, axis=1)) * len(value) for value in values]
-        scale = float(np.sqrt(sum(moves) / sum(map(len, values))))
-        found.append(scale if scale > 1e-12 else 1.0)
-    return tuple(found)
-
-
-class RolloutTargets(NamedTuple):
-    """Targets and scales of the loss."""
-
-    knowledge: System
-    rest: Any
-    parts: tuple[TrajectoryBatch, ...]
-    scales: Any
-
-
-@functools.partial(jax.jit, static_argnames=("compared", "settings", "dt"))
+@jax.jit
 def loss_and_slope(
-    weights: Any, aim: RolloutTargets, compared: tuple[str, ...], settings: Settings, dt: float
+    weights: Any, rest: Any, knowledge: System, batches: TrajectoryBatches
 ) -> tuple[Float[Any, ""], Any]:
     """Return the rollout loss of a residual's weights and its gradient; NaN if a step is not solved.
 
@@ -189,40 +183,31 @@ def loss_and_slope(
     """
 
     def loss(weights: Any) -> Any:
-        model = KNODE(aim.knowledge, eqx.combine(weights, aim.rest))
+        model = KNODE(knowledge, eqx.combine(weights, rest))
         total, count = jnp.zeros(()), 0
-        for course in aim.parts:
-            found = simulated_batch(model, course, settings, dt)[:, 1:]
-            for i, name in enumerate(compared):
-                pair = (model.y_layout.get(y, name) for y in (found, course.y[:, 1:]))
-                error = _difference(name, *pair) / aim.scales[i]
-                total = total + jnp.mean(error**2) * course.y.shape[0]
-            count += course.y.shape[0]
-        return total / (count * len(compared))
+        for batch in batches.parts:
+            simulated = simulated_batch(model, batch, batches)[:, 1:]
+            for name, scale in zip(batches.compared, batches.scales, strict=True):
+                pair = (model.y_layout.get(y, name) for y in (simulated, batch.y[:, 1:]))
+                total = total + jnp.mean((_difference(name, *pair) / scale) ** 2) * batch.y.shape[0]
+            count += batch.y.shape[0]
+        return total / (count * len(batches.compared))
 
     return jax.value_and_grad(loss)(weights)
 
 
-def _difference(name: str, found: Any, truth: Any) -> Any:
-    if name != "h" or found.shape[-1] != 4:
-        return found - truth
-    found, truth = (h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True)) for h in (found, truth))
-    same = jnp.sum(found * truth, axis=-1, keepdims=True) >= 0.0
-    return found - jnp.where(same, truth, -truth)
+def _difference(name: str, values: Any, truth: Any) -> Any:
+    if name != "h" or values.shape[-1] != 4:
+        return values - truth
+    values, truth = (h / jnp.sqrt(jnp.sum(h * h, axis=-1, keepdims=True)) for h in (values, truth))
+    same = jnp.sum(values * truth, axis=-1, keepdims=True) >= 0.0
+    return values - jnp.where(same, truth, -truth)
 
 
 # fine-tuning
 
 
-@jax.jit
-def _proposal(weights: Any, rest: Any, adam: Any, slope: Any, rate: Any, clip: Any) -> Any:
-    slope, _ = optax.clip_by_global_norm(clip).update(slope, optax.EmptyState())
-    direction, adam = ADAM.update(slope, adam)
-    moved = jax.tree.map(lambda weight, change: weight - rate * change, weights, direction)
-    return split(eqx.combine(moved, rest).clamped())[0], adam
-
-
-class RolloutState(NamedTuple):
+class _RolloutState(NamedTuple):
     """State of fine-tuning: weights, optimiser, gradient, weights of least loss, factor on the step."""
 
     weights: Any
@@ -230,6 +215,15 @@ class RolloutState(NamedTuple):
     slope: Any
     lowest: Any
     scale: Any
+
+
+@jax.jit
+def _proposal(state: _RolloutState, rest: Any, rate: Any, clip: Any) -> Any:
+    """Return the weights and the optimiser after a step."""
+    slope, _ = optax.clip_by_global_norm(clip).update(state.slope, optax.EmptyState())
+    direction, adam = ADAM.update(slope, state.adam)
+    moved = jax.tree.map(lambda weight, change: weight - rate * change, state.weights, direction)
+    return split(eqx.combine(moved, rest).clamped())[0], adam
 
 
 class RolloutRun(Run):
@@ -243,17 +237,16 @@ class RolloutRun(Run):
     loss_after = True
 
     def __init__(
-        self, knowledge: System, residual: Residual, courses: TrajectoryBatches, options: RolloutTraining,
-        seed: int, held_out: TrajectoryBatches | None,
+        self, model: KNODE, batches: TrajectoryBatches, options: RolloutTraining, seed: int,
+        held_out: TrajectoryBatches | None,
     ):  # fmt: skip
-        weights, rest = split(residual)
+        weights, self._rest = split(model.residual)
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
         slope = jax.tree.map(jnp.zeros_like, weights)
-        state = RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
+        state = _RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
         super().__init__((seed,), options.updates, state, Best(_one(weights), options.stop_after))
-        self._courses, self._options, self._held_out = courses, options, held_out
-        measured = np.array(scales(courses, knowledge.y_layout))
-        self._aim = RolloutTargets(knowledge, rest, courses.parts, measured)
+        self._knowledge, self._batches = model.knowledge, batches
+        self._options, self._held_out = options, held_out
 
     def compile(self) -> None:
         """Compile by one evaluation and one held-out rollout."""
@@ -262,8 +255,7 @@ class RolloutRun(Run):
             tip_error(self._model(), self._held_out)
 
     def _evaluated(self, weights: Any) -> tuple[float, Any]:
-        courses = self._courses
-        loss, slope = loss_and_slope(weights, self._aim, courses.compared, courses.settings, courses.dt)
+        loss, slope = loss_and_slope(weights, self._rest, self._knowledge, self._batches)
         return float(loss), slope
 
     def _begin(self, watch: ProgressMonitor) -> None:
@@ -287,9 +279,7 @@ class RolloutRun(Run):
             rate *= 0.5 * (1.0 + np.cos(np.pi * self.done / options.updates))
         for _ in range(options.rejections):
             step = rate * scale
-            weights, adam = _proposal(
-                state.weights, self._aim.rest, state.adam, state.slope, step, options.clip
-            )
+            weights, adam = _proposal(state, self._rest, step, options.clip)
             loss, slope = self._evaluated(weights)
             if loss <= DIVERGED * max(self.losses[0, 0], NOTHING) and is_finite((weights, slope)):
                 break
@@ -300,14 +290,14 @@ class RolloutRun(Run):
                 f"{options.rejections} times, to {step:.3g}, the robot still cannot be simulated after it"
             )
         lowest = weights if loss < self.losses.min() else state.lowest
-        self.state = RolloutState(weights, adam, slope, lowest, np.array(scale))
+        self.state = _RolloutState(weights, adam, slope, lowest, np.array(scale))
         watch.steps(self.stage, self.seeds, self.done, self.losses[-1:], np.array([[step]]))
         self.losses = np.append(self.losses, [[loss]], axis=0)
         self.rates = np.append(self.rates, [[step]], axis=0)
         self._check(watch)
 
     def _model(self) -> KNODE:
-        return KNODE(self._aim.knowledge, eqx.combine(self.state.weights, self._aim.rest))
+        return KNODE(self._knowledge, eqx.combine(self.state.weights, self._rest))
 
     def _check(self, watch: ProgressMonitor) -> None:
         if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
@@ -318,7 +308,7 @@ class RolloutRun(Run):
 
     def residuals(self) -> list[Residual]:
         """Return the weights with the lowest loss, or the lowest held-out error if it may stop early."""
-        return [eqx.combine(self.best.chosen(0, _one(self.state.lowest)), self._aim.rest)]
+        return [eqx.combine(self.best.chosen(0, _one(self.state.lowest)), self._rest)]
 
 
 def _one(weights: Any) -> Any:

@@ -19,16 +19,13 @@ import optax  # type: ignore[import-untyped]
 from tqdm import tqdm
 
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.learning.config import FitError
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed_tree, unpacked
 
 ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
-
-
-class FitError(KnodeCosseratError, ValueError):
-    """A fit that cannot start or continue. The message is one line: the reason, and the kept state."""
-
-    code = "fit"
+#: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
+DIVERGED, NOTHING = 1e6, 1e-6
 
 
 class WatchError(KnodeCosseratError, ValueError):
@@ -167,8 +164,8 @@ class Best:
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
         like = [self.errors, self.steps, self.stopped]
-        given = [snapshot.get(name) for name in ("errors", "steps", "stopped")]
-        self.errors, self.steps, self.stopped = (np.array(leaf) for leaf in unpacked(given, like))
+        arrays = [snapshot.get(name) for name in ("errors", "steps", "stopped")]
+        self.errors, self.steps, self.stopped = (np.array(leaf) for leaf in unpacked(arrays, like))
         self.weights = jax.tree.map(np.array, unpacked(snapshot.get("weights"), self.weights))
         self.seen = [list(row) for row in np.asarray(snapshot.get("seen")).tolist()]
 
@@ -220,8 +217,8 @@ class Run(abc.ABC):
         """Return loss, rate and held-out errors of one seed over the steps."""
         k = self.seeds.index(seed)
         rows = slice(0, self.best.stopped[k] if self.best.stopped[k] >= 0 and not self.loss_after else None)
-        found = {"loss": self.losses[rows, k], "learning_rate": self.rates[rows, k]}
-        return found | ({"held_out_error": self.best.report(k)} if self.best.seen else {})
+        history = {"loss": self.losses[rows, k], "learning_rate": self.rates[rows, k]}
+        return history | ({"held_out_error": self.best.report(k)} if self.best.seen else {})
 
     def snapshot(self) -> dict[str, Any]:
         """Return the state as plain values, arrays, and lists of arrays."""

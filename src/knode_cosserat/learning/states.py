@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from knode_cosserat._files.writing import package_version
-from knode_cosserat.learning.config import FitConfig, NetworkOptions, PassiveOptions
+from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions, PassiveOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
@@ -31,7 +31,7 @@ from knode_cosserat.learning.training.rollouts import (
     tip_error,
     trajectory_batches,
 )
-from knode_cosserat.learning.training.runs import FitError, ProgressMonitor, Run, run_all
+from knode_cosserat.learning.training.runs import ProgressMonitor, Run, run_all
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
@@ -54,7 +54,7 @@ LITTLE = 0.2
 SOLVED = 1e-8
 
 
-def fit(
+def fit_states(
     knowledge: System,
     trajectories: Sequence[Trajectory],
     config: FitConfig = BEST,
@@ -123,16 +123,14 @@ def fit(
         verify = not type(nominal_model(knowledge)).__module__.startswith("knode_cosserat.")
     models = []
     for seed, residual in learned.items():
-        own: dict[str, Any] = {**facts, "seed": seed, **histories[seed]}
+        model, about = KNODE(knowledge, residual), {**facts, "seed": seed, **histories[seed]}
         if data.held_out is not None:
-            own["held_out_error"] = tip_error(KNODE(knowledge, residual), data.held_out)
+            about["held_out_error"] = tip_error(model, data.held_out)
         if verify:
-            own["rollout_errors"] = list(
-                rollout_errors(knowledge, KNODE(knowledge, residual), trajectories[0])
-            )
-        own["seconds"] = time.perf_counter() - began
-        models.append(KNODE(knowledge, residual, About(own), trained))
-        log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), own["seconds"], seed)
+            about["rollout_errors"] = list(rollout_errors(knowledge, model, trajectories[0]))
+        about["seconds"] = time.perf_counter() - began
+        models.append(KNODE(knowledge, residual, About(about), trained))
+        log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), about["seconds"], seed)
     return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
 
 
@@ -161,10 +159,10 @@ def require_allowed(knowledge: System, config: FitConfig) -> None:
             raise FitError(str(error)) from None
 
 
-def _listed(name: str, given: Any) -> list[Trajectory]:
-    if isinstance(given, Trajectory) or not isinstance(given, Iterable):
-        raise FitError(f"{name} is a {type(given).__name__}; allowed is a list of trajectories")
-    return list(given)
+def _listed(name: str, trajectories: Any) -> list[Trajectory]:
+    if isinstance(trajectories, Trajectory) or not isinstance(trajectories, Iterable):
+        raise FitError(f"{name} is a {type(trajectories).__name__}; allowed is a list of trajectories")
+    return list(trajectories)
 
 
 class _Data(NamedTuple):
@@ -217,34 +215,34 @@ def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
     return dataclasses.replace(trajectory, y=y, z=z)
 
 
-def _segment_runs(given: _Data, learned: dict[int, Residual]) -> list[Run]:
-    training = given.config.segments
+def _segment_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
+    training = data.config.segments
     if training is None:
         return []
-    runs: list[Run] = []
-    for seeds in _groups(given.config, len(given.dataset.segments.t)):
-        residuals = [learned[seed] for seed in seeds]
-        runs.append(SegmentRun(given.knowledge, residuals, given.dataset, training, seeds, given.held_out))
-    return runs
+    return [
+        SegmentRun(
+            data.knowledge, {seed: learned[seed] for seed in seeds}, data.dataset, training, data.held_out
+        )
+        for seeds in _groups(data.config, len(data.dataset.segments.t))
+    ]
 
 
 def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
     """Group the seeds that share one vectorised program: all seeds, unless each keeps a core busy."""
-    if not isinstance(config.residual, NetworkOptions):
-        return [(seed,) for seed in config.seeds]
-    work = config.residual.hidden * count * len(config.seeds)
-    if jax.default_backend() != "cpu" or work <= SHARED:
-        return [config.seeds]
+    if isinstance(config.residual, NetworkOptions):
+        work = config.residual.hidden * count * len(config.seeds)
+        if jax.default_backend() != "cpu" or work <= SHARED:
+            return [config.seeds]
     return [(seed,) for seed in config.seeds]
 
 
-def _rollout_runs(given: _Data, learned: dict[int, Residual]) -> list[Run]:
-    options = given.config.rollouts
+def _rollout_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
+    options = data.config.rollouts
     if options is None:
         return []
-    along = trajectory_batches(given.knowledge, given.trajectories, options)
+    batches = trajectory_batches(data.knowledge, data.trajectories, options)
     return [
-        RolloutRun(given.knowledge, residual, along, options, seed, given.held_out)
+        RolloutRun(KNODE(data.knowledge, residual), batches, options, seed, data.held_out)
         for seed, residual in learned.items()
     ]
 
@@ -284,14 +282,14 @@ def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> tu
     scale, errors = np.asarray(nominal.scales().y), []
     for system in (nominal, model):
         with warnings.catch_warnings():
-            # the grid is that of the training data
+            # the training data have the same grid
             warnings.simplefilter("ignore")
-            found = simulate(
+            motion = simulate(
                 system, np.asarray(trajectory.control)[first:], trajectory.dt, time=settings.time or "bdf2",
                 space=settings.space, start=settings.start, initial=trajectory[:first], on_failure="return",
             )  # fmt: skip
-        apart = (np.asarray(found.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
-        errors.append(float(np.sqrt(np.mean(apart**2))) if found.all_valid else float("inf"))
+        apart = (np.asarray(motion.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
+        errors.append(float(np.sqrt(np.mean(apart**2))) if motion.all_valid else float("inf"))
     if np.isinf(errors[1]):
         warnings.warn(
             "the fitted model cannot be simulated over its first training trajectory: a step has no "
