@@ -130,11 +130,10 @@ class Core(EliminationCode):
     def _write_weights(self) -> None:
         """Weights of sizes relative to the state."""
         self.weigh = f = self._function("weigh")
-        with self._places(self.points) as j:
-            for i in range(self.equations.ny):
-                unit = self._unit(i, j)
-                size = f.apply("abs", self._wide(self.y, i, j))
-                self._write_wide(unit / (1.0 + unit * size), self.weights_of_y, i, j)
+        for i, j in self._components(self.equations.ny, self.points):
+            unit = self._unit(i, j)
+            size = f.apply("abs", self._wide(self.y, i, j))
+            self._write_wide(unit / (1.0 + unit * size), self.weights_of_y, i, j)
 
     # Newton's method
 
@@ -160,9 +159,8 @@ class Core(EliminationCode):
         renew, first, fresh, old, done = (truth(False) for _ in range(5))
         renew.set(~usable)
         old.set(usable)
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                self._write_wide(0.0, self.direction, i, j)
+        for i, j in self._components(e.ny, self.points):
+            self._write_wide(0.0, self.direction, i, j)
         for i in range(e.k):
             self._put(0.0, self.direction_unknowns, i)
         f.call(self.weigh, memory)
@@ -185,16 +183,13 @@ class Core(EliminationCode):
                 fresh.set(fresh.get() & ~now)
                 renew.set(renew.get() & ~now)
                 linearisations.set(linearisations.get() + f.select(now, 1.0, 0.0))
-                with self._places(self.points) as j:
-                    for i in range(e.ny):
-                        self._write_wide(self._wide(self.y, i, j), self.trial, i, j)
+                self._copy_wide(self.y, self.trial, self.points)
                 f.call(self.defects, memory)
             with f.if_(~anew.get()):
                 step = self._spread(damping.get())
-                with self._places(self.points) as j:
-                    for i in range(e.ny):
-                        moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
-                        self._write_wide(moved, self.trial, i, j)
+                for i, j in self._components(e.ny, self.points):
+                    moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
+                    self._write_wide(moved, self.trial, i, j)
                 for i in range(e.k):
                     moved = self._get(self.unknowns, i) + damping.get() * self._get(
                         self.direction_unknowns, i
@@ -242,11 +237,10 @@ class Core(EliminationCode):
             more = going & ~(good | dead | again)
             corrections.set(corrections.get() + f.select(more, 1.0, 0.0))
             wide_accept = self._spread(accept)
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    for source, target in ((self.trial, self.y), (self.dy, self.direction)):
-                        value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
-                        self._write_wide(value, target, i, j)
+            for i, j in self._components(e.ny, self.points):
+                for source, target in ((self.trial, self.y), (self.dy, self.direction)):
+                    value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
+                    self._write_wide(value, target, i, j)
             for i in range(e.k):
                 for source, target in (
                     (self.trial_unknowns, self.unknowns),
@@ -276,9 +270,8 @@ class Core(EliminationCode):
             self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
         pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
         changes = [weight - own for weight, own in pairs]
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
+        for i, j in self._components(e.ny, self.pieces):
+            self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
 
     def _write_check(self) -> None:
@@ -291,9 +284,7 @@ class Core(EliminationCode):
         largest = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
         # what the solution has left: no part of its errors
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
+        self._copy_wide(self.r, self.rest, self.pieces)
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)
         # no residual has the strains of the tip; y_s is part of a record if B is not zero
@@ -301,9 +292,7 @@ class Core(EliminationCode):
         with self._places(self.count) as j:
             for i in range(e.ny, e.numbers):
                 size = f.apply("abs", self._wide(self.records[0], i, j))
-                total.set(
-                    total.get() + (size if self.batch else f.select(self._inside(j, self.count), size, 0.0))
-                )
+                total.set(total.get() + self._before(self.count, j, size))
         finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
         f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
 
@@ -322,14 +311,12 @@ class Core(EliminationCode):
         e = self.equations
         f = self._function(name, "numbers")
         memory, numbers = f.arguments
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                defect = self._wide(self.defect, i, j) if has_defect else 0.0
-                self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
-        with self._places(self.ends) as j:
-            for i in range(e.ny):
-                start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
-                self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
+        for i, j in self._components(e.ny, self.pieces):
+            defect = self._wide(self.defect, i, j) if has_defect else 0.0
+            self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
+        for i, j in self._components(e.ny, self.ends):
+            start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
+            self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
         with self._places(self.used) as j:
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(history, i, j)
@@ -341,10 +328,9 @@ class Core(EliminationCode):
         def evaluated() -> Value:
             self._write_base(self.better_unknowns, self.better, self.own_dH)
             f.call(self.residual_of_better, memory)
-            with self._places(self.pieces) as j:
-                for i in range(e.ny):
-                    value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
-                    self._write_wide(value, self.r, i, j)
+            for i, j in self._components(e.ny, self.pieces):
+                value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
+                self._write_wide(value, self.r, i, j)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
             return f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
@@ -357,22 +343,20 @@ class Core(EliminationCode):
 
         def going() -> Value:
             found = Variable(f, f.splat(f.value(0.0), self.L))
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    y = self._wide(self.y, i, j)
-                    change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
-                    size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
-                    size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
-                    found.set(f.apply("max", found.get(), size))
+            for i, j in self._components(e.ny, self.points):
+                y = self._wide(self.y, i, j)
+                change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
+                size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
+                size = self._before(self.points, j, size)
+                found.set(f.apply("max", found.get(), size))
             far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
             return f.any(far & alive) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
 
         with f.while_(going):
             f.call(self.correct, memory)
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
-                    self._write_wide(value, self.better, i, j)
+            for i, j in self._components(e.ny, self.points):
+                value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
+                self._write_wide(value, self.better, i, j)
             for i in range(e.k):
                 value = self._get(self.better_unknowns, i) + self._get(self.step_unknowns, i)
                 self._put(value, self.better_unknowns, i)
@@ -396,15 +380,12 @@ class Core(EliminationCode):
         self.corrected = f = self._function("corrected", "numbers")
         memory, numbers = f.arguments
         ny = self.equations.ny
-        with self._places(self.pieces) as j:
-            for i in range(ny):
-                self._write_wide(self._wide(self.defect, i, j), self.r, i, j)
+        self._copy_wide(self.defect, self.r, self.pieces)
         for i in range(self.equations.k):
             self._put(0.0, self.tip, i)
         f.call(self.correct, memory)
-        with self._places(self.points) as j:
-            for i in range(ny):
-                self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
+        for i, j in self._components(ny, self.points):
+            self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
         for number, value in zip((POSITION, ANGLE), self._errors_of_poses(), strict=True):
             f.store(value, numbers, number * self.P)
 
@@ -419,7 +400,7 @@ class Core(EliminationCode):
                 return self._wide(self.better, i, j) - self._wide(self.y, i, j)
 
             def largest(found: Variable, value: Value) -> None:
-                value = value if self.batch else f.select(self._inside(j, self.points), value, 0.0)
+                value = self._before(self.points, j, value)
                 found.set(f.apply("max", found.get(), value))
                 total.set(total.get() + value)
 
@@ -464,17 +445,14 @@ class Core(EliminationCode):
                 c * self._wide(error, i, j) for c, error in zip(earlier, self.time_errors, strict=True)
             )
 
-        with self._places(self.used) as j:
-            for i in range(e.numbers):
-                self._write_wide(carried(i, j), self.time_dH, i, j)
+        for i, j in self._components(e.numbers, self.used):
+            self._write_wide(carried(i, j), self.time_dH, i, j)
         with f.if_(f.compare("ne", earlier[1], 0.0)):
             # the difference of the rates at both stages, and its product with the equations' derivatives
-            with self._places(self.used) as j:
-                for i in range(e.numbers):
-                    self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    self._write_wide(0.0, self.dy, i, j)
+            for i, j in self._components(e.numbers, self.used):
+                self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
+            for i, j in self._components(e.ny, self.points):
+                self._write_wide(0.0, self.dy, i, j)
             f.call(self.products, memory)
             state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
             moved = self._evaluated(e.products["base"], 0, False, state)
@@ -493,9 +471,7 @@ class Core(EliminationCode):
         e = self.equations
         self.products = self._function("products")
         (far, between, *_), tangents = self._evaluated_at(self.y), self.tangents
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(self.dy, i, j), tangents.far, i, j)
+        self._copy_wide(self.dy, tangents.far, self.points)
         if self.far is not None:
             with self._places(self.pieces) as j:
                 state = self._state_with_tangents((self.y, self.dy), j, j) | self._acting_at(j)
@@ -558,17 +534,9 @@ class Core(EliminationCode):
         for i, j, value in self._numbers_of(newest, self.count):
             self._write_wide(value, self.records[0], i, j)
         if self.settings.uses_rate:
-            with self._places(self.count) as j:
-                for i in range(e.numbers):
-                    value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
-                    self._write_wide(value, self.rate, i, j)
-
-    def _write_shift(self, states: list[Array], count: int) -> None:
-        """Shift earlier states by one step."""
-        for newer, older in reversed(list(itertools.pairwise(states))):
-            with self._places(count) as j:
-                for i in range(newer.size):
-                    self._write_wide(self._wide(newer, i, j), older, i, j)
+            for i, j in self._components(e.numbers, self.count):
+                value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
+                self._write_wide(value, self.rate, i, j)
 
     # the time loop
 
@@ -622,24 +590,20 @@ class Core(EliminationCode):
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
         def history(states: list[Array], rate: Array, target: Array, count: int) -> None:
-            with self._places(count) as j:
-                for i in range(e.numbers):
-                    value = _sum(
-                        c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True)
-                    )
-                    if self.settings.uses_rate:
-                        value = value + d1 * self._wide(rate, i, j)
-                    self._write_wide(value, target, i, j)
+            for i, j in self._components(e.numbers, count):
+                value = _sum(c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True))
+                if self.settings.uses_rate:
+                    value = value + d1 * self._wide(rate, i, j)
+                self._write_wide(value, target, i, j)
 
         if self.scheme:
             history(self.records, self.rate, self.H, self.count)
             weights = [self._wide(self.weights, k) for k in range(3)]
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    guess = weights[0] * self._wide(self.past[0], i, j)
-                    for k in (1, 2):
-                        guess = guess + weights[k] * self._wide(self.past[k], i, j)
-                    self._write_wide(guess, self.y, i, j)
+            for i, j in self._components(e.ny, self.points):
+                guess = weights[0] * self._wide(self.past[0], i, j)
+                for k in (1, 2):
+                    guess = guess + weights[k] * self._wide(self.past[k], i, j)
+                self._write_wide(guess, self.y, i, j)
         for k, (i, base) in enumerate(self._unknown_numbers()):
             self._put(self._get(self.y, i, base), self.unknowns, k)
         self._write_base(self.unknowns, self.y, self.H)
@@ -651,10 +615,9 @@ class Core(EliminationCode):
             history(self.errors, self.error_rate, self.dH, self.used)
         f.call(self.corrected, memory, numbers)
         if self.settings.uses_rate:
-            with self._places(self.used) as j:
-                for i in range(e.numbers):
-                    value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
-                    self._write_wide(value, self.error_rate, i, j)
+            for i, j in self._components(e.numbers, self.used):
+                value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
+                self._write_wide(value, self.error_rate, i, j)
         if isinstance(self.scheme, SDIRK2):
             f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
@@ -674,17 +637,16 @@ class Core(EliminationCode):
             for half in range(2)
         )
         misfits = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(3)]
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                past = [self._wide(each, i, j) for each in self.past]
-                unit, y = self._unit(i, j), self._wide(self.y, i, j)
-                for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
-                    guess = past[0] * weights[0]
-                    for k in range(1, order + 1):
-                        guess = guess + past[k] * weights[k]
-                    size = f.apply("abs", guess - y) * unit
-                    size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
-                    misfit.set(f.apply("max", misfit.get(), size))
+        for i, j in self._components(e.ny, self.points):
+            past = [self._wide(each, i, j) for each in self.past]
+            unit, y = self._unit(i, j), self._wide(self.y, i, j)
+            for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
+                guess = past[0] * weights[0]
+                for k in range(1, order + 1):
+                    guess = guess + past[k] * weights[k]
+                size = f.apply("abs", guess - y) * unit
+                size = self._before(self.points, j, size)
+                misfit.set(f.apply("max", misfit.get(), size))
         sizes = [self._largest(each.get()) for each in misfits]
         least = f.apply("max", f.apply("min", sizes[0], f.apply("min", sizes[1], sizes[2])), ROUNDING)
         ratios = [f.apply("max", each / least, 1.0) for each in sizes]
@@ -695,12 +657,7 @@ class Core(EliminationCode):
             for order in range(k, 3):
                 weight = weight + trusts[order] / total * following[order][k]
             self._put(weight, self.weights, k)
-        for source, target in (
-            (self.past[1], self.past[2]), (self.past[0], self.past[1]), (self.y, self.past[0])
-        ):  # fmt: skip
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    self._write_wide(self._wide(source, i, j), target, i, j)
+        self._write_shift([self.y, *self.past], self.points)
 
     def _write_evaluate(self) -> None:
         """The state at y and history terms, with y at points between nodes corrected in some turns."""

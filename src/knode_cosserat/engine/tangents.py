@@ -137,7 +137,7 @@ class TangentCode(EliminationCode):
         self._write_data()
         self._write_solution()
         self._write_derivatives()
-        self._write_shift()
+        self._write_records()
 
     # a solved step
 
@@ -148,11 +148,10 @@ class TangentCode(EliminationCode):
         _, coefficients, control, unknowns = f.arguments
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         weights = [f.load(coefficients, k) for k in self._history_weights]
-        with self._places(self.used) as j:
-            for i in range(e.numbers):
-                parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
-                products = [weight * part for weight, part in zip(weights, parts, strict=False)]
-                self._write_wide(sum(products[1:], products[0]), self.H, i, j)
+        for i, j in self._components(e.numbers, self.used):
+            parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
+            products = [weight * part for weight, part in zip(weights, parts, strict=False)]
+            self._write_wide(sum(products[1:], products[0]), self.H, i, j)
         for i in range(e.k):
             self._put(f.load(unknowns, i), self.unknowns, i)
 
@@ -197,14 +196,11 @@ class TangentCode(EliminationCode):
         """Return the state at the tips and at the bases."""
         return ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
 
-    def _write_shift(self) -> None:
+    def _write_records(self) -> None:
         """The records after a step."""
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
-        for newer, older in reversed(list(itertools.pairwise(self.records))):
-            with self._places(self.used) as j:
-                for i in range(self.equations.numbers):
-                    self._write_wide(self._wide(newer, i, j), older, i, j)
+        self._write_shift(self.records, self.used)
         for i, j, newest in self._numbers_of(self._evaluated_at(self.y), self.used):
             self._write_wide(newest, self.records[0], i, j)
             if self.settings.uses_rate:
