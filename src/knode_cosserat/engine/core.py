@@ -7,7 +7,6 @@ estimated errors of the grid and of the time scheme.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import functools
 import itertools
@@ -111,14 +110,7 @@ class Core(EliminationCode):
         )
         self.dfe = a(ny, self.pieces)
         self._write()
-        self.compiled = self.module.compile()
-        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 3)(
-            self.compiled.address("run")
-        )
-        if not robots:
-            self._evaluate = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_long)(
-                self.compiled.address("evaluate")
-            )
+        self._functions = self.module.compile()
         guesses = EXTRAPOLATIONS[None]
         if settings.stages > 1:
             guesses = stage_extrapolations(settings)
@@ -726,7 +718,7 @@ class Core(EliminationCode):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
             table[[0, -1]] = c0, t
-            self._evaluate(*(each.ctypes.data for each in (memory, table, control)), turns)
+            self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), turns)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
             error = np.max(np.abs(defects[: self.pieces]) * inverse[: self.pieces])
@@ -781,7 +773,7 @@ class Core(EliminationCode):
             memory[self._motion] = first_motions[k]
             self._put_in(memory[None], self.params, lane_parameters[k][None, :, None])
             arrays = memory, lane_controls[k], table, self._guesses, *results
-            self._run(*(each.ctypes.data for each in arrays), 0, stop, stages)
+            self._functions["run"](*(each.ctypes.data for each in arrays), 0, stop, stages)
             last_motions[k], length[k] = (
                 memory[self._motion],
                 self._numbers(memory[None], self.length)[0, :, 0, 0],

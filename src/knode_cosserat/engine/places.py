@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 from collections.abc import Callable
 from typing import Any
 
@@ -47,8 +46,7 @@ class PlaceCode:
             values, target = f.evaluate(program, nodes, here, lanes), f.pointer(results, j.value)
             for k, node in enumerate(nodes):
                 f.store(values[node], target, count * k, lanes)
-        self._code = module.compile()
-        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_long)(self._code.address("run"))
+        self._run = module.compile()["run"]
 
     def evaluate(self, data: np.ndarray, s: Float[np.ndarray, " n"]) -> Any:
         """Return results at places (n, ...), of parameters and control in one vector."""

@@ -7,7 +7,6 @@ tangents in lanes. Cotangents pass through the transposed maps, from the last st
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import itertools
 import operator
@@ -109,7 +108,7 @@ class TangentCode(EliminationCode):
         self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
         self._reserve_products()
         self._write()
-        self.compiled = self.module.compile()
+        self._run = self.module.compile()["run"]
 
     def _reserve_state(self) -> None:
         """Reserve arrays that last from step to step, for each column."""
@@ -550,10 +549,6 @@ class TangentCore(TangentCode):
 
     transposed = False
 
-    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
-        super().__init__(system, settings, moving, lanes)
-        self._run = _callable(self.compiled.address("run"), 11, 3)
-
     def _reserve_state(self) -> None:
         #: what is added to the residual of the tip's conditions
         self.added_tip = self._tangent_array(self.equations.k, 1, 1)
@@ -704,10 +699,6 @@ class CotangentCore(TangentCode):
     """Machine code of the cotangents of solved steps, one after the other."""
 
     transposed = True
-
-    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
-        super().__init__(system, settings, moving, lanes)
-        self._run = _callable(self.compiled.address("run"), 10, 2)
 
     def _reserve_state(self) -> None:
         e, a = self.equations, self._array
@@ -905,10 +896,6 @@ class CotangentCore(TangentCode):
         joined = [self._joined(each, self._numbers(state, each)[:, 0], len(d_rate)) for each in parts]
         before = [np.moveaxis(each, 0, -1) for each in joined]
         return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:-1]), before[-1]
-
-
-def _callable(address: int, pointers: int, numbers: int) -> Any:
-    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_long] * numbers)(address)
 
 
 def _nodes(nonzeros: Nonzeros) -> list[int]:
