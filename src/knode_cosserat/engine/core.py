@@ -23,25 +23,27 @@ from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import StateArrays
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
-from knode_cosserat.solvers.problem import FILLING, Evaluated
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import (
+from knode_cosserat.solvers.history import (
     COARSE_ANGLE,
     COARSE_SHARE,
     ESTIMATE_TOLERANCE,
     ESTIMATE_TURNS,
+    EXTRAPOLATIONS,
     ROUNDING,
+    StateHistory,
     StepCoefficients,
     StepRows,
     stage_extrapolations,
 )
+from knode_cosserat.solvers.problem import FILLING, Evaluated
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.time import SDIRK2
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
+#: largest correction that may be left at a solution, relative to the state and its natural units
+LARGEST_CORRECTION = 1e-5
 #: part of the largest correction allowed at a solution, below which an expected correction is not computed
 SURELY_SMALL = 1e-2
 #: index of `acceptable` in Newton's options
@@ -55,16 +57,6 @@ class Shape(NamedTuple):
 
 
 States = TypeVar("States", StateHistory, Shape)
-
-
-class Constants(NamedTuple):
-    """Numbers that all steps of a run share."""
-
-    #: of the system, or of each robot
-    parameters: Float[np.ndarray, "*robots n"]
-    newton: NewtonOptions
-    #: subtracted from the residual of the tip's conditions
-    tip_offset: Any = 0.0
 
 
 class Core(EliminationCode):
@@ -729,14 +721,15 @@ class Core(EliminationCode):
         return evaluate
 
     def integrate(
-        self, constants: Constants, controls: np.ndarray, steps: StepCoefficients, states: States,
+        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: States,
         span: tuple[int, int],
     ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
         """Solve a span of steps of each robot until one fails.
 
-        Controls (robots, T, c) or (robots, T, stages * c) and states (robots, ...). Returns the numbers of
-        steps done, the states after them, and rows. In a batch, a robot with a failed step waits for the
-        others in its vector; its last state is not kept, except if the first step failed.
+        Parameters (n,) of the system, or (robots, n); controls (robots, T, c) or (robots, T, stages * c) and
+        states (robots, ...). Returns the numbers of steps done, the states after them, and rows. In a batch,
+        a robot with a failed step waits for the others in its vector; its last state is not kept, except if
+        the first step failed.
         """
         e, P, stages, (start, stop) = self.equations, self.P, np.size(steps.ends), span
         count, nodes, size = stop - start, len(self.grid.nodes), len(controls)
@@ -752,8 +745,8 @@ class Core(EliminationCode):
         lane_controls = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
         lane_controls = np.broadcast_to(lane_controls, (vectors, P, count, stages, e.nc))
         lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
-        lane_parameters = in_lanes(np.broadcast_to(constants.parameters, (size, self.params.size)))
-        table = coefficients_of(steps, stages, span)
+        lane_parameters = in_lanes(np.broadcast_to(parameters, (size, self.params.size)))
+        table = coefficients_of(steps, span)
         rows = np.zeros((vectors, count, stages, nodes, self.strands * e.numbers, P))
         infos = np.zeros((vectors, count, stages, 8 + e.k, P))
         reached, length = np.zeros((2, vectors, P))
@@ -763,8 +756,9 @@ class Core(EliminationCode):
         last_motions = np.empty_like(first_motions)
 
         memory, empty = self._empty_memory(), self._empty.copy()
+        newton = steps.settings.newton
         for array, numbers in (
-            (self.options, dataclasses.astuple(constants.newton)), (self.tip_offset, constants.tip_offset)
+            (self.options, dataclasses.astuple(newton)), (self.tip_offset, steps.tip_offset)
         ):  # fmt: skip
             self._put_in(empty[None], array, np.broadcast_to(numbers, (1, P, 1, array.size)))
 
@@ -791,11 +785,11 @@ class Core(EliminationCode):
         robot_rows, robot_infos = (
             np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
         )
-        found = self._rows(robot_rows, robot_infos, constants.newton, length.reshape(-1)[:size], done)
+        found = self._rows(robot_rows, robot_infos, newton.acceptable, length.reshape(-1)[:size], done)
         return start + done, lasts, found
 
     def _rows(
-        self, rows: np.ndarray, infos: np.ndarray, newton: NewtonOptions, length: np.ndarray, done: np.ndarray
+        self, rows: np.ndarray, infos: np.ndarray, acceptable: float, length: np.ndarray, done: np.ndarray
     ) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
         if self.strands > 1:
@@ -805,7 +799,7 @@ class Core(EliminationCode):
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
         fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE)
         result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
-        result = np.where(error <= newton.acceptable, result, int(Result.NO_CONVERGENCE))
+        result = np.where(error <= acceptable, result, int(Result.NO_CONVERGENCE))
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
@@ -838,11 +832,9 @@ class Core(EliminationCode):
         return type(before)(**found)
 
 
-def coefficients_of(
-    steps: StepCoefficients, stages: int, span: tuple[int, int]
-) -> Float[np.ndarray, "T stages n"]:
+def coefficients_of(steps: StepCoefficients, span: tuple[int, int]) -> Float[np.ndarray, "T stages n"]:
     """Return coefficients and the time since row 0 (s) of all stages of a span of steps."""
-    start, stop = span
+    (start, stop), stages = span, np.size(steps.ends)
     coefficients = np.asarray(steps.table)
     coefficients = coefficients.reshape(len(coefficients), stages, -1)
     table = np.empty((stop - start, stages, coefficients.shape[-1] + 1))

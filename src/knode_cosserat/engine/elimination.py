@@ -22,7 +22,6 @@ from knode_cosserat.engine.equations import Elimination, Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
-from knode_cosserat.solvers.boundary import pivots_of
 
 
 class Correction(NamedTuple):
@@ -62,7 +61,8 @@ class EliminationCode(RodCode):
         ny, k = e.ny, e.k
         #: number of unknowns of a strand, and their rows in y
         self.own = k // self.strands
-        self.pivots = [int(index) for index in pivots_of(system)[: self.own]]
+        unknown = system.y_layout.indices(system.base_unknowns)
+        self.pivots = [int(index) for index in unknown[: self.own]]
         #: nonzero slopes of base and tip: row, column, node
         self.base_slopes, self.tip_slopes = (
             [

@@ -1148,7 +1148,7 @@ class Evaluation:
         if name in ACCUMULATED:
             return [self._accumulated(ACCUMULATED[name], equation, *arguments)]
         if name in SCATTERED:
-            return [self._do_scatter(equation, *arguments, operation=SCATTERED[name])]
+            return [self._do_scatter(equation, *arguments)]
         inner = next((params[key] for key in CALLS if key in params), None)
         if inner is None or name in INSTEAD:
             raise self.error(equation)
@@ -1455,9 +1455,8 @@ class Evaluation:
             out[place] = at(place)[0]
         return np.moveaxis(out, range(len(batch), out.ndim), d.offset_dims)
 
-    def _do_scatter(
-        self, e: Any, x: Nodes, indices: Nodes, updates: Nodes, operation: str | None = None
-    ) -> Nodes:
+    def _do_scatter(self, e: Any, x: Nodes, indices: Nodes, updates: Nodes) -> Nodes:
+        operation = SCATTERED.get(e.primitive.name)
         d, batch = e.params["dimension_numbers"], indices.shape[:-1]
         window = d.update_window_dims
         updates = np.moveaxis(updates, window, range(len(batch), len(batch) + len(window)))

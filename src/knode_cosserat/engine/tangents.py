@@ -26,6 +26,20 @@ from knode_cosserat.solvers.problem import FILLING
 from knode_cosserat.solvers.settings import Settings
 
 
+class SolvedSteps(NamedTuple):
+    """Solved steps, all stages in turn, from which derivatives are evaluated."""
+
+    parameters: Float[np.ndarray, " n"]
+    #: coefficients and times
+    table: Float[np.ndarray, "solves n"]
+    controls: Float[np.ndarray, "solves c"]
+    rows: Float[Any, "solves nodes x"]
+    unknowns: Float[Any, "solves k"]
+    #: history before the first step
+    records: Float[Any, "memory used x"]
+    rate: Float[Any, "used x"]
+
+
 class Tangents(NamedTuple):
     """Arrays of the tangents of a step, or of their cotangents."""
 
@@ -530,17 +544,14 @@ class TangentCode(EliminationCode):
     def _row_size(self) -> int:
         return len(self.grid.nodes) * self.packed.size
 
-    def _begun(
-        self, parameters: np.ndarray, solved: tuple[Any, Any], controls: Any, table: Any,
-        records: Any, rate: Any,
-    ) -> list[np.ndarray]:  # fmt: skip
+    def _begun(self, solved: SolvedSteps) -> list[np.ndarray]:
         """Return the memory before a run, controls, coefficients, rows and unknowns."""
         memory = self._empty_memory()
-        self._put_in(memory[None], self.params, parameters[None, None, None])
-        for array, values in zip((*self.records, self.rate), (*records, rate), strict=True):
+        self._put_in(memory[None], self.params, solved.parameters[None, None, None])
+        for array, values in zip((*self.records, self.rate), (*solved.records, solved.rate), strict=True):
             self._put_in(memory[None], array, self._by_strand(array, np.asarray(values, float))[None, None])
-        rows, unknowns = solved
-        data = controls, table, np.asarray(rows)[..., : self.packed.size], unknowns
+        rows = np.asarray(solved.rows)[..., : self.packed.size]
+        data = solved.controls, solved.table, rows, solved.unknowns
         return [memory, *(np.ascontiguousarray(each, float) for each in data)]
 
 
@@ -645,20 +656,18 @@ class TangentCore(TangentCode):
             f.call(self.shift, memory, table)
 
     def solve(
-        self, parameters: np.ndarray, table: Float[np.ndarray, "solves n"], solved: tuple[Any, Any],
-        controls: Float[np.ndarray, "solves c"], moves: tuple[Any, Any], d_controls: Any, states: Any,
-        d_tip: Any = 0.0,
-    ) -> tuple[Any, Any]:  # fmt: skip
-        """Return the tangents of solved rows (solves, nodes, x, m) and unknowns (solves, k, m), and states.
+        self, solved: SolvedSteps, moves: tuple[Any, Any], d_controls: Any, d_states: Any, d_tip: Any = 0.0
+    ) -> tuple[Any, Any]:
+        """Return states, and the tangents of solved rows (solves, nodes, x, m) and unknowns (solves, k, m).
 
-        `moves` are directions of the moving parameters (d, n) and weights (d, m); `states` are records
-        (memory, used, x) and rate before the first step, and their tangents with one more axis (m). `d_tip`
-        (k, m) is added to the tangents of the tip's residual. The states returned are those after the last
-        step.
+        `moves` are directions of the moving parameters (d, n) and weights (d, m); `d_states` are the tangents
+        of records and rate before the first step, with one more axis (m). `d_tip` (k, m) is added to the
+        tangents of the tip's residual. The states returned are those after the last step: records, rate, and
+        their tangents.
         """
-        e, L, (records, rate, d_records, d_rate) = self.equations, self.L, states
-        (directions, weights), count = moves, len(controls)
-        m, nodes, places = d_controls.shape[-1], len(self.grid.nodes), len(rate)
+        e, L, (d_records, d_rate) = self.equations, self.L, d_states
+        (directions, weights), count = moves, len(solved.controls)
+        m, nodes, places = d_controls.shape[-1], len(self.grid.nodes), len(solved.rate)
         blocks = -(-m // L)
 
         def filled(values: Any) -> np.ndarray:
@@ -667,7 +676,7 @@ class TangentCore(TangentCode):
             found[..., :m] = values
             return found
 
-        begun = self._begun(parameters, solved, controls, table, records, rate)
+        begun = self._begun(solved)
         memory = begun[0]
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
@@ -871,16 +880,13 @@ class CotangentCore(TangentCode):
     def _kept_size(self) -> int:
         return sum(map(self._length_of, self._kept))
 
-    def solve(
-        self, parameters: np.ndarray, table: Float[np.ndarray, "solves n"], solved: tuple[Any, Any],
-        controls: Float[np.ndarray, "solves c"], states: tuple[Any, Any], cotangents: Any,
-    ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
+    def solve(self, solved: SolvedSteps, cotangents: Any) -> tuple[Any, Any, Any, Any]:
         """Return the cotangents of moving parameters (n, m), controls (solves, c, m), records and rate.
 
-        `states` are records (memory, used, x) and rate before the first step. `cotangents` are those of rows
-        (solves, nodes, x, m) and unknowns (solves, k, m), and of records and rate after the last step.
+        `cotangents` are those of rows (solves, nodes, x, m) and unknowns (solves, k, m), and of records and
+        rate after the last step.
         """
-        begun, count = self._begun(parameters, solved, controls, table, *states), len(controls)
+        begun, count = self._begun(solved), len(solved.controls)
         d_rows, d_unknowns, d_records, d_rate = (np.ascontiguousarray(each, float) for each in cotangents)
         m, parts = d_rate.shape[-1], (*self.tangents.records, self.tangents.rate)
         state = np.zeros((m, self.state_size))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.engine.places import values_along
+from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
 from knode_cosserat.rods.rod import Rod
 from knode_cosserat.rods.section import ALONG

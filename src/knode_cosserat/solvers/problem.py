@@ -1,4 +1,15 @@
-"""The equations of one time step along the rod: the problem that Newton's method (`boundary`) solves."""
+"""The boundary-value problem of one time step, solved at all nodes at once.
+
+Unknown are y at every node and the free numbers ξ at the base. Their equations:
+
+    y_0 = base(ξ),     y_{j+1} = y_j + h Σ bᵢ f(Yᵢ)  (a piece of the space scheme),     tip(y_N) = 0
+
+Newton's method linearises all pieces side by side, and one linear recursion along the rod gives the
+correction (`engine.elimination`). A linearisation costs as much as several corrections. It is kept, also from
+one time step to the next, while corrections converge fast. Corrections are damped by the natural monotonicity
+test: the correction that the same linearisation proposes at the new point must be shorter than the last one
+(Deuflhard, Newton Methods for Nonlinear Problems, 2004, ch. 3).
+"""
 
 from __future__ import annotations
 
@@ -119,7 +130,8 @@ class StepProblem(eqx.Module):
 
     def jump(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities."""
-        return semi_discrete.jump(self.system, acting, self.t, y, self.control, self._unpack(history))
+        point = Point(None, self.t, y, self.control, self._unpack(history))
+        return semi_discrete.jump(self.system, acting, point)
 
     def far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""

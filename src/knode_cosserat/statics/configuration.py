@@ -9,7 +9,7 @@ import numpy as np
 
 from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.settings import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
 from knode_cosserat.statics.response import Pose, first_solved, tip_pose

@@ -20,12 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, unknowns_of
-from knode_cosserat.solvers.boundary import NewtonOptions, pivots_of
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
 from knode_cosserat.statics.response import node_values
@@ -222,7 +221,8 @@ def _directions(
     scale, rows = np.asarray(scales.y), np.asarray(scales.tip)
     error = float(np.maximum(np.max(np.abs(defects) / scale), np.max(np.abs(tip) / rows)))
     try:
-        rod = _Elimination(*pieces, *at_ends, pivots=pivots_of(system))
+        pivots = np.asarray(system.y_layout.indices(system.base_unknowns))
+        rod = _Elimination(*pieces, *at_ends, pivots=pivots)
         at_tip, columns = rod.M @ rod.X[-1], scale[rod.pivots]
         # of a neutral family, the smallest solutions
         inverse = np.linalg.pinv(at_tip * columns / rows[:, None], NEUTRAL)

@@ -10,9 +10,9 @@ import numpy as np
 from knode_cosserat._reprs import packed_text, quantity, wrapped
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
+from knode_cosserat.solvers.settings import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import (
     checked_control,

@@ -25,8 +25,8 @@ from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
