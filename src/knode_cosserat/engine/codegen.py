@@ -39,6 +39,8 @@ def literal(value: float) -> str:
     return f"0x{struct.unpack('<Q', struct.pack('<d', float(value)))[0]:016X}"
 
 
+#: arrays with the addresses at which their sums are added, and which lanes are inside
+Sums = tuple[Sequence[tuple[int, "Value"]], Any]
 Operator = Callable[["Value", Any], "Value"]
 
 
@@ -534,19 +536,19 @@ class Function:
 
     def evaluate(
         self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int,
-        added: Sequence[tuple[int, Value]] = (), inside: Any = True,
+        sums: Sums = ((), True),
     ) -> dict[int, Any]:  # fmt: skip
         """Write the operations that outputs need, and return the values of all of them.
 
         `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
-        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. The sums
-        of the arrays `added` over the lanes `inside` are added to memory at their addresses.
+        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. `sums`
+        are arrays, the sums of which over the lanes inside are added to memory at their addresses.
         """
+        added, inside = sums
         values: dict[int, Any] = dict(known)
         parts = [part for node, _ in added for part, _ in summands(program, node)]
-        needed = program.needed([*outputs, *parts], frozenset(values))
-        arrays = ArrayCode(self, program, needed, outputs, values, parts)
-        for node in needed:
+        arrays = ArrayCode(self, program, outputs, parts, values)
+        for node in arrays.needed:
             if node in values:
                 continue
             operation, *arguments = program.operations[node]

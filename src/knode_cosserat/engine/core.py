@@ -441,10 +441,10 @@ class Core(EliminationCode):
             state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
             moved = self._evaluated(e.products["base"], 0, False, state)
             for k, value in enumerate(moved):
-                self._put(value, self.correction.w, k % e.ny, self.bases[k // e.ny])
+                self._put(value, self.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.correct, memory)
             for k in range(len(moved)):
-                self._put(0.0, self.correction.w, k % e.ny, self.bases[k // e.ny])
+                self._put(0.0, self.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.products, memory)
             for i, j, product in self._numbers_of(self.tangents, self.used):
                 once = product - self._wide(self.difference, i, j)

@@ -88,7 +88,7 @@ def parameters_of(system: System) -> np.ndarray:
     return np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])
 
 
-class PlaceCode:
+class _PlaceCode:
     """Machine code of a function of a system, a place s (m) and a control."""
 
     def __init__(
@@ -141,6 +141,6 @@ def values_along(function: Callable[[Any, Any, Any], Any], system: System, s: An
     """
     pattern, control = Pattern.of(system), np.asarray(control, dtype=float)
     code = compiled(
-        (pattern, function, len(control)), lambda: PlaceCode(function, pattern.system, len(control))
+        (pattern, function, len(control)), lambda: _PlaceCode(function, pattern.system, len(control))
     )
     return code.evaluate(np.concatenate([parameters_of(system), control]), np.asarray(s, dtype=float))

@@ -72,7 +72,7 @@ class Loop:
     source: str = ""
 
 
-class Product(NamedTuple):
+class _Product(NamedTuple):
     """Product of a Jacobian with a vector: nodes that depend linearly on inputs."""
 
     inputs: list[int]
@@ -110,7 +110,7 @@ def regular(positions: np.ndarray) -> Positions | None:
 
 
 @dataclasses.dataclass(eq=False)
-class Rule:
+class _Rule:
     """Derivative rule of a JAX function: of `jax.custom_jvp`, or of a linear solver."""
 
     function: Callable[..., Any]
@@ -120,7 +120,7 @@ class Rule:
     #: "hold" nodes of the results
     results: list[Nodes] = dataclasses.field(default_factory=list)
     #: places of the arguments with tangents, and the results' tangents, once needed
-    product: tuple[list[int], Product] | None = None
+    product: tuple[list[int], _Product] | None = None
 
     def traced(self) -> tuple[list[int], Any]:
         """Return the places of the arguments with tangents, and the jaxpr of the results' tangents."""
@@ -174,7 +174,7 @@ class Program:
         self.levels: list[int] = []
         self.loops: list[Loop] = []
         #: derivative rules of "hold" nodes, by node; None: the derivative is zero
-        self.rules: dict[int, Rule | None] = {}
+        self.rules: dict[int, _Rule | None] = {}
         #: shapes of arrays; other nodes are scalars
         self.shapes: dict[int, tuple[int, ...]] = {}
         self._boolean: list[bool] = []
@@ -399,7 +399,7 @@ class Program:
         stopped = self.operations[a][0] == "hold" and self.rules[a] is None
         return a if stopped else self.held(a, None)
 
-    def held(self, node: int, rule: Rule | None) -> int:
+    def held(self, node: int, rule: _Rule | None) -> int:
         """Return a node of the same value whose derivative follows a rule; None: it is zero."""
         while (known := self._memo.get(("held", node))) is not None:
             if self.rules[known] is rule:
@@ -417,7 +417,7 @@ class Program:
         """Return the results of a function with a derivative rule; `values` evaluates it."""
         key = ("rule", name, *(x for each in arguments for x in (each.shape, each.tobytes())))
         if key not in self._memo:
-            rule = Rule(function, shapes, arguments)
+            rule = _Rule(function, shapes, arguments)
             # before the results, because nodes are in the order of evaluation
             self._all_parts(arguments)
             for array in values():
@@ -739,10 +739,10 @@ class Program:
                 found.add(node)
         return found
 
-    def _partial(self, partial: Callable[..., Scalar | float], node: int) -> int:
+    def _partial(self, partial: Callable[..., _Scalar | float], node: int) -> int:
         """Return a partial derivative of an operation."""
-        value = partial(*(Scalar(self, each) for each in (node, *self.operations[node][1:])))
-        return value.node if isinstance(value, Scalar) else self.constant(value)
+        value = partial(*(_Scalar(self, each) for each in (node, *self.operations[node][1:])))
+        return value.node if isinstance(value, _Scalar) else self.constant(value)
 
     def _loop_error(self, node: int) -> EngineError:
         return EngineError(
@@ -821,7 +821,7 @@ class Program:
         keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
         is_sparse = 2 * sum(map(len, moving.values())) < len(moving) * len(keys)
         if len(moving) < 2 * len(keys) and is_sparse:
-            return {Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
+            return {_Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
         zero = np.full(scalars.size, self.constant(0.0))
         tangents = {}
         for key in keys:
@@ -836,7 +836,7 @@ class Program:
         total, zero = dict[Any, int](), self.constant(0.0)
         for key, tangent in found.get(array, {}).items():
             own = int(self.entries(tangent, self.shapes[array]).flat[k])
-            chain = found[key.node] if isinstance(key, Component) else {key: self.constant(1.0)}
+            chain = found[key.node] if isinstance(key, _Component) else {key: self.constant(1.0)}
             for variable, slope in chain.items():
                 total[variable] = self.apply("add", total.get(variable, zero), self.apply("mul", own, slope))
         return self._nonzero(total)
@@ -848,7 +848,7 @@ class Program:
         rule = self.rules[node]
         return () if rule is None else self._all_parts(rule.arguments)
 
-    def _by_rule(self, rule: Rule, found: Tangents) -> None:
+    def _by_rule(self, rule: _Rule, found: Tangents) -> None:
         """Add the tangents of all results of a rule."""
         moving = {node: found[node] for node in self._all_parts(rule.arguments) if found.get(node)}
         results = self._all_parts(rule.results)
@@ -863,7 +863,7 @@ class Program:
                 if not self.is_constant(tangent, 0.0):
                     found[node][key] = tangent
 
-    def _product(self, rule: Rule) -> tuple[list[int], Product]:
+    def _product(self, rule: _Rule) -> tuple[list[int], _Product]:
         """Return the active arguments of a rule, and its results' tangents."""
         if rule.product is None:
             active, jaxpr = rule.traced()
@@ -880,7 +880,7 @@ class Program:
                 if not depending.isdisjoint(self._sources(node)):
                     depending.add(node)
                     steps.append(node)
-            rule.product = active, Product(inputs, outputs, steps)
+            rule.product = active, _Product(inputs, outputs, steps)
         return rule.product
 
     def _sources(self, node: int) -> tuple[int, ...]:
@@ -891,7 +891,7 @@ class Program:
         results = self._all_parts(rule.results)
         return (*self._all_parts(rule.arguments), *(self.operations[each][1] for each in results))
 
-    def _replaced(self, product: Product, new: dict[int, int]) -> list[int]:
+    def _replaced(self, product: _Product, new: dict[int, int]) -> list[int]:
         """Return the outputs with other nodes in the place of the inputs."""
         for node in product.steps:
             rule = self.rules.get(node)
@@ -902,7 +902,7 @@ class Program:
                 continue
             arguments = [self._nodes([new.get(each, each) for each in self.parts(array)], array.shape)
                          for array in rule.arguments]  # fmt: skip
-            copy = Rule(rule.function, rule.shapes, arguments)
+            copy = _Rule(rule.function, rule.shapes, arguments)
             for array in rule.results:
                 parts = self.parts(array)
                 values = [self.operations[each][1] for each in parts]
@@ -939,38 +939,40 @@ class Program:
 
     def evaluate(self, closed_jaxpr: Any, arguments: Sequence[Nodes]) -> list[Nodes]:
         """Return the results of a jaxpr for arrays of nodes."""
-        return Evaluation(self).closed(closed_jaxpr, arguments)
+        return _Evaluation(self).closed(closed_jaxpr, arguments)
 
 
-class Component(NamedTuple):
+class _Component(NamedTuple):
     """Variable of a derivative: a scalar in an array."""
 
     node: int
 
 
-def _arithmetic(operation: str) -> tuple[Callable[[Scalar, Any], Scalar], Callable[[Scalar, Any], Scalar]]:
+def _arithmetic(
+    operation: str,
+) -> tuple[Callable[[_Scalar, Any], _Scalar], Callable[[_Scalar, Any], _Scalar]]:
     """Return an operator of scalars, and the one for a scalar on its right."""
     return (
         lambda x, other: x.of(operation, other),
-        lambda x, other: Scalar(x.program, x.program.constant(other)).of(operation, x),
+        lambda x, other: _Scalar(x.program, x.program.constant(other)).of(operation, x),
     )
 
 
-class Scalar:
+class _Scalar:
     """A node with arithmetic, to write formulas."""
 
     def __init__(self, program: Program, node: int) -> None:
         self.program = program
         self.node = node
 
-    def of(self, operation: str, *others: Scalar | float) -> Scalar:
+    def of(self, operation: str, *others: _Scalar | float) -> _Scalar:
         """Return an operation on this and on other scalars or numbers."""
         nodes = [
-            other.node if isinstance(other, Scalar) else self.program.constant(other) for other in others
+            other.node if isinstance(other, _Scalar) else self.program.constant(other) for other in others
         ]
-        return Scalar(self.program, self.program.apply(operation, self.node, *nodes))
+        return _Scalar(self.program, self.program.apply(operation, self.node, *nodes))
 
-    def __neg__(self) -> Scalar:
+    def __neg__(self) -> _Scalar:
         return self.of("neg")
 
     __add__, __radd__ = _arithmetic("add")
@@ -979,14 +981,14 @@ class Scalar:
     __truediv__, __rtruediv__ = _arithmetic("div")
 
 
-def _share(a: Scalar, b: Scalar, comparison: str) -> Scalar:
+def _share(a: _Scalar, b: _Scalar, comparison: str) -> _Scalar:
     """Return the derivative of max or min by the first argument: a half at ties."""
     tied = a.of("eq", b).of("select", 0.0, 0.5)
     return a.of(comparison, b).of("select", tied, 1.0)
 
 
 #: partial derivatives by each argument, from the result r and the arguments; other operations have none
-PARTIALS: dict[str, tuple[Callable[..., Scalar | float], ...]] = {
+PARTIALS: dict[str, tuple[Callable[..., _Scalar | float], ...]] = {
     "add": (lambda r, a, b: 1.0, lambda r, a, b: 1.0),
     "sub": (lambda r, a, b: 1.0, lambda r, a, b: -1.0),
     "mul": (lambda r, a, b: b, lambda r, a, b: a),
@@ -1018,24 +1020,24 @@ PARTIALS: dict[str, tuple[Callable[..., Scalar | float], ...]] = {
 }
 
 
-def _sinh(x: Scalar) -> Scalar:
+def _sinh(x: _Scalar) -> _Scalar:
     grown = x.of("expm1")
     return 0.5 * (grown + grown / (1.0 + grown))
 
 
-def _cbrt(x: Scalar) -> Scalar:
+def _cbrt(x: _Scalar) -> _Scalar:
     size = (x.of("abs").of("log") / 3.0).of("exp")
     return x.of("sign") * x.of("eq", 0.0).of("select", size, 0.0)
 
 
-def _rounded_to_even(x: Scalar) -> Scalar:
+def _rounded_to_even(x: _Scalar) -> _Scalar:
     up = (x + 0.5).of("floor")
     odd = up.of("rem", 2.0).of("ne", 0.0)
     return odd.of("and", (up - x).of("eq", 0.5)).of("select", up, up - 1.0)
 
 
 #: functions of one number by other operations
-FORMULAS: dict[str, Callable[[Scalar], Scalar]] = {
+FORMULAS: dict[str, Callable[[_Scalar], _Scalar]] = {
     "square": lambda x: x * x,
     "rsqrt": lambda x: 1.0 / x.of("sqrt"),
     "cbrt": _cbrt,
@@ -1101,7 +1103,7 @@ def source_line(equations: Sequence[Any]) -> str:
     return "unknown line"
 
 
-class Evaluation:
+class _Evaluation:
     """Evaluates jaxprs on the nodes of a program. Methods `_do_…` are of primitives."""
 
     def __init__(self, program: Program) -> None:
@@ -1266,8 +1268,8 @@ class Evaluation:
         is_even = int(e.params["rounding_method"]) == 1
         return self._of_one(_rounded_to_even if is_even else FORMULAS["round"], x)
 
-    def _of_one(self, formula: Callable[[Scalar], Scalar], x: Nodes) -> Nodes:
-        return self.elementwise(lambda node: formula(Scalar(self.program, node)).node, x)
+    def _of_one(self, formula: Callable[[_Scalar], _Scalar], x: Nodes) -> Nodes:
+        return self.elementwise(lambda node: formula(_Scalar(self.program, node)).node, x)
 
     def _do_xor(self, e: Any, a: Nodes, b: Nodes) -> Nodes:
         return self.elementwise(self._operation(e, "ne"), a, b)

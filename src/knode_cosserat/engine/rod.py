@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.engine.arrays import Stored
-from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, Sums, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
 from knode_cosserat.solvers.grid import grid_of
@@ -176,14 +176,14 @@ class RodCode(Memory):
 
     def _evaluated(
         self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any],
-        added: Sequence[tuple[int, Value]] = (), inside: Any = True,
+        sums: Sums = ((), True),
     ) -> list[Value]:  # fmt: skip
         """Write the operations of outputs at a place, and of arrays that are added (`Function.evaluate`)."""
         own = [int(each) for each in outputs]
-        self._outputs = [*own, *(node for node, _ in added)]
+        self._outputs = [*own, *(node for node, _ in sums[0])]
         lanes = self.L if wide else self.P
         known = self._known(j, wide, state)
-        values = self._now.evaluate(self.equations.program, own, known, lanes, added, inside)
+        values = self._now.evaluate(self.equations.program, own, known, lanes, sums)
         return [values[node] for node in own]
 
     def _write_setup(self) -> None:

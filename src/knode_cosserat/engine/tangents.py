@@ -19,7 +19,7 @@ from jaxtyping import Float
 from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Nonzeros, TangentEquations
-from knode_cosserat.engine.linear import Add, Clear, Loop, Number, Operation, Scale, write
+from knode_cosserat.engine.linear import Add, Loop, Number, Operation, Scale, write
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.problem import FILLING
@@ -40,7 +40,7 @@ class SolvedSteps(NamedTuple):
     rate: Float[Any, "used x"]
 
 
-class Tangents(NamedTuple):
+class _Tangents(NamedTuple):
     """Arrays of the tangents of a step, or of their cotangents."""
 
     #: the step's data: records and rate before it, control
@@ -70,7 +70,7 @@ class Tangents(NamedTuple):
     unknowns: Array
 
 
-class TangentCode(EliminationCode):
+class _TangentCode(EliminationCode):
     """Code of the derivatives of a system's solved steps, by all data of a step.
 
     The system changes in its `moving` parameters, a mask for each of its leaves. Functions are written by
@@ -109,7 +109,7 @@ class TangentCode(EliminationCode):
         groups = self.groups[1] * self.strands
         #: component of a packed row for each number of each strand's record
         self.packed = e.by_strand(np.arange(self.strands * numbers))
-        self.tangents = Tangents(
+        self.tangents = _Tangents(
             records, rate, many(e.nc, 1), many(numbers, self.used), many(nx, self.used),
             many(ny, self.pieces), many(ny, self.pieces), many(ny, self.used - self.ends),
             many(1, self.pieces), many(ny, self.pieces), many(k, 1), many(ny * self.strands, 1),
@@ -258,7 +258,7 @@ class TangentCode(EliminationCode):
     def _by_data(self, name: str, j: Any, places: Sequence[Any]) -> list[Operation]:
         """Set results at fixed y, by the history at a place of each strand, and by the control."""
         e, t, target = self.equations, self.tangents, self.results[name]
-        found: list[Operation] = [Clear(Number(target, i, j)) for i in range(target.size)]
+        found: list[Operation] = [Scale(Number(target, i, j)) for i in range(target.size)]
         for nonzeros, matrix, source, at in (
             (e.by_history[name], self.by_history[name], t.history, places),
             (e.by_control[name], self.by_control[name], t.control, (0,)),
@@ -277,13 +277,13 @@ class TangentCode(EliminationCode):
         def at_place(j: Index) -> list[Operation]:
             found = list[Operation]()
             for i in range(t.history.size):
-                found.append(Clear(Number(t.history, i, j)))
+                found.append(Scale(Number(t.history, i, j)))
                 for part, weight in zip((*t.records, t.rate), weights, strict=False):
                     found.append(Add(Number(t.history, i, j), Number(part, i, j), weight))
             return found + self._by_data("rates", j, [j])
 
         def behind(j: Index) -> list[Operation]:
-            return [Clear(Number(t.lengths, 0, j)), *self._by_data("far", j, [j])]
+            return [Scale(Number(t.lengths, 0, j)), *self._by_data("far", j, [j])]
 
         return [
             Loop(0, self.used, at_place), Loop(0, self.pieces, behind),
@@ -344,7 +344,7 @@ class TangentCode(EliminationCode):
             """Set y at a stage at fixed y, and add its part of the rates there."""
             (stage, first), at = stages[k], j + k * self.pieces
             own = [Number(t.between, i, at) for i in range(e.ny)]
-            found: list[Operation] = [Clear(number) for number in own]
+            found: list[Operation] = [Scale(number) for number in own]
             if self.far is not None:
                 found += [Add(own[i], Number(t.far, i, j), 1.0 - stage.end) for i in range(e.ny)]
             found += by_length(stage.rates, own.__getitem__, j)
@@ -353,7 +353,7 @@ class TangentCode(EliminationCode):
 
         def defect(j: Index) -> list[Operation]:
             r = [Number(t.r, i, j) for i in range(e.ny)]
-            found: list[Operation] = [Clear(number) for number in r]
+            found: list[Operation] = [Scale(number) for number in r]
             found += [Add(r[i], Number(t.far, i, j)) for i in range(e.ny)]
             found += by_length(formula.weights, r.__getitem__, j)
             return found + increment(formula.weights, r.__getitem__, t.rates, j)
@@ -370,7 +370,7 @@ class TangentCode(EliminationCode):
 
         def changed(j: Index) -> list[Operation]:
             """Set the change of rates at ends of pieces by y."""
-            found: list[Operation] = [Clear(Number(t.change, i, j)) for i in range(e.ny)]
+            found: list[Operation] = [Scale(Number(t.change, i, j)) for i in range(e.ny)]
             return found + slopes_by((t.change, j), lambda c: Number(t.newest, c, j), j)
 
         def solved_between(k: int, j: Index) -> list[Operation]:
@@ -382,7 +382,7 @@ class TangentCode(EliminationCode):
                 found.append(Add(own[i], Number(t.newest, i, j), 1.0 - stage.end))
                 found.append(Add(own[i], Number(t.y, i, j + 1), stage.end))
             found += increment(stage.rates, own.__getitem__, t.change, j)
-            found += [Clear(Number(t.change, i, j + first)) for i in range(e.ny)]
+            found += [Scale(Number(t.change, i, j + first)) for i in range(e.ny)]
             found += slopes_by((t.change, j + first), own.__getitem__, j + first)
             found += [Add(Number(t.between, i, at), own[i]) for i in range(e.ny)]
             return found + _copies(e.ny, (t.newest, j + first), (t.between, at))
@@ -410,7 +410,7 @@ class TangentCode(EliminationCode):
             found += _products(strains, (self.z_by_y, j), (t.newest, j), (t.newest, j))
             for i in range(e.numbers - e.ny - e.nz):
                 rate = Number(t.newest, e.ny + e.nz + i, j)
-                found += [Clear(rate), Add(rate, Number(t.rates, i, j)), Add(rate, Number(t.change, i, j))]
+                found += [Scale(rate), Add(rate, Number(t.rates, i, j)), Add(rate, Number(t.change, i, j))]
             if self.settings.uses_rate:
                 found += _copies(e.numbers, (t.rate, j), (t.history, j))
                 for i in range(e.numbers):
@@ -445,7 +445,7 @@ class TangentCode(EliminationCode):
         def piece(j: Index) -> list[Operation]:
             end, found = [Number(t.w, i, j + 1) for i in range(ny)], list[Operation]()
             for i in range(ny):
-                found += [Clear(end[i]), Add(end[i], Number(t.r, i, j))]
+                found += [Scale(end[i]), Add(end[i], Number(t.r, i, j))]
             for i, c in zip(*np.nonzero(el.matrix != el.program.constant(0.0)), strict=True):
                 entry: Any = el.program.values[int(el.matrix[i, c])]
                 if (i, c) in entries:
@@ -484,7 +484,7 @@ class TangentCode(EliminationCode):
             found = solved(alpha + 1, end)
             for c in range(own):
                 found += [
-                    Clear(Number(t.alpha, c, alpha)),
+                    Scale(Number(t.alpha, c, alpha)),
                     Add(Number(t.beta, c, group), Number(t.alpha, c, alpha + 1), is_negative=True),
                 ]
             for i, c in np.ndindex(own, own):
@@ -519,7 +519,7 @@ class TangentCode(EliminationCode):
             entry = self._entry_at(self.M, k, i, component, strand)
             at_tip.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))
         alpha = [Number(t.alpha, i % own, i // own * (count + 1) + count) for i in range(k)]
-        at_tip += map(Clear, alpha)
+        at_tip += map(Scale, alpha)
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
             at_tip.append(Add(alpha[i], Number(t.tip, c), entry, is_negative=True))
@@ -555,7 +555,7 @@ class TangentCode(EliminationCode):
         return [memory, *(np.ascontiguousarray(each, float) for each in data)]
 
 
-class TangentCore(TangentCode):
+class TangentCore(_TangentCode):
     """Machine code of the tangents of solved steps, as many side by side as there are lanes."""
 
     transposed = False
@@ -704,7 +704,7 @@ class TangentCore(TangentCode):
         return found, (d_rows[..., :m], d_unknowns[..., :m])
 
 
-class CotangentCore(TangentCode):
+class CotangentCore(_TangentCode):
     """Machine code of the cotangents of solved steps, one after the other."""
 
     transposed = True
@@ -750,7 +750,7 @@ class CotangentCore(TangentCode):
                 for i, node in enumerate(e.cotangents[name]):
                     here[int(node)] = self._wide(self.results[name], i, j)
                 nodes, added = self._parted(e.pulled[name])
-                *values, place = self._evaluated(nodes, j, True, here, added, inside)
+                *values, place = self._evaluated(nodes, j, True, here, (added, inside))
                 for k, value in enumerate(values):
                     own = f.select(inside, f.splat(value, self.L), 0.0)
                     self._put(self._get(self.term, k, 0, self.L) + own, self.term, k, 0, self.L)
@@ -762,7 +762,7 @@ class CotangentCore(TangentCode):
             for i, node in enumerate(e.cotangents[name]):
                 here[int(node)] = self._get(self.results[name], i)
             nodes, added = self._parted(e.pulled[name])
-            values = self._evaluated(nodes, 0, False, here | known, added)
+            values = self._evaluated(nodes, 0, False, here | known, (added, True))
             sums = [a + b for a, b in zip(sums, values, strict=False)]
         given = self._parameters(e.by_terms) | terms
         given |= {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
@@ -799,7 +799,7 @@ class CotangentCore(TangentCode):
         """Add cotangents of the moving parameters to those known."""
         (nodes, added), program = self._parted(cotangents), self.equations.program
         moving = {k: node for k, node in enumerate(nodes) if not program.is_constant(node, 0.0)}
-        values = self._now.evaluate(program, [*moving.values()], known, 1, added)
+        values = self._now.evaluate(program, [*moving.values()], known, 1, (added, True))
         for k, node in moving.items():
             self._put(self._get(self.parameter, k) + values[node], self.parameter, k)
 
@@ -931,5 +931,5 @@ def _set(pairs: Iterable[tuple[Number, Number]]) -> list[Operation]:
     """Set the first number of each pair to the second."""
     found = list[Operation]()
     for target, source in pairs:
-        found += [Clear(target), Add(target, source)]
+        found += [Scale(target), Add(target, source)]
     return found

@@ -122,10 +122,12 @@ class Recovery(abc.ABC):
         """
         began, newton = time.perf_counter(), self.settings.newton
         newton = dataclasses.replace(newton, max_linearisations=MOST_LINEARISATIONS)
-        steps = StepCoefficients.of(dataclasses.replace(self.settings, newton=newton))
+        patient = dataclasses.replace(self.settings, newton=newton)
         start, weights, step = guess, EXTRAPOLATIONS[0], self.step
-        if step is not None:
-            steps = steps._replace(table=np.asarray(step.coefficients)[None], dt=step.t, ends=1.0)
+        if step is None:
+            steps = StepCoefficients.of(patient)
+        else:
+            steps = StepCoefficients(patient, np.asarray(step.coefficients)[None], step.t)
             # the first guess is the newest of the earlier states
             start = step.past._replace(y=np.stack([guess, *step.past.y[:-1]]), weights=weights, t0=0.0)
         _, state, rows = engine.solve_steps(
