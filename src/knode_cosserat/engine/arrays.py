@@ -57,7 +57,7 @@ class ArrayCode:
         self.function, self.program, self._values = function, program, values
         whole = {*outputs, *added}
         stored = {node for node in outputs if node in program.shapes}
-        #: entries that are needed, of arrays of which only entries are
+        #: needed entries of arrays that are not needed as a whole
         self._entries: dict[int, list[int]] = {}
         for node in self.needed:
             name, *rest = program.operations[node]

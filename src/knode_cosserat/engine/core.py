@@ -267,7 +267,7 @@ class Core(EliminationCode):
         f.call(self.weigh, memory)
         largest = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
-        # what the solution has left: no part of its errors
+        # the residual of the solution is no part of its errors
         self._copy_wide(self.r, self.rest, self.pieces)
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)

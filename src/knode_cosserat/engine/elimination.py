@@ -83,8 +83,8 @@ class EliminationCode(RodCode):
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k)
         self.dy, self.step_unknowns = a(ny, self.ends), a(k)
-        #: corrections along the rod without those of the unknowns, what the groups of pieces take from them,
-        #: the sum of both, and the corrections of the unknowns of each strand
+        #: corrections along the rod at fixed unknowns, changes of unknowns at the ends of groups of pieces, all
+        #: corrections, and those of each strand's unknowns
         self.w, self.beta = by_rows(ny, 1, self.points), by_rows(self.own, 1, self.groups[1] * self.strands)
         self.column_dy = self.dy if robots else by_rows(ny, 1, self.points)
         self.alpha = by_rows(self.own, 1, self.strands)
@@ -159,7 +159,7 @@ class EliminationCode(RodCode):
             f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
 
     def _write_advance(self) -> Function:
-        """A column at a piece's start to its end: B⁻¹ A x plus what is added."""
+        """A column at a piece's start to its end: B⁻¹ A x plus an added column."""
         el, n = self.elimination, self.equations.ny
         f = self._function("advance", "from", "added", "to", "n_piece")
         _, source, added, target, piece = f.arguments

@@ -321,7 +321,7 @@ class TangentEquations(Equations):
 class Elimination:
     """Programs of a piece: A and B are derivatives of its defect by y at its start (before jumps) and end.
 
-    B is factored. A correction x of the start goes on as B⁻¹ (A x + r).
+    B is factored. A correction x of the start becomes B⁻¹ (A x + r) at the end.
     """
 
     def __init__(self, equations: Equations):

@@ -59,7 +59,7 @@ class Memory:
         return found
 
     def _by_rows(self, rows: int, columns: int, count: int) -> Array:
-        """Reserve matrices of which a vector holds a row of all robots, or as many rows as lanes."""
+        """Reserve matrices by columns: a vector has a row of all robots, or as many rows as lanes."""
         size = columns * self._padded(rows)
         if self.batch:
             return self._array(size, count)

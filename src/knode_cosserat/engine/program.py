@@ -571,7 +571,7 @@ class Program:
         return self.view(other, np.arange(chosen.size).reshape(shape)[..., int(column.argmax())])
 
     def parts(self, nodes: Nodes) -> list[int]:
-        """Return the array of which scalars are entries, or the scalars."""
+        """Return the one array with these scalars as entries, or the scalars."""
         return [self.array(nodes)] if self.is_computed(nodes) else nodes.ravel().tolist()
 
     def _all_parts(self, arrays: Iterable[Nodes]) -> list[int]:

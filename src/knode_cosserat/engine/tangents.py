@@ -528,7 +528,7 @@ class _TangentCode(EliminationCode):
         ]  # fmt: skip
 
     def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Number:
-        """Return an entry of a matrix of which a vector holds rows."""
+        """Return an entry of a matrix with rows in lanes."""
         return Number(matrix, c * self._padded(rows) + i, j)
 
     # running
@@ -561,7 +561,7 @@ class TangentCore(_TangentCode):
     transposed = False
 
     def _reserve_state(self) -> None:
-        #: what is added to the residual of the tip's conditions
+        #: added to the residual of the tip's conditions
         self.added_tip = self._tangent_array(self.equations.k, 1, 1)
 
     def _reserve_products(self) -> None:

@@ -128,16 +128,23 @@ class LinearStep:
         return self.law.C + self.c0 * self.law.D
 
 
+@dataclasses.dataclass
 class MaterialStep:
     """Strains by their elastic laws of this step, then internal variables."""
 
-    def __init__(self, law: MaterialLaw, layout: Layout, c0: Any, hz: Any, internal: Fields, length: Any):
-        self.law, self.layout, self.c0, self.length = law, layout, c0, length
+    law: MaterialLaw
+    layout: Layout
+    c0: Any
+    hz: Float[Any, " z"]
+    #: internal variables that do not depend on the strains
+    internal: Fields
+    #: length of the rod (m)
+    length: Any
+
+    def __post_init__(self) -> None:
         #: history of each field of z
-        self.history: Fields = dict(zip(layout.names, layout.split(hz), strict=True))
-        #: internal variables that do not depend on the strains
-        self.internal = internal
-        self.elastic = {name: self._elastic(name, strain) for name, strain in law.strains.items()}
+        self.history: Fields = dict(zip(self.layout.names, self.layout.split(self.hz), strict=True))
+        self.elastic = {name: self._elastic(name, strain) for name, strain in self.law.strains.items()}
 
     @property
     def linear(self) -> bool:

@@ -146,14 +146,21 @@ class Recovery(abc.ABC):
         """Return True if the attempt is a solution."""
         return bool(found.row.error <= self.settings.newton.acceptable)
 
-    def recover(self, controls: tuple[Any, Any]) -> SolvedStep:
-        """Solve the step by all methods in order. `controls` are the previous step's and this one's."""
+    def recover(
+        self, controls: tuple[Any, Any], has_direct: bool = True, has_last: bool = True
+    ) -> SolvedStep:
+        """Solve the step by all methods in order. `controls` are the previous step's and this one's.
+
+        The direct methods solve the step itself, the last one may change the problem on the way.
+        """
         if self.budget.seconds <= 0.0:
             return self._given_up(controls[1])
         best: list[SolvedStep] = []
         cause = ""
         try:
-            found = self._by_all_methods(controls, best)
+            found = self._directly(controls, best) if has_direct else None
+            if found is None and has_last:
+                found = self.last_method(controls)
             if found is not None:
                 return self._outcome(*found)
         except TimeoutError:
@@ -182,10 +189,10 @@ class Recovery(abc.ABC):
             result = Result.COARSE
         return SolvedStep(found.state, row._replace(corrections=self.corrections, result=int(result)))
 
-    def _by_all_methods(
+    def _directly(
         self, controls: tuple[Any, Any], best: list[SolvedStep]
     ) -> tuple[Result, SolvedStep] | None:
-        """Try all methods in order; attempts from direct guesses are added to `best`."""
+        """Try guesses, load continuation and easing; attempts from guesses are added to `best`."""
         for guess in self.first_guesses(controls[1]):
             found = self.solve(controls[1], guess)
             best.append(found)
@@ -195,9 +202,7 @@ class Recovery(abc.ABC):
         if continued is not None:
             return Result.RECOVERED_LOAD_CONTINUATION, continued
         eased = self.ease(controls[1])
-        if eased is not None:
-            return Result.RECOVERED_EASING, eased
-        return self.last_method(controls)
+        return None if eased is None else (Result.RECOVERED_EASING, eased)
 
     def continue_load(self, before: Any, now: Any) -> SolvedStep | None:
         """Continue from the previous control to this one in load steps, each from the last solution."""
@@ -320,20 +325,6 @@ class StepRecovery(Recovery):
         )
 
 
-class _Substeps(StepRecovery):
-    """Recovery of a step of several stages by substeps of one stage, its last method."""
-
-    def first_guesses(self, control: Any) -> list[Any]:
-        """Return none: a whole step of one stage would be another scheme's."""
-        return []
-
-    def continue_load(self, before: Any, now: Any) -> None:
-        """Return None, as for `first_guesses`."""
-
-    def ease(self, control: Any) -> None:
-        """Return None, as for `first_guesses`."""
-
-
 def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedStep:
     """Recover a step of several stages: each stage, or all of them by substeps of a multistep scheme."""
     system, settings, step, dt, budget = whole.system, whole.settings, whole.step, whole.dt, whole.budget
@@ -341,8 +332,9 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
     before, now = (np.broadcast_to(np.reshape(each, (-1, shape[1])), shape) for each in controls)
     last, past, found = before[-1], step.past, []
     for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):
-        stage = _Stage(system, settings, TimeStep(past, coefficients, t), dt, budget)
-        solved = stage.recover((last, own))
+        stage = StepRecovery(system, settings, TimeStep(past, coefficients, t), dt, budget)
+        # the whole step is divided, not a stage
+        solved = stage.recover((last, own), has_last=False)
         if solved.row.result < 0:
             break
         found.append(solved.row)
@@ -357,19 +349,14 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
     one = TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
-    solved = _Substeps(system, settings, one, dt, budget).recover((before[-1], now[-1]))
+    # without direct methods: a whole step of one stage would be another scheme's
+    divided = StepRecovery(system, settings, one, dt, budget)
+    solved = divided.recover((before[-1], now[-1]), has_direct=False)
     lost = solved.state._replace(time_error=np.full_like(solved.state.time_error, np.nan))
     row, count = solved.row, settings.stages - 1
     # between the ends of such a step no stages are known
     stages, unknowns = (np.repeat(each[None], count, axis=0) for each in (row.records, row.unknowns))
     return solved._replace(state=lost, row=row._replace(stages=stages, stage_unknowns=unknowns))
-
-
-class _Stage(StepRecovery):
-    """Recovery of one stage, which cannot be divided."""
-
-    def last_method(self, controls: tuple[Any, Any]) -> None:
-        """Return None: the whole step is divided instead."""
 
 
 class StaticRecovery(Recovery):

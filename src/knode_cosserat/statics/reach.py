@@ -234,10 +234,10 @@ def _one(
         if wanted.reached(found):
             break
     if best is None:
-        return _nothing(search, begin), begin, None
+        return _outcome(search, wanted, begin, None, Reach.NO_EQUILIBRIUM), begin, None
     _, u, found, settled = best
     result = Reach.UNREACHABLE if settled else Reach.NOT_CONVERGED
-    return _told(search, wanted, u, found, Reach.REACHED if wanted.reached(found) else result), u, found
+    return _outcome(search, wanted, u, found, Reach.REACHED if wanted.reached(found) else result), u, found
 
 
 def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
@@ -246,19 +246,30 @@ def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
     return np.where(free, sample(np.zeros(size), np.ones(size), max(count, 1))[:count], 0.0)
 
 
-def _told(
-    search: _Search, wanted: _Wanted, u: np.ndarray, found: Response, result: Reach
+def _outcome(
+    search: _Search, wanted: _Wanted, u: np.ndarray, found: Response | None, result: Reach
 ) -> InverseKinematics:
-    control = search.control(u)
-    position, turned = wanted.errors(found)
-    same = _from_rest(search, control, found)
-    y, z = node_values(search.system, search.settings, control, found.y)
+    """Return the result for an equilibrium, or for none: NaN."""
+    system, control = search.system, search.control(u)
+    errors, same, code, residual = (np.nan, np.nan), False, Result.NO_CONVERGENCE, np.inf
+    if found is None:
+        position, quaternion = search.pose(system, np.full(system.y_layout.size, np.nan))
+        y, z = (np.full((system.nodes, each.size), np.nan) for each in (system.y_layout, system.z_layout))
+    else:
+        position, quaternion, code, residual = (
+            found.position, found.quaternion, Result.CONVERGED, float(found.error)
+        )  # fmt: skip
+        errors = tuple(float(np.linalg.norm(each)) for each in wanted.errors(found))  # type: ignore[assignment]
+        same = _from_rest(search, control, found)
+        y, z = node_values(system, search.settings, control, found.y)
+    rest = Trajectory(
+        system=system, settings=search.settings, time=np.zeros(1), control=control[None],
+        y=np.asarray(y)[None], z=np.asarray(z)[None], result=np.array([int(code)]),
+        residual=np.array([residual]), iterations=np.zeros(1, int),
+    )  # fmt: skip
     return InverseKinematics(
-        result, control, np.asarray(found.position),
-        None if found.quaternion is None else np.asarray(found.quaternion),
-        float(np.linalg.norm(position)), float(np.linalg.norm(turned)),
-        control <= search.low, control >= search.high, same, search.trials,
-        _rest(search, control, (y, z), Result.CONVERGED, float(found.error)),
+        result, control, np.asarray(position), None if quaternion is None else np.asarray(quaternion),
+        *errors, control <= search.low, control >= search.high, same, search.trials, rest,
     )  # fmt: skip
 
 
@@ -293,27 +304,6 @@ def _same_shape(system: System, one: np.ndarray, other: np.ndarray) -> bool:
     # the distance of unit quaternions, up to sign, is half the angle between them
     turned = 2.0 * np.minimum(np.linalg.norm(g - h, axis=-1), np.linalg.norm(g + h, axis=-1))
     return max(off, float(np.max(turned))) <= SAME_SHAPE
-
-
-def _nothing(search: _Search, u: np.ndarray) -> InverseKinematics:
-    control = search.control(u)
-    system = search.system
-    position, quaternion = search.pose(system, np.full(system.y_layout.size, np.nan))
-    nothing = [np.full((system.nodes, layout.size), np.nan) for layout in (system.y_layout, system.z_layout)]
-    return InverseKinematics(
-        Reach.NO_EQUILIBRIUM, control, np.asarray(position),
-        None if quaternion is None else np.asarray(quaternion), np.nan, np.nan,
-        control <= search.low, control >= search.high, False, search.trials,
-        _rest(search, control, nothing, Result.NO_CONVERGENCE, np.inf),
-    )  # fmt: skip
-
-
-def _rest(search: _Search, control: np.ndarray, state: Any, result: Result, residual: float) -> Trajectory:
-    y, z = (np.asarray(part)[None] for part in state)
-    return Trajectory(
-        system=search.system, settings=search.settings, time=np.zeros(1), y=y, z=z, control=control[None],
-        result=np.array([int(result)]), residual=np.array([residual]), iterations=np.zeros(1, int),
-    )  # fmt: skip
 
 
 def _checked_wanted(
