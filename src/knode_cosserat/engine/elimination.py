@@ -83,8 +83,8 @@ class EliminationCode(RodCode):
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k)
         self.dy, self.step_unknowns = a(ny, self.ends), a(k)
-        #: corrections along the rod at fixed unknowns, changes of unknowns at the ends of groups of pieces, all
-        #: corrections, and those of each strand's unknowns
+        #: corrections along the rod at fixed unknowns, changes of unknowns at the ends of groups of pieces,
+        #: all corrections, and those of each strand's unknowns
         self.w, self.beta = by_rows(ny, 1, self.points), by_rows(self.own, 1, self.groups[1] * self.strands)
         self.column_dy = self.dy if robots else by_rows(ny, 1, self.points)
         self.alpha = by_rows(self.own, 1, self.strands)

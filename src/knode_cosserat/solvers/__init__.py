@@ -10,7 +10,6 @@ from knode_cosserat._lazy import make_lazy
 if TYPE_CHECKING:
     from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
     from knode_cosserat.solvers.result import Result, SimulationError
-    from knode_cosserat.solvers.semi_discrete import History
     from knode_cosserat.solvers.settings import NewtonOptions, Settings
     from knode_cosserat.solvers.simulate import simulate
     from knode_cosserat.solvers.space import Euler, Lobatto2, Lobatto4
@@ -23,7 +22,6 @@ __all__ = [
     "SDIRK2",
     "BDFAlpha",
     "Euler",
-    "History",
     "Lobatto2",
     "Lobatto4",
     "NewtonOptions",
@@ -43,7 +41,6 @@ make_lazy(
     {
         "knode_cosserat.solvers.equilibrium": "equilibria equilibrium",
         "knode_cosserat.solvers.result": "Result SimulationError",
-        "knode_cosserat.solvers.semi_discrete": "History",
         "knode_cosserat.solvers.settings": "NewtonOptions Settings",
         "knode_cosserat.solvers.simulate": "simulate",
         "knode_cosserat.solvers.space": "Euler Lobatto2 Lobatto4",
