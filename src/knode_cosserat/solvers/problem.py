@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System, is_traced
@@ -156,17 +156,12 @@ class StepProblem(eqx.Module):
 
     def _evaluated(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any]:
         """Return f and z at places, from y there."""
-        s, history = self._each_strand(self.places[lanes]), self.history_by_strand(self.history[lanes])
-        f, z = jax.vmap(self.point_rates)(s, self.by_strand(y), history)
+        system, s = self.system, self.places[lanes]
+        s = jnp.repeat(s, system.strands) if system.strands > 1 else s
+        # a lane for each strand
+        parts = in_strands(system, y), records_in_strands(system, self.history[lanes])
+        f, z = jax.vmap(self.point_rates)(s, *(part.reshape(-1, part.shape[-1]) for part in parts))
         return f.reshape(len(y), -1), z.reshape(len(y), -1)
-
-    def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
-        """Return the places at the ends of pieces that the scheme uses (all if `every`), and y there."""
-        far = self.far(y)
-        if not (every or self.space.implicit):
-            return slice(0, self.grid.tip), far
-        grid = self.grid
-        return slice(0, grid.ends), jnp.concatenate([far, y[-1:], taken(y, grid.near)])
 
     def lengths(self) -> Float[Any, "pieces 1"]:
         """Return the lengths of all pieces (m)."""
@@ -195,9 +190,11 @@ class StepProblem(eqx.Module):
         return found
 
     def ends(self, y: Float[Any, "points y"], every: bool = True) -> Stages:
-        """Evaluate the equations at the ends of pieces."""
-        lanes, ends = self._ends(y, every)
-        f, z = self._evaluated(lanes, ends)
+        """Evaluate the equations at the ends of pieces: at `every` end, or at those that the scheme uses."""
+        grid, ends = self.grid, self.far(y)
+        if every or self.space.implicit:
+            ends = jnp.concatenate([ends, y[-1:], taken(y, grid.near)])
+        f, z = self._evaluated(slice(0, len(ends)), ends)
         return Stages([ends], [f], [z])
 
     def between(self, stage: Any, start: Any, end: Any, rates: list[Any]) -> Any:
@@ -205,29 +202,23 @@ class StepProblem(eqx.Module):
         moved = sum(x * f for x, f in zip(stage.rates, rates, strict=False) if x)
         return (1.0 - stage.end) * start + stage.end * end + self.lengths() * moved
 
-    def reached_by(self, formula: Formula, found: Stages) -> Float[Any, "pieces y"]:
-        """Return y at the ends of pieces by a formula, from its stages."""
-        rates = [*self.at_ends(found.f[0]), *found.f[1:]]
-        moved = sum(b * f for b, f in zip(formula.weights, rates, strict=False) if b)
-        return found.y[0][: self.grid.tip] + self.lengths() * moved
-
     def reached(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y at the ends of all pieces by the scheme."""
         formula = self.space.formula
-        return self.reached_by(formula, self.stages(y, formula))
+        found = self.stages(y, formula)
+        rates = [*self.at_ends(found.f[0]), *found.f[1:]]
+        moved = sum(b * f for b, f in zip(formula.weights, rates, strict=False) if b)
+        return found.y[0][: self.grid.tip] + self.lengths() * moved
 
     def residuals(self, y: Float[Any, "points y"]) -> tuple[Any, Any]:
         """Return the defects of all pieces (y at the end by the scheme, minus y), and the tip's residual."""
         return self.reached(y) - y[1:], self.tip_residual(y[-1])
 
-    def packed(self, found: Stages) -> Float[Any, "places x"]:
-        """Pack stages into the records that later steps need: y, z and, if B is not zero, y_s."""
+    def records(self, y: Float[Any, "points y"]) -> Float[Any, "places x"]:
+        """Return the records that later steps need, at every place: y, z and, if B is not zero, y_s."""
+        found = self.stages(y, self.space.check, self.ends(y))
         parts = [found.y, found.z, found.f] if self.system.mixed else [found.y, found.z]
         return jnp.concatenate([jnp.concatenate(part) for part in parts], axis=-1)
-
-    def records(self, y: Float[Any, "points y"]) -> Float[Any, "places x"]:
-        """Return the records of a state at every place."""
-        return self.packed(self.stages(y, self.space.check, self.ends(y)))
 
     def evaluated(self, y: Float[Any, "n y"]) -> Evaluated:
         """Return the state of y at all points, or at the nodes."""
@@ -262,18 +253,3 @@ class StepProblem(eqx.Module):
             return y.at[1:].add(jnp.where(before, change, 0.0))
 
         return jax.lax.fori_loop(0, FILLING * most, corrected, found)
-
-    # strands
-
-    def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "n_strands ..."]:
-        return jnp.repeat(values, self.system.strands, axis=0) if self.system.strands > 1 else values
-
-    def by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
-        """Return rows of y or z split by strand."""
-        own = in_strands(self.system, rows)
-        return own.reshape(-1, own.shape[-1])
-
-    def history_by_strand(self, records: Float[Any, "n x"]) -> Float[Any, "n_strands own"]:
-        """Return packed records of history split by strand."""
-        own = records_in_strands(self.system, records)
-        return own.reshape(-1, own.shape[-1])
