@@ -237,11 +237,6 @@ def still_records(
     return numeric.where(solved, still.records, at_places(system, space, nodes))
 
 
-def rows_suffice(system: System, space: SpaceScheme) -> bool:
-    """True if rows hold every state that steps need: no stages between nodes, no discontinuities, B zero."""
-    return not (system.mixed or space.formula.stages or system.cuts)
-
-
 # the steps of a run, and their results
 
 #: a row is COARSE if its position error is above this part of the length, or its orientation error above this

@@ -246,25 +246,19 @@ def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> Simulat
     return SimulationError(number, t, float(rows.error[i]), Result(int(rows.result[i])), cause, robot)
 
 
-def time_error_of(system: System, rows: StepRows) -> Any:
-    """Return the estimated errors in time (m); NaN if there is none, or if it is more than the length."""
-    numeric: Any = jnp if is_traced(rows) else np
-    length = system.length[..., None] if np.ndim(system.length) else system.length
-    known = (numeric.asarray(rows.result) >= 0) & (rows.time_error <= length)
-    return numeric.where(known, rows.time_error, numeric.nan)
-
-
 def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
     """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
     numeric: Any = jnp if is_traced(rows) else np
     ny, nz = system.y_layout.size, system.z_layout.size
     invalid = numeric.asarray(rows.result) < 0
+    length = system.length[..., None] if np.ndim(system.length) else system.length
     records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
     found = {
         "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
         "residual": rows.error, "iterations": rows.corrections,
         "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
-        "time_error": time_error_of(system, rows),
+        # an estimate beyond the rod's length is none
+        "time_error": numeric.where(~invalid & (rows.time_error <= length), rows.time_error, numeric.nan),
     }  # fmt: skip
     if rows.stages.shape[-3]:
         found["stages"] = numeric.where(invalid[..., None, None, None], numeric.nan, rows.stages)

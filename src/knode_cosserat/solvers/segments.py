@@ -25,7 +25,7 @@ from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import ON_NODE, at_places, grid_of, inside
-from knode_cosserat.solvers.history import coefficient_table, history_of, rows_suffice
+from knode_cosserat.solvers.history import coefficient_table, history_of
 from knode_cosserat.solvers.replay import replay, replayed_settings
 from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.settings import MEASURED, Settings
@@ -210,8 +210,11 @@ def samples(
 
 def rows_are_states(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
     """True if the rows hold every state that steps need, or were not simulated."""
-    made = [each.settings for each in trajectories]
-    return all(settings is None or rows_suffice(knowledge, settings.space) for settings in made)
+    if not any(each.settings for each in trajectories):
+        return True
+    # no stages between nodes, no discontinuities, B zero
+    stages = any(each.settings.space.formula.stages for each in trajectories if each.settings)
+    return not (knowledge.mixed or stages or knowledge.cuts)
 
 
 def strand_samples(knowledge: System, data: Dataset) -> Dataset:
@@ -311,16 +314,13 @@ def _past_of_rows(
     simulated = trajectory.settings is not None
     known = replay(trajectory, model) if model is not None and simulated else None
     if known is None:
-        past = jax.vmap(lambda each: segment_history(knowledge, space, each))(history)
+        past = jax.vmap(lambda each: in_segments(knowledge, space, at_places(knowledge, space, each)))(
+            history
+        )
     else:
         along = known.terms[rows - known.first]
         past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along)
     return np.asarray(past[0]), np.asarray(past[1])
-
-
-def segment_history(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
-    """Return `Samples.history` and `Samples.later` of one row's segments, from its history at the nodes."""
-    return in_segments(knowledge, space, at_places(knowledge, space, records))
 
 
 def in_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "places x"]) -> Any:

@@ -125,7 +125,9 @@ def simulate(
     if initial is not None:
         check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
-    bare, before = without_range(system), without_range(unmarked(initial))
+    bare, before = without_range(system), None
+    if initial is not None:
+        before = without_range(dataclasses.replace(initial, extrapolated=None))
     task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
     if is_traced((system, controls, initial)):
         found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
@@ -144,11 +146,6 @@ def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
             f'initial is a {type(initial).__name__}{given}; allowed is a Trajectory, "equilibrium", or None'
         )
     return initial, False
-
-
-def unmarked(initial: Trajectory | None) -> Trajectory | None:
-    """Return a trajectory without marks of extrapolation."""
-    return None if initial is None else dataclasses.replace(initial, extrapolated=None)
 
 
 def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:

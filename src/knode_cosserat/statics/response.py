@@ -59,11 +59,6 @@ def node_values(system: System, settings: Settings, control: Any, y: Any) -> tup
     return record[:, :ny], record[:, ny : ny + system.z_layout.size]
 
 
-def wrench_fields(system: System) -> tuple[str, ...]:
-    """Return the tip's conditions to which a force and a moment at the tip are added."""
-    return tuple(name for name in ("n", "m") if name in system.ends.layout.names)
-
-
 def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
     """Return the pose's twist for a change dy of the last node's y."""
     (_, h), (dp, dh) = jax.jvp(lambda y: pose(system, y), (y,), (dy,))
@@ -78,7 +73,8 @@ def respond(system: System, settings: Settings, pose: Pose, control: Any, guess:
     """Return the equilibrium found from a guess of y at all points, its pose, and the pose's derivatives."""
     control, c, ny = np.asarray(control, dtype=float), system.control_size, system.y_layout.size
     _, y, rows = TimeIntegration(settings).solve(system, control[None], np.asarray(guess))
-    names = wrench_fields(system)
+    # a force and a moment at the tip are added to its conditions on n and m
+    names = tuple(name for name in ("n", "m") if name in system.ends.layout.names)
     wrench = np.asarray(system.ends.layout.indices(names) if names else [], dtype=int)
     d_controls, d_tip = np.eye(c, c + len(wrench))[None], np.zeros((unknown_count(system), c + len(wrench)))
     d_tip[wrench, c + np.arange(len(wrench))] = 1.0
