@@ -51,7 +51,7 @@ class EngineError(KnodeCosseratError, NotImplementedError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Loop:
+class _Loop:
     """A `while` loop: `program` computes the condition and the next state from the state and the inputs.
 
     In `program` the level of inputs is 1, and the level of the state is 2.
@@ -172,7 +172,7 @@ class Program:
         self.values: list[Any] = []
         #: 0 of constants, given for inputs, and otherwise the largest of the arguments
         self.levels: list[int] = []
-        self.loops: list[Loop] = []
+        self.loops: list[_Loop] = []
         #: derivative rules of "hold" nodes, by node; None: the derivative is zero
         self.rules: dict[int, _Rule | None] = {}
         #: shapes of arrays; other nodes are scalars
@@ -426,7 +426,7 @@ class Program:
             self._memo[key] = rule.results
         return self._memo[key]
 
-    def loop(self, loop: Loop) -> list[int]:
+    def loop(self, loop: _Loop) -> list[int]:
         """Return the nodes of the final state of a loop."""
         arguments = [*(node for _, node in loop.inputs), *loop.initial]
         inner = loop.program
@@ -1672,7 +1672,7 @@ class _Evaluation:
         condition = inner.evaluate(e.params["cond_jaxpr"], [*fixed[:cond_nconsts], *state])[0]
         following = inner.evaluate(e.params["body_jaxpr"], [*fixed[cond_nconsts:], *state])
 
-        loop = Loop(
+        loop = _Loop(
             inner, [(name, node) for node, name in inputs.items()], _flat(state), _flat(arguments[count:]),
             _flat(following), int(condition), kinds, source_line(self.nested),
         )  # fmt: skip

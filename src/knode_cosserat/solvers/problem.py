@@ -69,7 +69,7 @@ def places_of(system: System, space: SpaceScheme) -> Float[Any, " places"]:
     return numeric.concatenate([first, last, near, *stages])
 
 
-class Stages(NamedTuple):
+class _Stages(NamedTuple):
     """Rates and strains of a state: at the ends of pieces, then at each stage between them."""
 
     y: list[Any]
@@ -174,12 +174,12 @@ class StepProblem(eqx.Module):
         end = taken(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
         return values[: grid.tip], end
 
-    def stages(self, y: Float[Any, "points y"], formula: Formula, known: Stages | None = None) -> Stages:
+    def stages(self, y: Float[Any, "points y"], formula: Formula, known: _Stages | None = None) -> _Stages:
         """Evaluate the stages of a formula that are not known yet.
 
         Without known stages, only those ends of pieces are evaluated that the scheme uses (`ends` gives all).
         """
-        found = self.ends(y, every=False) if known is None else Stages(*map(list, known))
+        found = self.ends(y, every=False) if known is None else _Stages(*map(list, known))
         rates = [*self.at_ends(found.f[0]), *found.f[1:]]
         for k in range(len(found.f) - 1, len(formula.stages)):
             between = self.between(formula.stages[k], found.y[0][: self.grid.tip], y[1:], rates)
@@ -189,13 +189,13 @@ class StepProblem(eqx.Module):
                 values.append(new)
         return found
 
-    def ends(self, y: Float[Any, "points y"], every: bool = True) -> Stages:
+    def ends(self, y: Float[Any, "points y"], every: bool = True) -> _Stages:
         """Evaluate the equations at the ends of pieces: at `every` end, or at those that the scheme uses."""
         grid, ends = self.grid, self.far(y)
         if every or self.space.implicit:
             ends = jnp.concatenate([ends, y[-1:], taken(y, grid.near)])
         f, z = self._evaluated(slice(0, len(ends)), ends)
-        return Stages([ends], [f], [z])
+        return _Stages([ends], [f], [z])
 
     def between(self, stage: Any, start: Any, end: Any, rates: list[Any]) -> Any:
         """Return y at a stage, from y at both ends of the pieces and earlier rates."""

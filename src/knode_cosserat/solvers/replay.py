@@ -73,7 +73,7 @@ def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0:
     return repeated_record_history(system, settings, records, still.y, t0)
 
 
-class Replay(NamedTuple):
+class _Replay(NamedTuple):
     """Solver states along the rows of a trajectory."""
 
     #: first row whose step has a known history
@@ -84,7 +84,7 @@ class Replay(NamedTuple):
     state: SolverState
 
 
-def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> Replay | None:
+def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> _Replay | None:
     """Return the histories along a motion's rows by a system's equations; None if the rows do not suffice.
 
     `dt` is the time step (s) of rows whose times are traced.
@@ -117,7 +117,7 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
     history, terms = _along(system, made, past, (rows, controls), steps)
     last = state.after(history, apart, len(time) - 1 - row, made)
     last = dataclasses.replace(last, rate_known=state.rate_known and made.uses_rate)
-    return Replay(row + 1, terms[made.stages - 1 :: made.stages], last)
+    return _Replay(row + 1, terms[made.stages - 1 :: made.stages], last)
 
 
 def history_settings(settings: Settings) -> Settings:

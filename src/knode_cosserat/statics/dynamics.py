@@ -46,7 +46,7 @@ TOGETHER = 1e-6
 SAME = 0.02
 
 
-class Modes(NamedTuple):
+class _Modes(NamedTuple):
     """Resolved modes of small motions about an equilibrium: the fastest growing first."""
 
     #: λ: growth rate and angular frequency (1/s); of a complex pair, the one with positive frequency
@@ -70,7 +70,7 @@ class Modes(NamedTuple):
         return ~self.growing & (np.maximum(self.values.real, self.coarse) > self.rounding)
 
 
-def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Modes:
+def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Modes:
     """Return the modes of small motions about an equilibrium y (nodes, y).
 
     Raises `ValueError`, with a reason, if they cannot be computed.
@@ -121,7 +121,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
     order = np.lexsort((np.abs(fine), -growth))
     first = _motion(own, step, moving, factors[order[0]])
     found = [each[order] / time for each in (fine, uncertainty, rounding, other.real)]
-    return Modes(found[0], found[1], found[2], found[3], first)
+    return _Modes(found[0], found[1], found[2], found[3], first)
 
 
 def _history_size(system: System) -> int:
