@@ -301,7 +301,8 @@ class StepCoefficients(NamedTuple):
     def at(self, t0: Any, i: Any) -> tuple[Any, Any]:
         """Return the coefficients of step i, and the times (s) at its end or at those of its stages."""
         numeric: Any = jnp if is_traced((self, i)) else np
-        return self.table[numeric.minimum(i, len(self.table) - 1)], t0 + (i + self.ends) * self.dt
+        row = numeric.minimum(i, len(self.table) - 1)
+        return numeric.asarray(self.table)[row], t0 + (i + self.ends) * self.dt
 
 
 class TimeStep(NamedTuple):
