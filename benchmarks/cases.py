@@ -154,7 +154,7 @@ def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
     import knode_cosserat as kc
     from knode_cosserat.solvers.history import resting_history
     from knode_cosserat.solvers.run import TimeIntegration
-    from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
+    from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
     from knode_cosserat.solvers.settings import Settings
 
     robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT, sampled="end")
@@ -174,12 +174,12 @@ def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
     zeros = [np.zeros((*part.shape, columns)) for part in (past.records[:, :used], past.rate[:used])]
     state = TangentState(past.records[:, :used], past.rate[:used], *zeros, 0.0)
     d_controls = np.einsum("tk,ij->tikj", block, np.eye(4)).reshape(steps, 4, columns)
-    changes = SystemMoves(None, np.zeros((0, columns))), d_controls
+    changes = Changes(d_controls)
 
     def moved() -> Any:
         _, _, rows = task.solve(robot, tensions, past, (0, steps))
         at = rows.every_stage, (robot, tensions)
-        return tangent_time_loop(settings, task.coefficients, *at, changes, state)
+        return tangent_time_loop(task.coefficients, *at, changes, state)
 
     cases = {"tangents": moved, "jax": lambda: jax.block_until_ready(slopes(none))}
     taken = medians(cases, rounds=25)

@@ -14,11 +14,9 @@ import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.equations import Equations
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import resting_history
-from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import StepCoefficients
+from knode_cosserat.solvers.history import StepCoefficients, resting_history
+from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 
 DT, STEPS, BATCH, ROUNDS = 0.05, 100, 64, 7
 COLUMNS, TANGENT_STEPS = 32, 20
@@ -41,9 +39,9 @@ def row_of(label, robot, scheme, batch):
     built = seconds(lambda: Core(robot, settings, batch).stride)
     if batch:
         pasts = jax.tree.map(lambda leaf: np.stack([leaf] * BATCH), past)
-        run = functools.partial(loops.loop_many, robot, settings, steps, tensions, pasts, STEPS)
+        run = functools.partial(loops.solve_steps, robot, steps, tensions, pasts, (0, STEPS))
     else:
-        run = functools.partial(loops.loop_one, robot, settings, steps, tensions[0], past, (0, STEPS))
+        run = functools.partial(loops.solve_steps, robot, steps, tensions[0], past, (0, STEPS))
     run()
     taken = np.median([seconds(run) for _ in range(ROUNDS)]) / STEPS / (BATCH if batch else 1) * 1e6
     return f"| {label} | {scheme} | {BATCH if batch else 1} | {taken:.1f} | {built:.1f} |"
@@ -55,11 +53,11 @@ def tangents_of(label, robot, scheme):
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
     rng = np.random.default_rng(0)
     controls = rng.uniform(4.0, 8.0, (TANGENT_STEPS, 4))
-    _, _, rows = loops.loop_one(robot, settings, steps, controls, past, (0, TANGENT_STEPS))
+    _, _, rows = loops.solve_steps(robot, steps, controls, past, (0, TANGENT_STEPS))
     columns = [np.zeros((*part.shape, COLUMNS)) for part in (past.records, past.rate)]
     state = TangentState.of(robot, settings.space, past, *columns)
-    changes = SystemMoves(None, np.zeros((0, COLUMNS))), rng.normal(size=(*controls.shape, COLUMNS))
-    given = settings, steps, rows.every_stage, (robot, controls), changes, state
+    changes = Changes(rng.normal(size=(*controls.shape, COLUMNS)))
+    given = steps, rows.every_stage, (robot, controls), changes, state
     run = functools.partial(tangent_time_loop, *given)
     built = seconds(run)
     taken = 1e3 * np.median([seconds(run) for _ in range(10 * ROUNDS)])

@@ -187,7 +187,7 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "stability": lambda robot, it: kc.statics.stability(it.rest).least,
     "equilibrium_path": followed,
     "configuration": lambda robot, it: kc.statics.configuration(robot, it.controls[0]).jacobian,
-    "compliance": lambda robot, it: kc.statics.compliance(robot, it.controls[0]),
+    "compliance": lambda robot, it: kc.statics.configuration(robot, it.controls[0]).compliance,
     "workspace": lambda robot, it: kc.workspace(robot, *it.limits, 2).position,
     "inverse_kinematics": reached,
     "Stepper": stepped,

@@ -80,7 +80,7 @@ WRONG = {
     ),
     "a workspace of text": (lambda t: kc.workspace(ROBOT, "many"), "'many'", r"\(B, 4\)"),
     "a configuration of 2": (lambda t: kc.statics.configuration(ROBOT, [1, 2]), r"\(2,\)", r"\(4,\).*\(N\)"),
-    "a compliance of text": (lambda t: kc.statics.compliance(ROBOT, "x"), "'x'", r"\(4,\).*\(N\)"),
+    "a configuration of text": (lambda t: kc.statics.configuration(ROBOT, "x"), "'x'", r"\(4,\).*\(N\)"),
     "to identify text": (lambda t: kc.identify("x", [t], parameters="all"), "str", "one robot"),
     "to identify by one": (lambda t: kc.identify(ROBOT, t, parameters="all"), "Trajectory", "list of"),
     "to identify from states": (lambda t: kc.identify(ROBOT, [t]), "Trajectory", "recordings"),
@@ -105,8 +105,7 @@ WRONG = {
     "no ensemble": (lambda t: kc.learning.load_ensemble("nope"), "nope", "member-000"),
     "to estimate parts of text": (lambda t: kc.recordings.estimate_parts("x", ROBOT), "str", "a Recording"),
     "nodes of a number": (lambda t: kc.metrics.node_error(t, 3), "int", "a Trajectory"),
-    "a jacobian of two": (lambda t: kc.statics.jacobian(ROBOT, [1, 2]), r"\(2,\)", r"\(4,\).*\(N\)"),
-    "a manipulability of text": (lambda t: kc.statics.manipulability("x", [1, 2, 3, 4]), "str", "one robot"),
+    "a configuration of none": (lambda t: kc.statics.configuration("x", [1, 2, 3, 4]), "str", "one robot"),
     "the stability of a number": (lambda t: kc.statics.stability(3), "int", "a Trajectory"),
     "the stability of no row": (lambda t: kc.statics.stability(t, row="x"), "'x'", "allowed is -"),
     **{

@@ -15,7 +15,7 @@ import pytest
 import knode_cosserat as kc
 import knode_cosserat_hardware as kch
 from knode_cosserat.learning.residual import Nothing
-from knode_cosserat.statics.configuration import Ellipsoid
+from knode_cosserat.statics.configuration import Ellipsoid, Manipulability
 
 SPACES = [thing for name in sorted(kc.__all__) if isinstance(thing := getattr(kc, name), types.ModuleType)]
 #: first words of a docstring that says nothing on its own
@@ -283,7 +283,7 @@ def test_results_of_statics_show_poses_with_units(rest):
     short(found, "UNREACHABLE; tension [2, 0, 0, 0] N; tip at [0.1, 0, 0.62] m; error 250 mm")
     assert str(found.result) == "UNREACHABLE"
     ellipsoid = Ellipsoid(np.ones(3), np.eye(3), 1.0, 1.0)
-    short(statics.Manipulability(ellipsoid, ellipsoid, None), "singular values [1, 1, 1]")
+    short(Manipulability(ellipsoid, ellipsoid, None), "singular values [1, 1, 1]")
     found = statics.Configuration(control, pose, None, np.zeros((6, 4)), np.zeros((6, 6)), 0.635)
     short(found, "position [0.1, 0, 0.62] m")
     poses, rows = np.stack([pose, 2 * pose]), np.zeros(2, int)

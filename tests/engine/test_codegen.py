@@ -1,6 +1,5 @@
 """Machine code of single operations against NumPy, on numbers and on vectors, with NaN and infinity."""
 
-import ctypes
 import functools
 
 import hypothesis
@@ -37,8 +36,7 @@ def test_operations_are_those_of_numpy(lanes):
     found = f.evaluate(program, nodes, known, lanes)
     for k, node in enumerate(nodes):
         f.store(found[node], out, k * lanes, lanes)
-    compiled = module.compile()
-    run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(compiled.address("run"))
+    run = module.compile()["run"]
     for first in range(0, len(VALUES), lanes):
         one = VALUES[first : first + lanes].copy()
         for shift in range(len(VALUES)):
@@ -59,11 +57,9 @@ def vector_function(name):
     f = module.function("run", ["x", "out"], exported=True)
     node = program.apply(name, x)
     f.store(f.evaluate(program, [node], {x: f.load(f.arguments[0], 0, 8)}, 8)[node], f.arguments[1], 0, 8)
-    compiled = module.compile()
-    run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 2)(compiled.address("run"))
+    run = module.compile()["run"]
 
     def values(numbers):
-        assert compiled
         given, found = np.array(numbers, dtype=float), np.zeros(8)
         run(given.ctypes.data, found.ctypes.data)
         return found
@@ -113,8 +109,8 @@ def answer():
     module = Module()
     f = module.function("run", ["out"], exported=True)
     f.store(42.0, f.arguments[0], 0)
-    compiled, out = module.compile(), np.zeros(1)
-    ctypes.CFUNCTYPE(None, ctypes.c_void_p)(compiled.address("run"))(out.ctypes.data)
+    out = np.zeros(1)
+    module.compile()["run"](out.ctypes.data)
     return out[0]
 
 

@@ -22,20 +22,20 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.system import unknown_count
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
+    StepCoefficients,
+    TimeStep,
     history_of,
     repeated_record_history,
     resting_history,
+    unloaded_shape,
 )
 from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
-from knode_cosserat.solvers.recovery import attempt
-from knode_cosserat.solvers.settings import Settings, schemes
+from knode_cosserat.solvers.recovery import Budget, StaticRecovery, StepRecovery
+from knode_cosserat.solvers.settings import NewtonOptions, Settings, schemes
 from knode_cosserat.solvers.space import Formula, SpaceScheme, Stage
-from knode_cosserat.solvers.steps import StepCoefficients, TimeStep
 from tests.engine.networks import with_committee, with_network
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
@@ -63,7 +63,7 @@ def settings_of(scheme, space="lobatto2"):
 
 def emitted(robot, settings, controls, span=(0, STEPS)):
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
-    return loops.loop_one(robot, settings, steps, controls, past, span)
+    return loops.solve_steps(robot, steps, controls, past, span)
 
 
 @functools.cache
@@ -197,7 +197,9 @@ def displacements(count=1):
 def standing_history(robot, settings):
     """History of six legs in equilibrium."""
     y, control = unloaded_shape(robot, settings.space), np.zeros(6)
-    _, y, _ = loops.static_one(robot, Settings(None, settings.space), control[None], y, (0, 1))
+    _, y, _ = loops.solve_steps(
+        robot, StepCoefficients.of(Settings(None, settings.space)), control[None], y, (0, 1)
+    )
     none = no_history(robot, settings.space)
     found = loops.evaluator(robot, settings)(0.0, 0.0, control, none, y)
     return repeated_record_history(robot, settings, found.records, found.y, 0.0)
@@ -224,7 +226,7 @@ def test_schemes_and_systems(case):
     robot, settings = robot_of(name) if isinstance(name, str) else name, settings_of(time, space)
     past = (standing_history if name == LEGS else resting_history)(robot, settings)
     steps = StepCoefficients.of(settings, DT)
-    done, state, rows = loops.loop_one(robot, settings, steps, controls, past, (0, STEPS))
+    done, state, rows = loops.solve_steps(robot, steps, controls, past, (0, STEPS))
     assert done == STEPS
     assert_stored(case, rows, state, estimates=estimates)
     assert_solved(robot, settings, controls, past, rows, state)
@@ -234,10 +236,10 @@ def test_strands_in_lanes():
     robot, settings, control = robot_of(LEGS), settings_of("sdirk2"), displacements(3)
     past, steps = standing_history(robot, settings), StepCoefficients.of(settings, DT)
     pasts = jax.tree.map(lambda leaf: np.stack([leaf] * 3), past)
-    done, states, rows = loops.loop_many(robot, settings, steps, control, pasts, STEPS)
+    done, states, rows = loops.solve_steps(robot, steps, control, pasts, (0, STEPS))
     assert np.all(done == STEPS)
     for k in (0, 2):
-        _, state, wanted = loops.loop_one(robot, settings, steps, control[k], past, (0, STEPS))
+        _, state, wanted = loops.solve_steps(robot, steps, control[k], past, (0, STEPS))
         np.testing.assert_allclose(rows.records[k], wanted.records, atol=1e-8 * np.max(wanted.records))
         np.testing.assert_allclose(states.records[k], state.records, atol=1e-8 * np.max(state.records))
 
@@ -254,7 +256,7 @@ def test_equilibria(name, space):
     controls = rng.uniform(0.0, size, (3, 4, robot.control_layout.size))
     y, none = unloaded_shape(robot, settings.space), no_history(robot, settings.space)
     for k, own in enumerate(controls):
-        done, last, rows = loops.static_one(robot, settings, own, y, (0, 4))
+        done, last, rows = loops.solve_steps(robot, StepCoefficients.of(settings), own, y, (0, 4))
         assert done == 4
         assert_stored(f"equilibria {k}, {name}", rows)
         found, base, tip = by_jax(robot, settings.space, 0.0, 0.0, own[-1], none, last, rows.unknowns[-1])
@@ -262,7 +264,7 @@ def test_equilibria(name, space):
         np.testing.assert_allclose(last[0] / robot.scales().y, base, atol=1e-12)
         wanted = np.asarray(row_of(robot, last, found.records))
         np.testing.assert_allclose(rows.records[-1], wanted, atol=1e-11 * np.max(np.abs(wanted)))
-    many = loops.static_many(robot, settings, controls, np.stack([y] * 3), 4)
+    many = loops.solve_steps(robot, StepCoefficients.of(settings), controls, np.stack([y] * 3), (0, 4))
     np.testing.assert_array_equal(many[0], [4, 4, 4])
     np.testing.assert_allclose(many[2].records[-1], rows.records, atol=1e-8)
 
@@ -271,9 +273,11 @@ def test_equilibria_end_at_the_first_without_a_solution():
     robot, settings = robot_of(PAPER), Settings(None)
     controls = np.array([[5.0, 4.0, 4.0, 5.0], [1e7, 0.0, 0.0, 1e7], [5.0, 4.0, 4.0, 5.0]])
     y = unloaded_shape(robot, settings.space)
-    done, last, rows = loops.static_one(robot, settings, controls, y, (0, 3))
+    done, last, rows = loops.solve_steps(robot, StepCoefficients.of(settings), controls, y, (0, 3))
     assert done == 1 and rows.result.tolist()[1:] == [kc.Result.NO_CONVERGENCE, kc.Result.NOT_REACHED]
-    np.testing.assert_array_equal(last, loops.static_one(robot, settings, controls[:1], y, (0, 1))[1])
+    np.testing.assert_array_equal(
+        last, loops.solve_steps(robot, StepCoefficients.of(settings), controls[:1], y, (0, 1))[1]
+    )
 
 
 class Joined(kc.robots.ParallelRobot):
@@ -311,7 +315,11 @@ def test_one_problem_from_a_guess_with_an_offset_at_the_tip(kind):
             coefficients, t = coefficients[1], t[1]
         guess, step = past.y[1], TimeStep(past, coefficients, t)
         c0, history = coefficients[0], history_of(past.records, past.rate, coefficients, settings)
-    found = attempt(robot, settings, step, control, guess, offset)
+    budget = Budget(60.0)
+    recovery = StaticRecovery(robot, settings, guess, budget)
+    if step is not None:
+        recovery = StepRecovery(robot, settings, step, DT, budget)
+    found = recovery.solve(control, guess, offset)
     assert found.row.error <= 1e-10
     assert_stored(f"attempt, {kind}", found.row, found.state)
     y = found.state if step is None else found.state.y[0]
@@ -368,10 +376,10 @@ def test_a_process_keeps_a_bounded_number_of_codes(monkeypatch):
 def test_a_span_continues_another():
     robot, settings, control = robot_of(PAPER), settings_of("sdirk2"), tensions(1)[0]
     steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
-    _, _, whole = loops.loop_one(robot, settings, steps, control, past, (0, STEPS))
-    done, state, first = loops.loop_one(robot, settings, steps, control, past, (0, 10))
+    _, _, whole = loops.solve_steps(robot, steps, control, past, (0, STEPS))
+    done, state, first = loops.solve_steps(robot, steps, control, past, (0, 10))
     assert done == 10
-    _, _, second = loops.loop_one(robot, settings, steps, control, state, (10, STEPS))
+    _, _, second = loops.solve_steps(robot, steps, control, state, (10, STEPS))
     # factors are not kept from one span to the next: equal within the tolerance of a step
     np.testing.assert_allclose(first.records, whole.records[:10], atol=1e-13)
     np.testing.assert_allclose(second.records, whole.records[10:], atol=1e-8)
@@ -425,11 +433,11 @@ def test_robots_in_lanes_have_their_own_parameters_and_controls(name):
         lambda *leaves: np.stack(leaves), *(resting_history(each, settings) for each in systems)
     )
     steps = StepCoefficients.of(settings, DT)
-    done, states, rows = loops.loop_many(batch, settings, steps, control, pasts, STEPS)
+    done, states, rows = loops.solve_steps(batch, steps, control, pasts, (0, STEPS))
     assert np.all(done == STEPS) and states.y.shape == pasts.y.shape
     for k in (0, 3, 9):
         past = resting_history(systems[k], settings)
-        _, _, wanted = loops.loop_one(systems[k], settings, steps, control[k], past, (0, STEPS))
+        _, _, wanted = loops.solve_steps(systems[k], steps, control[k], past, (0, STEPS))
         scale = np.max(np.abs(wanted.records))
         np.testing.assert_allclose(rows.records[k], wanted.records, atol=1e-8 * scale)
         for field in ("position_error", "time_error"):

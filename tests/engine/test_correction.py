@@ -11,11 +11,9 @@ import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.rods.tendons import TendonFriction
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import history_of, resting_history
+from knode_cosserat.solvers.history import StepCoefficients, history_of, resting_history
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import StepCoefficients
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from tests.engine.test_core import Stretching, standing_history
 
 DT = 0.05
@@ -108,7 +106,7 @@ def test_a_correction_is_that_of_a_dense_solve(name, space):
     control = np.random.default_rng(1).uniform(0.2, 0.4, robot.control_layout.size)
     control *= {"reel": 1e-3, "six legs": 1e-3}.get(name, 1.0)
     steps, y = StepCoefficients.of(settings, DT), np.asarray(past.y[0])
-    _, state, rows = loops.loop_one(robot, settings, steps, control[None], past, (0, 1))
+    _, state, rows = loops.solve_steps(robot, steps, control[None], past, (0, 1))
     assert rows.corrections[0] == 1
     dy, dxi = dense_correction(robot, settings, DT, past, control, y)
     found = (state.y[0] - y) / np.asarray(robot.scales().y)
@@ -129,7 +127,7 @@ def test_growth_along_the_rod_does_no_harm(space):
     settings = Settings.of("bdf2", space, "paper", NewtonOptions())
     past, control = resting_history(bar, settings), np.array([1e4])
     steps, y = StepCoefficients.of(settings, dt), np.asarray(past.y[0])
-    done, state, rows = loops.loop_one(bar, settings, steps, control[None], past, (0, 1))
+    done, state, rows = loops.solve_steps(bar, steps, control[None], past, (0, 1))
     assert done == 1 and rows.error[0] <= 1e-10
     dy, dxi = dense_correction(bar, settings, dt, past, control, y)
     found = (state.y[0] - y) / np.asarray(bar.scales().y)

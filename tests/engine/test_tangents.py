@@ -17,15 +17,12 @@ from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import Discontinuities
 from knode_cosserat.solvers import rollout
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.evaluation import unloaded_shape
-from knode_cosserat.solvers.history import history_of, resting_history
+from knode_cosserat.solvers.history import StepCoefficients, history_of, resting_history, unloaded_shape
 from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.run import Equilibria, TimeIntegration
-from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.run import TimeIntegration
+from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import LOBATTO2
-from knode_cosserat.solvers.steps import StepCoefficients
 from tests.engine.networks import with_committee, with_network
 from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
 from tests.engine.test_program import with_curved_law
@@ -92,7 +89,7 @@ class Motion:
         rate[:used] += part * self.d_rate[..., column]
         past = self.past._replace(records=records, rate=rate)
         controls = self.controls + part * self.d_controls[..., column]
-        done, after, rows = loops.loop_one(system, self.settings, self.steps, controls, past, (0, STEPS))
+        done, after, rows = loops.solve_steps(system, self.steps, controls, past, (0, STEPS))
         assert done == STEPS
         return after, rows
 
@@ -100,8 +97,8 @@ class Motion:
     def given(self):
         past, used = self.past, self.d_rate.shape[0]
         state = TangentState(past.records[:, :used], past.rate[:used], self.d_records, self.d_rate, past.t0)
-        changes = SystemMoves(self.directions, self.weights), self.d_controls
-        return self.settings, self.steps, self.solved, (self.robot, self.controls), changes, state
+        changes = Changes(self.d_controls, self.directions, self.weights)
+        return self.steps, self.solved, (self.robot, self.controls), changes, state
 
 
 @pytest.mark.parametrize(
@@ -252,7 +249,7 @@ def test_cotangents_are_those_of_the_transposed_map(name, scheme, space):
 def test_tangents_and_cotangents_of_equilibria(name, low, high):
     robot, rng, eps = kc.load_robot(name), np.random.default_rng(0), 1e-4
     controls, y = rng.uniform(low, high, (3, robot.control_layout.size)), unloaded_shape(robot, LOBATTO2)
-    run = rollout.static_rollout(Equilibria(Settings(None), 3), Pattern.of(robot))
+    run = rollout.static_rollout(TimeIntegration(Settings(None), steps=3), Pattern.of(robot))
     along = (
         jax.tree.map(lambda x: 0.1 * x * rng.normal(size=np.shape(x)), robot),
         0.1 * high * rng.normal(size=controls.shape),

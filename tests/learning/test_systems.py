@@ -9,8 +9,7 @@ from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.routing import Helical
 from knode_cosserat.rods.surroundings import Plane
-from knode_cosserat.solvers.segments import samples
-from knode_cosserat.solvers.slopes import pieces
+from knode_cosserat.solvers.segments import pieces, samples
 
 STEPS, DT = 60, 0.05
 DELRIN = kc.load_robot("delrin-tendon-robot")

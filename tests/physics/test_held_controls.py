@@ -12,9 +12,8 @@ from scipy.linalg import expm
 
 import knode_cosserat as kc
 from knode_cosserat.solvers.damping import LongStepWarning
-from knode_cosserat.solvers.history import history_of
+from knode_cosserat.solvers.history import StepCoefficients, history_of
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import StepCoefficients
 
 # an oscillator, whose motion under held and under linear controls is known
 

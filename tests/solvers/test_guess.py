@@ -68,22 +68,15 @@ def test_positions_that_are_none_are_refused_in_one_line():
 
 
 @pytest.mark.slow
-def test_position_tolerance_adds_nodes():
-    robot = kc.load_robot("delrin-tendon-robot")
-    bent = kc.equilibrium(robot, [30.0, 5.0, 5.0, 5.0], position_tolerance=1e-3)
-    assert bent.system.nodes > robot.nodes and bent.position_error[0] <= 1e-3
+def test_position_tolerance_chooses_the_nodes():
+    robot, pull = kc.load_robot("delrin-tendon-robot"), [30.0, 5.0, 5.0, 5.0]
+    coarse, bent = (kc.equilibrium(robot, pull, position_tolerance=each) for each in (1e-2, 1e-3))
+    assert coarse.system.nodes < bent.system.nodes and bent.system.nodes > robot.nodes
+    assert bent.position_error[0] <= 1e-3
+    fine = kc.equilibrium(robot.replace(nodes=61), pull, space="lobatto4")
+    assert np.linalg.norm(bent.tip_position - fine.tip_position) < 1.5e-3
     with pytest.raises(ValueError, match="position_tolerance is -1"):
         kc.equilibrium(robot, [5.0] * 4, position_tolerance=-1)
-
-
-@pytest.mark.campaign
-def test_position_tolerance_chooses_the_nodes():
-    robot = kc.load_robot("delrin-tendon-robot")
-    bent = [kc.equilibrium(robot, [30.0, 5.0, 5.0, 5.0], position_tolerance=each) for each in (1e-2, 1e-3)]
-    assert bent[0].system.nodes < bent[1].system.nodes
-    assert bent[1].position_error[0] <= 1e-3
-    fine = kc.equilibrium(robot.replace(nodes=61), [30.0, 5.0, 5.0, 5.0], space="lobatto4")
-    assert np.linalg.norm(bent[1].tip_position - fine.tip_position) < 1.5e-3
 
 
 @pytest.mark.campaign

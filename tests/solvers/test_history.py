@@ -135,9 +135,24 @@ def test_rows_tell_what_the_last_step_looked_back_on(rod, whole):
     np.testing.assert_allclose(again.state.history.records, whole.final_state.history.records, atol=2e-8)
 
 
+@pytest.mark.slow
+def test_derivatives_go_through_rows_without_a_state(rod, whole):
+    """Rows that JAX traces are evaluated by JAX, and others by the engine."""
+    before = dataclasses.replace(whole[:4], final_state=None)
+
+    def tip(part):
+        moved = dataclasses.replace(before, y=before.y + part * np.sin(before.y))
+        return gone_on(rod, moved, 2).tip_position[-1]
+
+    wanted = (tip(1e-4) - tip(-1e-4)) / 2e-4
+    np.testing.assert_allclose(jax.jit(tip)(0.0), tip(0.0), atol=1e-9)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(tip))(0.0), wanted, rtol=1e-4, atol=1e-7)
+
+
 @pytest.mark.campaign
-def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod, whole):
+def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod):
     """States that were changed since are taken as they are."""
+    whole = kc.simulate(rod, NONE, DT, space="lobatto4", time="bdf2")
     changed = dataclasses.replace(whole, z=whole.z + 1e-3)
     plain, moved = (replay(each, rod).terms for each in (whole, changed))
     # c1 + c2 of BDF2 is -3/2 of 1/dt, whatever the past

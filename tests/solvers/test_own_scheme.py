@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.recovery import Budget
-from knode_cosserat.solvers.recovery_methods import StepRecovery
-from knode_cosserat.solvers.steps import StepCoefficients, TimeStep
+from knode_cosserat.solvers.history import StepCoefficients, TimeStep
+from knode_cosserat.solvers.recovery import Budget, StepRecovery
 from knode_cosserat.solvers.time import TimeScheme
 
 

@@ -46,17 +46,6 @@ def test_its_rows_are_those_of_a_simulation(robot, sine, truth):
     assert stepper.state is rows[-1] and stepper.time == truth.time[-1]
 
 
-def test_beyond_the_rows_of_one_program_it_goes_on_as_a_longer_simulation(robot, sine):
-    controls = np.concatenate([sine, sine[:60]])
-    stepper = kc.solvers.Stepper(robot, DT)
-    rows = [stepper.state, *(stepper.step(control) for control in controls)]
-    wanted = kc.simulate(robot, controls[100:], DT, initial=kc.simulate(robot, sine, DT))
-    # residuals of either are below 1e-10; the factors that are kept, and hence the last digits, are others
-    found = np.concatenate([row.y for row in rows[-60:]])
-    np.testing.assert_allclose(found, wanted.y[1:], rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose([row.time[0] for row in rows], np.arange(161) * DT, rtol=1e-12)
-
-
 def test_from_a_trajectory_it_goes_on_as_a_simulation_does(robot, sine, truth):
     wanted = kc.simulate(robot, sine[:20], DT, initial=truth)
     stepper = kc.solvers.Stepper(robot, DT, initial=truth)

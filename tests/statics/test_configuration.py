@@ -27,7 +27,7 @@ def test_a_cantilever_is_compliant_as_a_beam():
     expected = np.diag([across, across, L / EA, L / EI, L / EI, L / GJ])
     expected[0, 4] = expected[4, 0] = lean
     expected[1, 3] = expected[3, 1] = -lean
-    found = kc.statics.compliance(robot, np.zeros(4), space="lobatto4")
+    found = kc.statics.configuration(robot, np.zeros(4), space="lobatto4").compliance
     np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-12)
 
 
@@ -54,7 +54,7 @@ def test_slopes_are_those_of_the_equilibrium(robot):
 @pytest.mark.campaign
 def test_compliance_is_symmetric_and_positive():
     """Held tensions have a potential; the scheme along the rod keeps that up to its error."""
-    C = kc.statics.compliance(ROBOT, CONTROL, space="lobatto4")
+    C = kc.statics.configuration(ROBOT, CONTROL, space="lobatto4").compliance
     assert np.max(np.abs(C - C.T)) < 1e-5 * np.max(np.abs(C))
     assert np.min(np.linalg.eigvalsh((C + C.T) / 2)) > 0.0
 
@@ -63,7 +63,7 @@ def test_compliance_is_symmetric_and_positive():
 def test_asymmetry_is_of_the_order_of_the_scheme():
     asymmetry = []
     for nodes in (10, 20):
-        C = kc.statics.compliance(ROUTED.replace(nodes=nodes), CONTROL, space="lobatto4")
+        C = kc.statics.configuration(ROUTED.replace(nodes=nodes), CONTROL, space="lobatto4").compliance
         assert np.min(np.linalg.eigvalsh((C + C.T) / 2)) > 0.0
         asymmetry.append(np.max(np.abs(C - C.T)) / np.max(np.abs(C)))
     assert asymmetry[0] < 1e-5
@@ -97,7 +97,7 @@ def test_a_quarter_turn_of_the_controls_turns_everything():
 def test_manipulability_is_that_of_the_jacobian():
     found = kc.statics.configuration(ROUTED, CONTROL)
     J, L = found.jacobian, float(ROUTED.length)
-    moved, turned, whole = kc.statics.manipulability(ROUTED, CONTROL)
+    moved, turned, whole = kc.statics.configuration(ROUTED, CONTROL).manipulability
     assert moved.measure == pytest.approx(np.sqrt(np.linalg.det(J[:3] @ J[:3].T)), rel=1e-6)
     assert moved.condition == pytest.approx(np.linalg.cond(J[:3]), rel=1e-9)
     scaled = np.concatenate([J[:3] / L, J[3:]])
@@ -116,13 +116,13 @@ def test_a_rod_without_controls_has_a_compliance():
     assert found.jacobian.shape == (6, 0) and not found.unstable
     softness = length**3 / (3 * E * np.pi * radius**4 / 4)
     np.testing.assert_allclose(
-        np.diag(kc.statics.compliance(rod, [], space="lobatto4"))[:2], softness, rtol=1e-4
+        np.diag(kc.statics.configuration(rod, [], space="lobatto4").compliance)[:2], softness, rtol=1e-4
     )
     for ellipsoid in found.manipulability:
         assert not len(ellipsoid.singular_values)
         assert ellipsoid.measure == 0.0 and ellipsoid.condition == np.inf
     with pytest.raises(ValueError, match=r"control has shape .*there are no controls"):
-        kc.statics.compliance(rod, [1.0])
+        kc.statics.configuration(rod, [1.0])
     with pytest.raises(ValueError, match="a SlenderRod without controls is given"):
         kc.inverse_kinematics(rod, [0.0, 0.0, 0.3], low=0.0, high=1.0)
     assert kc.workspace(rod, np.zeros((2, 0)), space="lobatto4").unsolved == 0
@@ -130,8 +130,8 @@ def test_a_rod_without_controls_has_a_compliance():
 
 def test_wrong_arguments_are_named():
     with pytest.raises(ValueError, match=r"control has shape \(3,\); allowed is \(4,\): tension"):
-        kc.statics.jacobian(ROBOT, [1.0, 2.0, 3.0])
+        kc.statics.configuration(ROBOT, [1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match=r"control is nan at index \(1,\)"):
-        kc.statics.compliance(ROBOT, [1.0, np.nan, 3.0, 0.0])
+        kc.statics.configuration(ROBOT, [1.0, np.nan, 3.0, 0.0])
     with pytest.raises(ValueError, match="robot is list"):
         kc.statics.configuration([ROBOT], CONTROL)

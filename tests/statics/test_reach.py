@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 import knode_cosserat as kc
 from knode_cosserat.learning.structured.residual import Structured
 from knode_cosserat.rods.aspects import Drawing
-from knode_cosserat.statics.reach import _same_shape
-from knode_cosserat.statics.search import at_limits, rotation_between
+from knode_cosserat.statics.reach import _same_shape, at_limits, rotation_between
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 ROUTED = kc.robots.RoutedTendonRobot.like(ROBOT)
@@ -94,7 +93,7 @@ def test_what_cannot_be_reached_gives_the_nearest(target):
     assert found.result is kc.statics.Reach.UNREACHABLE and not found.converged
     away = found.position - np.array(target)
     assert found.position_error == pytest.approx(np.linalg.norm(away)) and found.position_error > 1e-2
-    slope = away @ kc.statics.jacobian(ROBOT, found.control)[:3]
+    slope = away @ kc.statics.configuration(ROBOT, found.control).jacobian[:3]
     inside = ~(found.at_low | found.at_high)
     assert np.all(np.abs(slope[inside]) < 1e-8)
     assert np.all(slope[found.at_low] > -1e-8) and np.all(slope[found.at_high] < 1e-8)

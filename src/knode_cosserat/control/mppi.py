@@ -79,5 +79,5 @@ class MPPI(PlanController):
         histories = jax.tree.map(
             lambda leaf: np.broadcast_to(leaf, (len(plans), *np.shape(leaf))), belief.past
         )
-        done, _, rows = model.task(steps).solve_many(system, controls, histories)
+        done, _, rows = model.task(steps).solve(system, controls, histories)
         return np.asarray(_errors(system, self.target, rows.records, wanted)), np.asarray(done == steps)

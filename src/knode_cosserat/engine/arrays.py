@@ -49,15 +49,17 @@ class ArrayCode:
     """Code of the arrays among the nodes of a program, in a function."""
 
     def __init__(
-        self, function: Function, program: Program, nodes: Sequence[int], outputs: Iterable[int],
-        values: dict[int, Any], added: Iterable[int] = (),
+        self, function: Function, program: Program, outputs: Iterable[int], added: Iterable[int],
+        values: dict[int, Any],
     ):  # fmt: skip
+        #: nodes that outputs and added arrays need, in order
+        self.needed = program.needed([*outputs, *added], frozenset(values))
         self.function, self.program, self._values = function, program, values
         whole = {*outputs, *added}
         stored = {node for node in outputs if node in program.shapes}
-        #: entries that are needed, of arrays of which only entries are
+        #: needed entries of arrays that are not needed as a whole
         self._entries: dict[int, list[int]] = {}
-        for node in nodes:
+        for node in self.needed:
             name, *rest = program.operations[node]
             if name == "entry":
                 self._entries.setdefault(rest[0], []).append(rest[1])
@@ -174,7 +176,7 @@ class ArrayCode:
         f = self.function
         with contextlib.ExitStack() as loops:
             indices = [loops.enter_context(f.loop(count)) for count in positions.shape]
-            value = Terms(self, self._pointers(self._read(node), indices)).value(node)
+            value = _Terms(self, self._pointers(self._read(node), indices)).value(node)
             if inside is not None:
                 value = f.total(f.select(inside, value, 0.0))
             offset = self._offset(indices, [stride * target.distance for stride in positions.strides])
@@ -221,7 +223,7 @@ class ArrayCode:
         with contextlib.ExitStack() as loops:
             indices = [loops.enter_context(self.function.loop(count)) for count in shape]
             sources = (each for node in nodes for each in self._sources(node))
-            terms = Terms(self, self._pointers(sources, indices))
+            terms = _Terms(self, self._pointers(sources, indices))
             at = self._offset(indices, strides)
             for node, target in zip(nodes, targets, strict=True):
                 self._store(terms.computed(node), target, at)
@@ -259,7 +261,7 @@ class ArrayCode:
                         (base, steps): f.pointer(pointer, k.value * (steps[-1] * self.value(base).distance))
                         for (base, steps), pointer in pointers.items()
                     }
-                    terms = Terms(self, here)
+                    terms = _Terms(self, here)
                     for node, row in zip(added, sums, strict=True):
                         for shift, total in enumerate(row):
                             total.set(total.get() + terms.value(node, shift))
@@ -271,7 +273,7 @@ class ArrayCode:
         self._values.update(zip(nodes, targets, strict=True))
 
 
-class Terms:
+class _Terms:
     """Values of arrays at one position, or at some rows further on (along the last axis but one)."""
 
     def __init__(self, code: ArrayCode, pointers: dict[Any, Value]):

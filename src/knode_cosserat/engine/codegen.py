@@ -9,6 +9,7 @@ code by `Function.evaluate`.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import dataclasses
 import hashlib
 import itertools
@@ -38,6 +39,23 @@ def literal(value: float) -> str:
     return f"0x{struct.unpack('<Q', struct.pack('<d', float(value)))[0]:016X}"
 
 
+#: arrays with the addresses at which their sums are added, and which lanes are inside
+Sums = tuple[Sequence[tuple[int, "Value"]], Any]
+Operator = Callable[["Value", Any], "Value"]
+
+
+def _arithmetic(operation: str) -> tuple[Operator, Operator]:
+    """Return an operator, and the one for a value on its right."""
+    return (
+        lambda value, other: value.function.binary(operation, value, other),
+        lambda value, other: value.function.binary(operation, other, value),
+    )
+
+
+def _comparison(operation: str) -> Operator:
+    return lambda value, other: value.function.compare(operation, value, other)
+
+
 @dataclasses.dataclass(frozen=True, eq=False)
 class Value:
     """A number ("double"), truth ("i1") or whole number ("i64"), or a vector of `lanes` of them."""
@@ -52,44 +70,14 @@ class Value:
         """The type in LLVM's notation."""
         return self.kind if self.lanes == 1 else f"<{self.lanes} x {self.kind}>"
 
-    def __add__(self, other: Any) -> Value:
-        return self.function.binary("add", self, other)
-
-    def __radd__(self, other: Any) -> Value:
-        return self.function.binary("add", other, self)
-
-    def __sub__(self, other: Any) -> Value:
-        return self.function.binary("sub", self, other)
-
-    def __rsub__(self, other: Any) -> Value:
-        return self.function.binary("sub", other, self)
-
-    def __mul__(self, other: Any) -> Value:
-        return self.function.binary("mul", self, other)
-
-    def __rmul__(self, other: Any) -> Value:
-        return self.function.binary("mul", other, self)
-
-    def __truediv__(self, other: Any) -> Value:
-        return self.function.binary("div", self, other)
-
-    def __rtruediv__(self, other: Any) -> Value:
-        return self.function.binary("div", other, self)
+    __add__, __radd__ = _arithmetic("add")
+    __sub__, __rsub__ = _arithmetic("sub")
+    __mul__, __rmul__ = _arithmetic("mul")
+    __truediv__, __rtruediv__ = _arithmetic("div")
+    __lt__, __le__, __gt__, __ge__ = map(_comparison, ("lt", "le", "gt", "ge"))
 
     def __neg__(self) -> Value:
         return self.function.apply("neg", self)
-
-    def __lt__(self, other: Any) -> Value:
-        return self.function.compare("lt", self, other)
-
-    def __le__(self, other: Any) -> Value:
-        return self.function.compare("le", self, other)
-
-    def __gt__(self, other: Any) -> Value:
-        return self.function.compare("gt", self, other)
-
-    def __ge__(self, other: Any) -> Value:
-        return self.function.compare("ge", self, other)
 
     def __and__(self, other: Any) -> Value:
         return self.function.logical("and", self, other)
@@ -198,8 +186,8 @@ class Module:
         functions = (function.text for function in self._functions)
         return "\n".join([*sorted(self.declarations), *tables, *functions])
 
-    def compile(self, optimisation: int = 1) -> Compiled:
-        """Return machine code for this computer.
+    def compile(self, optimisation: int = 1) -> dict[str, Any]:
+        """Return the exported functions as machine code for this computer, by their names.
 
         Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
         three times as long and make steps no faster. Variables are turned into registers.
@@ -215,45 +203,30 @@ class Module:
         version = ".".join(map(str, llvm.llvm_version_info))
         described = "\n".join([self.text, machine.triple, cpu, features, version, str(optimisation)])
         name = f"engine-{hashlib.sha256(described.encode()).hexdigest()}"
-        code = _stored(name)
+        directory, code = cache_directory(), None
+        with contextlib.suppress(OSError):
+            code = ProgramCache(directory).get(name) if directory else None
         if code is None:
             module = llvm.parse_assembly(self.text)
             passes = llvm.create_new_module_pass_manager()
             passes.add_sroa_pass()
             passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
             code = machine.emit_object(module)
-            _store(name, code)
+            # without an error, if the folder is full or read-only
+            with contextlib.suppress(OSError):
+                if directory:
+                    ProgramCache(directory).put(name, code)
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
         engine.add_object_file(llvm.ObjectFileRef.from_data(code))
         engine.finalize_object()
-        return Compiled(engine)
-
-
-def _stored(name: str) -> bytes | None:
-    """Return machine code from the cache on disk; None if it is not there, or cannot be read."""
-    directory = cache_directory()
-    with contextlib.suppress(OSError):
-        return ProgramCache(directory).get(name) if directory else None
-    return None
-
-
-def _store(name: str, code: bytes) -> None:
-    """Write machine code to the cache on disk; without an error, if the folder is full or read-only."""
-    directory = cache_directory()
-    with contextlib.suppress(OSError):
-        if directory:
-            ProgramCache(directory).put(name, code)
-
-
-class Compiled:
-    """Machine code of a module; valid while this object lives."""
-
-    def __init__(self, engine: Any):
-        self._engine = engine
-
-    def address(self, name: str) -> int:
-        """Return the address of an exported function."""
-        return self._engine.get_function_address(name)
+        functions = {}
+        for each in self._functions:
+            if each.exported:
+                kinds = [ctypes.c_void_p if own.kind == "ptr" else ctypes.c_long for own in each.arguments]
+                function: Any = ctypes.CFUNCTYPE(None, *kinds)(engine.get_function_address(each.name))
+                # machine code is valid while its engine lives
+                function.engine, functions[each.name] = engine, function
+        return functions
 
 
 class Function:
@@ -263,7 +236,7 @@ class Function:
         self, module: Module, name: str, arguments: Sequence[str], exported: bool, lanes: int | None = None
     ):
         """Begin a function; with lanes, of vectors, which returns the vector `returned`."""
-        self.module, self.name, self._count, self._exported = module, name, 0, exported
+        self.module, self.name, self._count, self.exported = module, name, 0, exported
         self._lines: list[Any] = []
         self._stack: list[str] = []
         #: addresses of places that have been written
@@ -278,12 +251,12 @@ class Function:
     def text(self) -> str:
         """The function in LLVM's assembly language."""
         given = ", ".join(f"{each.type} {each.name}" for each in self.arguments)
-        linkage = "" if self._exported else "internal "
+        linkage = "" if self.exported else "internal "
         lines = itertools.chain.from_iterable(
             [line] if isinstance(line, str) else line for line in self._lines
         )
         body = "\n".join([*self._stack, "  br label %begin", "begin:", *lines])
-        inline = "nounwind" if self._exported else "noinline nounwind"
+        inline = "nounwind" if self.exported else "noinline nounwind"
         kind, end = "void", "ret void"
         if self.returned is not None:
             kind, end = self.returned.type, f"ret {self.returned.type} {self.returned.name}"
@@ -563,19 +536,19 @@ class Function:
 
     def evaluate(
         self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int,
-        added: Sequence[tuple[int, Value]] = (), inside: Any = True,
+        sums: Sums = ((), True),
     ) -> dict[int, Any]:  # fmt: skip
         """Write the operations that outputs need, and return the values of all of them.
 
         `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
-        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. The sums
-        of the arrays `added` over the lanes `inside` are added to memory at their addresses.
+        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. `sums`
+        are arrays, the sums of which over the lanes inside are added to memory at their addresses.
         """
+        added, inside = sums
         values: dict[int, Any] = dict(known)
         parts = [part for node, _ in added for part, _ in summands(program, node)]
-        needed = program.needed([*outputs, *parts], frozenset(values))
-        arrays = ArrayCode(self, program, needed, outputs, values, parts)
-        for node in needed:
+        arrays = ArrayCode(self, program, outputs, parts, values)
+        for node in arrays.needed:
             if node in values:
                 continue
             operation, *arguments = program.operations[node]

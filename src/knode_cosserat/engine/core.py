@@ -7,7 +7,6 @@ estimated errors of the grid and of the time scheme.
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
 import functools
 import itertools
@@ -24,25 +23,27 @@ from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import StateArrays
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import LARGEST_CORRECTION, NewtonOptions
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory
-from knode_cosserat.solvers.problem import FILLING, Evaluated
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import (
+from knode_cosserat.solvers.history import (
     COARSE_ANGLE,
     COARSE_SHARE,
     ESTIMATE_TOLERANCE,
     ESTIMATE_TURNS,
+    EXTRAPOLATIONS,
     ROUNDING,
+    StateHistory,
     StepCoefficients,
     StepRows,
     stage_extrapolations,
 )
+from knode_cosserat.solvers.problem import FILLING, Evaluated
+from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.time import SDIRK2
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
+#: largest correction that may be left at a solution, relative to the state and its natural units
+LARGEST_CORRECTION = 1e-5
 #: part of the largest correction allowed at a solution, below which an expected correction is not computed
 SURELY_SMALL = 1e-2
 #: index of `acceptable` in Newton's options
@@ -56,16 +57,6 @@ class Shape(NamedTuple):
 
 
 States = TypeVar("States", StateHistory, Shape)
-
-
-class Constants(NamedTuple):
-    """Numbers that all steps of a run share."""
-
-    #: of the system, or of each robot
-    parameters: Float[np.ndarray, "*robots n"]
-    newton: NewtonOptions
-    #: subtracted from the residual of the tip's conditions
-    tip_offset: Any = 0.0
 
 
 class Core(EliminationCode):
@@ -111,14 +102,7 @@ class Core(EliminationCode):
         )
         self.dfe = a(ny, self.pieces)
         self._write()
-        self.compiled = self.module.compile()
-        self._run = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 7, *[ctypes.c_long] * 3)(
-            self.compiled.address("run")
-        )
-        if not robots:
-            self._evaluate = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3, ctypes.c_long)(
-                self.compiled.address("evaluate")
-            )
+        self._functions = self.module.compile()
         guesses = EXTRAPOLATIONS[None]
         if settings.stages > 1:
             guesses = stage_extrapolations(settings)
@@ -130,11 +114,10 @@ class Core(EliminationCode):
     def _write_weights(self) -> None:
         """Weights of sizes relative to the state."""
         self.weigh = f = self._function("weigh")
-        with self._places(self.points) as j:
-            for i in range(self.equations.ny):
-                unit = self._unit(i, j)
-                size = f.apply("abs", self._wide(self.y, i, j))
-                self._write_wide(unit / (1.0 + unit * size), self.weights_of_y, i, j)
+        for i, j in self._components(self.equations.ny, self.points):
+            unit = self._unit(i, j)
+            size = f.apply("abs", self._wide(self.y, i, j))
+            self._write_wide(unit / (1.0 + unit * size), self.weights_of_y, i, j)
 
     # Newton's method
 
@@ -160,9 +143,8 @@ class Core(EliminationCode):
         renew, first, fresh, old, done = (truth(False) for _ in range(5))
         renew.set(~usable)
         old.set(usable)
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                self._write_wide(0.0, self.direction, i, j)
+        for i, j in self._components(e.ny, self.points):
+            self._write_wide(0.0, self.direction, i, j)
         for i in range(e.k):
             self._put(0.0, self.direction_unknowns, i)
         f.call(self.weigh, memory)
@@ -185,16 +167,13 @@ class Core(EliminationCode):
                 fresh.set(fresh.get() & ~now)
                 renew.set(renew.get() & ~now)
                 linearisations.set(linearisations.get() + f.select(now, 1.0, 0.0))
-                with self._places(self.points) as j:
-                    for i in range(e.ny):
-                        self._write_wide(self._wide(self.y, i, j), self.trial, i, j)
+                self._copy_wide(self.y, self.trial, self.points)
                 f.call(self.defects, memory)
             with f.if_(~anew.get()):
                 step = self._spread(damping.get())
-                with self._places(self.points) as j:
-                    for i in range(e.ny):
-                        moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
-                        self._write_wide(moved, self.trial, i, j)
+                for i, j in self._components(e.ny, self.points):
+                    moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
+                    self._write_wide(moved, self.trial, i, j)
                 for i in range(e.k):
                     moved = self._get(self.unknowns, i) + damping.get() * self._get(
                         self.direction_unknowns, i
@@ -242,11 +221,10 @@ class Core(EliminationCode):
             more = going & ~(good | dead | again)
             corrections.set(corrections.get() + f.select(more, 1.0, 0.0))
             wide_accept = self._spread(accept)
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    for source, target in ((self.trial, self.y), (self.dy, self.direction)):
-                        value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
-                        self._write_wide(value, target, i, j)
+            for i, j in self._components(e.ny, self.points):
+                for source, target in ((self.trial, self.y), (self.dy, self.direction)):
+                    value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
+                    self._write_wide(value, target, i, j)
             for i in range(e.k):
                 for source, target in (
                     (self.trial_unknowns, self.unknowns),
@@ -276,9 +254,8 @@ class Core(EliminationCode):
             self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
         pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
         changes = [weight - own for weight, own in pairs]
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
+        for i, j in self._components(e.ny, self.pieces):
+            self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
 
     def _write_check(self) -> None:
@@ -290,10 +267,8 @@ class Core(EliminationCode):
         f.call(self.weigh, memory)
         largest = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
-        # what the solution has left: no part of its errors
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(self.r, i, j), self.rest, i, j)
+        # the residual of the solution is no part of its errors
+        self._copy_wide(self.r, self.rest, self.pieces)
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)
         # no residual has the strains of the tip; y_s is part of a record if B is not zero
@@ -301,9 +276,7 @@ class Core(EliminationCode):
         with self._places(self.count) as j:
             for i in range(e.ny, e.numbers):
                 size = f.apply("abs", self._wide(self.records[0], i, j))
-                total.set(
-                    total.get() + (size if self.batch else f.select(self._inside(j, self.count), size, 0.0))
-                )
+                total.set(total.get() + self._before(self.count, j, size))
         finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
         f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
 
@@ -322,14 +295,12 @@ class Core(EliminationCode):
         e = self.equations
         f = self._function(name, "numbers")
         memory, numbers = f.arguments
-        with self._places(self.pieces) as j:
-            for i in range(e.ny):
-                defect = self._wide(self.defect, i, j) if has_defect else 0.0
-                self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
-        with self._places(self.ends) as j:
-            for i in range(e.ny):
-                start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
-                self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
+        for i, j in self._components(e.ny, self.pieces):
+            defect = self._wide(self.defect, i, j) if has_defect else 0.0
+            self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
+        for i, j in self._components(e.ny, self.ends):
+            start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
+            self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
         with self._places(self.used) as j:
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(history, i, j)
@@ -341,10 +312,9 @@ class Core(EliminationCode):
         def evaluated() -> Value:
             self._write_base(self.better_unknowns, self.better, self.own_dH)
             f.call(self.residual_of_better, memory)
-            with self._places(self.pieces) as j:
-                for i in range(e.ny):
-                    value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
-                    self._write_wide(value, self.r, i, j)
+            for i, j in self._components(e.ny, self.pieces):
+                value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
+                self._write_wide(value, self.r, i, j)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
             return f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
@@ -357,22 +327,20 @@ class Core(EliminationCode):
 
         def going() -> Value:
             found = Variable(f, f.splat(f.value(0.0), self.L))
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    y = self._wide(self.y, i, j)
-                    change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
-                    size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
-                    size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
-                    found.set(f.apply("max", found.get(), size))
+            for i, j in self._components(e.ny, self.points):
+                y = self._wide(self.y, i, j)
+                change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
+                size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
+                size = self._before(self.points, j, size)
+                found.set(f.apply("max", found.get(), size))
             far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
             return f.any(far & alive) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
 
         with f.while_(going):
             f.call(self.correct, memory)
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
-                    self._write_wide(value, self.better, i, j)
+            for i, j in self._components(e.ny, self.points):
+                value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
+                self._write_wide(value, self.better, i, j)
             for i in range(e.k):
                 value = self._get(self.better_unknowns, i) + self._get(self.step_unknowns, i)
                 self._put(value, self.better_unknowns, i)
@@ -396,15 +364,12 @@ class Core(EliminationCode):
         self.corrected = f = self._function("corrected", "numbers")
         memory, numbers = f.arguments
         ny = self.equations.ny
-        with self._places(self.pieces) as j:
-            for i in range(ny):
-                self._write_wide(self._wide(self.defect, i, j), self.r, i, j)
+        self._copy_wide(self.defect, self.r, self.pieces)
         for i in range(self.equations.k):
             self._put(0.0, self.tip, i)
         f.call(self.correct, memory)
-        with self._places(self.points) as j:
-            for i in range(ny):
-                self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
+        for i, j in self._components(ny, self.points):
+            self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
         for number, value in zip((POSITION, ANGLE), self._errors_of_poses(), strict=True):
             f.store(value, numbers, number * self.P)
 
@@ -419,7 +384,7 @@ class Core(EliminationCode):
                 return self._wide(self.better, i, j) - self._wide(self.y, i, j)
 
             def largest(found: Variable, value: Value) -> None:
-                value = value if self.batch else f.select(self._inside(j, self.points), value, 0.0)
+                value = self._before(self.points, j, value)
                 found.set(f.apply("max", found.get(), value))
                 total.set(total.get() + value)
 
@@ -464,25 +429,22 @@ class Core(EliminationCode):
                 c * self._wide(error, i, j) for c, error in zip(earlier, self.time_errors, strict=True)
             )
 
-        with self._places(self.used) as j:
-            for i in range(e.numbers):
-                self._write_wide(carried(i, j), self.time_dH, i, j)
+        for i, j in self._components(e.numbers, self.used):
+            self._write_wide(carried(i, j), self.time_dH, i, j)
         with f.if_(f.compare("ne", earlier[1], 0.0)):
             # the difference of the rates at both stages, and its product with the equations' derivatives
-            with self._places(self.used) as j:
-                for i in range(e.numbers):
-                    self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    self._write_wide(0.0, self.dy, i, j)
+            for i, j in self._components(e.numbers, self.used):
+                self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
+            for i, j in self._components(e.ny, self.points):
+                self._write_wide(0.0, self.dy, i, j)
             f.call(self.products, memory)
             state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
             moved = self._evaluated(e.products["base"], 0, False, state)
             for k, value in enumerate(moved):
-                self._put(value, self.correction.w, k % e.ny, self.bases[k // e.ny])
+                self._put(value, self.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.correct, memory)
             for k in range(len(moved)):
-                self._put(0.0, self.correction.w, k % e.ny, self.bases[k // e.ny])
+                self._put(0.0, self.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.products, memory)
             for i, j, product in self._numbers_of(self.tangents, self.used):
                 once = product - self._wide(self.difference, i, j)
@@ -493,9 +455,7 @@ class Core(EliminationCode):
         e = self.equations
         self.products = self._function("products")
         (far, between, *_), tangents = self._evaluated_at(self.y), self.tangents
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                self._write_wide(self._wide(self.dy, i, j), tangents.far, i, j)
+        self._copy_wide(self.dy, tangents.far, self.points)
         if self.far is not None:
             with self._places(self.pieces) as j:
                 state = self._state_with_tangents((self.y, self.dy), j, j) | self._acting_at(j)
@@ -558,17 +518,9 @@ class Core(EliminationCode):
         for i, j, value in self._numbers_of(newest, self.count):
             self._write_wide(value, self.records[0], i, j)
         if self.settings.uses_rate:
-            with self._places(self.count) as j:
-                for i in range(e.numbers):
-                    value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
-                    self._write_wide(value, self.rate, i, j)
-
-    def _write_shift(self, states: list[Array], count: int) -> None:
-        """Shift earlier states by one step."""
-        for newer, older in reversed(list(itertools.pairwise(states))):
-            with self._places(count) as j:
-                for i in range(newer.size):
-                    self._write_wide(self._wide(newer, i, j), older, i, j)
+            for i, j in self._components(e.numbers, self.count):
+                value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
+                self._write_wide(value, self.rate, i, j)
 
     # the time loop
 
@@ -622,24 +574,20 @@ class Core(EliminationCode):
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
         def history(states: list[Array], rate: Array, target: Array, count: int) -> None:
-            with self._places(count) as j:
-                for i in range(e.numbers):
-                    value = _sum(
-                        c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True)
-                    )
-                    if self.settings.uses_rate:
-                        value = value + d1 * self._wide(rate, i, j)
-                    self._write_wide(value, target, i, j)
+            for i, j in self._components(e.numbers, count):
+                value = _sum(c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True))
+                if self.settings.uses_rate:
+                    value = value + d1 * self._wide(rate, i, j)
+                self._write_wide(value, target, i, j)
 
         if self.scheme:
             history(self.records, self.rate, self.H, self.count)
             weights = [self._wide(self.weights, k) for k in range(3)]
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    guess = weights[0] * self._wide(self.past[0], i, j)
-                    for k in (1, 2):
-                        guess = guess + weights[k] * self._wide(self.past[k], i, j)
-                    self._write_wide(guess, self.y, i, j)
+            for i, j in self._components(e.ny, self.points):
+                guess = weights[0] * self._wide(self.past[0], i, j)
+                for k in (1, 2):
+                    guess = guess + weights[k] * self._wide(self.past[k], i, j)
+                self._write_wide(guess, self.y, i, j)
         for k, (i, base) in enumerate(self._unknown_numbers()):
             self._put(self._get(self.y, i, base), self.unknowns, k)
         self._write_base(self.unknowns, self.y, self.H)
@@ -651,10 +599,9 @@ class Core(EliminationCode):
             history(self.errors, self.error_rate, self.dH, self.used)
         f.call(self.corrected, memory, numbers)
         if self.settings.uses_rate:
-            with self._places(self.used) as j:
-                for i in range(e.numbers):
-                    value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
-                    self._write_wide(value, self.error_rate, i, j)
+            for i, j in self._components(e.numbers, self.used):
+                value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
+                self._write_wide(value, self.error_rate, i, j)
         if isinstance(self.scheme, SDIRK2):
             f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
@@ -674,17 +621,16 @@ class Core(EliminationCode):
             for half in range(2)
         )
         misfits = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(3)]
-        with self._places(self.points) as j:
-            for i in range(e.ny):
-                past = [self._wide(each, i, j) for each in self.past]
-                unit, y = self._unit(i, j), self._wide(self.y, i, j)
-                for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
-                    guess = past[0] * weights[0]
-                    for k in range(1, order + 1):
-                        guess = guess + past[k] * weights[k]
-                    size = f.apply("abs", guess - y) * unit
-                    size = size if self.batch else f.select(self._inside(j, self.points), size, 0.0)
-                    misfit.set(f.apply("max", misfit.get(), size))
+        for i, j in self._components(e.ny, self.points):
+            past = [self._wide(each, i, j) for each in self.past]
+            unit, y = self._unit(i, j), self._wide(self.y, i, j)
+            for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
+                guess = past[0] * weights[0]
+                for k in range(1, order + 1):
+                    guess = guess + past[k] * weights[k]
+                size = f.apply("abs", guess - y) * unit
+                size = self._before(self.points, j, size)
+                misfit.set(f.apply("max", misfit.get(), size))
         sizes = [self._largest(each.get()) for each in misfits]
         least = f.apply("max", f.apply("min", sizes[0], f.apply("min", sizes[1], sizes[2])), ROUNDING)
         ratios = [f.apply("max", each / least, 1.0) for each in sizes]
@@ -695,12 +641,7 @@ class Core(EliminationCode):
             for order in range(k, 3):
                 weight = weight + trusts[order] / total * following[order][k]
             self._put(weight, self.weights, k)
-        for source, target in (
-            (self.past[1], self.past[2]), (self.past[0], self.past[1]), (self.y, self.past[0])
-        ):  # fmt: skip
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    self._write_wide(self._wide(source, i, j), target, i, j)
+        self._write_shift([self.y, *self.past], self.points)
 
     def _write_evaluate(self) -> None:
         """The state at y and history terms, with y at points between nodes corrected in some turns."""
@@ -769,7 +710,7 @@ class Core(EliminationCode):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
             table[[0, -1]] = c0, t
-            self._evaluate(*(each.ctypes.data for each in (memory, table, control)), turns)
+            self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), turns)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
             error = np.max(np.abs(defects[: self.pieces]) * inverse[: self.pieces])
@@ -780,14 +721,15 @@ class Core(EliminationCode):
         return evaluate
 
     def integrate(
-        self, constants: Constants, controls: np.ndarray, steps: StepCoefficients, states: States,
+        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: States,
         span: tuple[int, int],
     ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
         """Solve a span of steps of each robot until one fails.
 
-        Controls (robots, T, c) or (robots, T, stages * c) and states (robots, ...). Returns the numbers of
-        steps done, the states after them, and rows. In a batch, a robot with a failed step waits for the
-        others in its vector; its last state is not kept, except if the first step failed.
+        Parameters (n,) of the system, or (robots, n); controls (robots, T, c) or (robots, T, stages * c) and
+        states (robots, ...). Returns the numbers of steps done, the states after them, and rows. In a batch,
+        a robot with a failed step waits for the others in its vector; its last state is not kept, except if
+        the first step failed.
         """
         e, P, stages, (start, stop) = self.equations, self.P, np.size(steps.ends), span
         count, nodes, size = stop - start, len(self.grid.nodes), len(controls)
@@ -803,8 +745,8 @@ class Core(EliminationCode):
         lane_controls = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
         lane_controls = np.broadcast_to(lane_controls, (vectors, P, count, stages, e.nc))
         lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
-        lane_parameters = in_lanes(np.broadcast_to(constants.parameters, (size, self.params.size)))
-        table = coefficients_of(steps, stages, span)
+        lane_parameters = in_lanes(np.broadcast_to(parameters, (size, self.params.size)))
+        table = coefficients_of(steps, span)
         rows = np.zeros((vectors, count, stages, nodes, self.strands * e.numbers, P))
         infos = np.zeros((vectors, count, stages, 8 + e.k, P))
         reached, length = np.zeros((2, vectors, P))
@@ -814,8 +756,9 @@ class Core(EliminationCode):
         last_motions = np.empty_like(first_motions)
 
         memory, empty = self._empty_memory(), self._empty.copy()
+        newton = steps.settings.newton
         for array, numbers in (
-            (self.options, dataclasses.astuple(constants.newton)), (self.tip_offset, constants.tip_offset)
+            (self.options, dataclasses.astuple(newton)), (self.tip_offset, steps.tip_offset)
         ):  # fmt: skip
             self._put_in(empty[None], array, np.broadcast_to(numbers, (1, P, 1, array.size)))
 
@@ -824,7 +767,7 @@ class Core(EliminationCode):
             memory[self._motion] = first_motions[k]
             self._put_in(memory[None], self.params, lane_parameters[k][None, :, None])
             arrays = memory, lane_controls[k], table, self._guesses, *results
-            self._run(*(each.ctypes.data for each in arrays), 0, stop, stages)
+            self._functions["run"](*(each.ctypes.data for each in arrays), 0, stop, stages)
             last_motions[k], length[k] = (
                 memory[self._motion],
                 self._numbers(memory[None], self.length)[0, :, 0, 0],
@@ -842,11 +785,11 @@ class Core(EliminationCode):
         robot_rows, robot_infos = (
             np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
         )
-        found = self._rows(robot_rows, robot_infos, constants.newton, length.reshape(-1)[:size], done)
+        found = self._rows(robot_rows, robot_infos, newton.acceptable, length.reshape(-1)[:size], done)
         return start + done, lasts, found
 
     def _rows(
-        self, rows: np.ndarray, infos: np.ndarray, newton: NewtonOptions, length: np.ndarray, done: np.ndarray
+        self, rows: np.ndarray, infos: np.ndarray, acceptable: float, length: np.ndarray, done: np.ndarray
     ) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
         if self.strands > 1:
@@ -856,7 +799,7 @@ class Core(EliminationCode):
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
         fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE)
         result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
-        result = np.where(error <= newton.acceptable, result, int(Result.NO_CONVERGENCE))
+        result = np.where(error <= acceptable, result, int(Result.NO_CONVERGENCE))
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
@@ -889,11 +832,9 @@ class Core(EliminationCode):
         return type(before)(**found)
 
 
-def coefficients_of(
-    steps: StepCoefficients, stages: int, span: tuple[int, int]
-) -> Float[np.ndarray, "T stages n"]:
+def coefficients_of(steps: StepCoefficients, span: tuple[int, int]) -> Float[np.ndarray, "T stages n"]:
     """Return coefficients and the time since row 0 (s) of all stages of a span of steps."""
-    start, stop = span
+    (start, stop), stages = span, np.size(steps.ends)
     coefficients = np.asarray(steps.table)
     coefficients = coefficients.reshape(len(coefficients), stages, -1)
     table = np.empty((stop - start, stages, coefficients.shape[-1] + 1))

@@ -13,32 +13,14 @@ from __future__ import annotations
 
 import functools
 import operator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Elimination, Equations
-from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
-from knode_cosserat.solvers.boundary import pivots_of
-
-
-class Correction(NamedTuple):
-    """Arrays of one right-hand side: defects of pieces and tip, and the correction of y and unknowns."""
-
-    r: Array
-    tip: Array
-    #: B⁻¹ r
-    added: Array
-    #: corrections along the rod without those of the unknowns, and what the groups of pieces take from them
-    w: Array
-    beta: Array
-    dy: Array
-    #: those of the unknowns of each strand
-    unknowns: Array
-
 
 #: pieces between two changes of the unknowns
 GROUPS = (3, 4, 5)
@@ -62,7 +44,8 @@ class EliminationCode(RodCode):
         ny, k = e.ny, e.k
         #: number of unknowns of a strand, and their rows in y
         self.own = k // self.strands
-        self.pivots = [int(index) for index in pivots_of(system)[: self.own]]
+        unknown = system.y_layout.indices(system.base_unknowns)
+        self.pivots = [int(index) for index in unknown[: self.own]]
         #: nonzero slopes of base and tip: row, column, node
         self.base_slopes, self.tip_slopes = (
             [
@@ -100,11 +83,11 @@ class EliminationCode(RodCode):
         #: the solution, its unknowns, and the correction of both
         self.y, self.unknowns = a(ny, self.ends), a(k)
         self.dy, self.step_unknowns = a(ny, self.ends), a(k)
-        self.correction = Correction(
-            self.r, self.tip, self.added, by_rows(ny, 1, self.points),
-            by_rows(self.own, 1, self.groups[1] * self.strands),
-            self.dy if robots else by_rows(ny, 1, self.points), by_rows(self.own, 1, self.strands),
-        )  # fmt: skip
+        #: corrections along the rod at fixed unknowns, changes of unknowns at the ends of groups of pieces,
+        #: all corrections, and those of each strand's unknowns
+        self.w, self.beta = by_rows(ny, 1, self.points), by_rows(self.own, 1, self.groups[1] * self.strands)
+        self.column_dy = self.dy if robots else by_rows(ny, 1, self.points)
+        self.alpha = by_rows(self.own, 1, self.strands)
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
 
@@ -176,7 +159,7 @@ class EliminationCode(RodCode):
             f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
 
     def _write_advance(self) -> Function:
-        """A column at a piece's start to its end: B⁻¹ A x plus what is added."""
+        """A column at a piece's start to its end: B⁻¹ A x plus an added column."""
         el, n = self.elimination, self.equations.ny
         f = self._function("advance", "from", "added", "to", "n_piece")
         _, source, added, target, piece = f.arguments
@@ -353,14 +336,14 @@ class EliminationCode(RodCode):
             with f.loop(self.pieces) as j:
                 source = self._pointer(self.wide_added, j), self.wide_added.component
                 self._copy(ny, source, (self._pointer(self.added, j), 1))
-        self._write_correction(self.correction, self.advance)
+        self._write_correction()
         if not self.batch:
             with f.loop(self.points) as j:
-                source = self._pointer(self.correction.dy, j), 1
+                source = self._pointer(self.column_dy, j), 1
                 self._copy(ny, source, (self._pointer(self.dy, j), self.dy.component))
         for k in range(self.equations.k):
             strand, i = divmod(k, self.own)
-            self._put(self._get(self.correction.unknowns, i, strand), self.step_unknowns, k)
+            self._put(self._get(self.alpha, i, strand), self.step_unknowns, k)
 
     def _write_filling(self, turns: Any, residual: Function) -> None:
         """Corrections of y at points between nodes (see `StepProblem.filled`); `residual` is that at y."""
@@ -376,32 +359,32 @@ class EliminationCode(RodCode):
                     change = self._get(self.wide_added, i, point - 1)
                     self._put(self._get(self.y, i, point) + change, self.y, i, point)
 
-    def _write_correction(self, arrays: Correction, advance: Function) -> None:
+    def _write_correction(self) -> None:
         """Solve for a correction, from B⁻¹ r of all pieces."""
         f, ny, k, own = self._now, self.equations.ny, self.equations.k, self.own
         memory, (size, count) = f.arguments[0], self.groups
 
         def piece(j: Index) -> None:
-            start, added, end = (arrays.w, j), (arrays.added, j), (arrays.w, j + 1)
-            f.call(advance, memory, *(self._pointer(*each) for each in (start, added, end)), j.value)
+            start, added, end = (self.w, j), (self.added, j), (self.w, j + 1)
+            f.call(self.advance, memory, *(self._pointer(*each) for each in (start, added, end)), j.value)
 
-        tips = [Variable(f, each) for each in self._column(arrays.tip, k)]
+        tips = [Variable(f, each) for each in self._column(self.tip, k)]
         with f.loop(self.strands) as strand:
             base = strand.value * self.strand_points
             with f.loop(count) as g:
                 last = f.index(base + (g.value + 1) * size)
                 with f.loop(last.value, base + g.value * size) as j:
                     piece(j)
-                w = self._column(arrays.w, ny, 0, last)
+                w = self._column(self.w, ny, 0, last)
                 columns = [self._column(self.X, ny, c, last) for c in range(own)]
                 moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
-                self._set_column([a - b for a, b in zip(w, moved, strict=True)], arrays.w, ny, 0, last)
+                self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
                 group = f.index(strand.value * count + g.value)
-                self._set_column(self._gathered(w, self.pivots), arrays.beta, own, 0, group)
+                self._set_column(self._gathered(w, self.pivots), self.beta, own, 0, group)
             tip = f.index(base + self.grid.tip)
             with f.loop(tip.value, base + count * size) as j:
                 piece(j)
-            w = self._column(arrays.w, ny, 0, tip)
+            w = self._column(self.w, ny, 0, tip)
             M = [self._column(self.M, k, i, strand) for i in range(ny)]
             products = self._product(M, [self._entry(w, i) for i in range(ny)])
             for variable, value in zip(tips, products, strict=True):
@@ -411,7 +394,7 @@ class EliminationCode(RodCode):
         unknowns = [-each for each in self._product(inverse, [self._entry(tip_values, c) for c in range(k)])]
         for q in range(self.strands):
             rows = list(range(q * own, (q + 1) * own))
-            self._set_column(self._gathered(unknowns, rows), arrays.unknowns, own, 0, q)
+            self._set_column(self._gathered(unknowns, rows), self.alpha, own, 0, q)
 
         def correct(start: Any, stop: Any) -> None:
             """Write the corrections of points that share their unknowns."""
@@ -419,18 +402,18 @@ class EliminationCode(RodCode):
             with f.loop(stop, start) as j:
                 columns = [self._column(self.X, ny, c, j) for c in range(own)]
                 moved = self._product(columns, numbers)
-                w = self._column(arrays.w, ny, 0, j)
-                self._set_column([a + b for a, b in zip(w, moved, strict=True)], arrays.dy, ny, 0, j)
+                w = self._column(self.w, ny, 0, j)
+                self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.column_dy, ny, 0, j)
 
         with f.loop(self.strands) as strand:
             base = strand.value * self.strand_points
-            alpha = [Variable(f, each) for each in self._column(arrays.unknowns, own, 0, strand)]
+            alpha = [Variable(f, each) for each in self._column(self.alpha, own, 0, strand)]
             correct(base + (count * size + 1), base + self.strand_points)
             with f.loop(0, count - 1, -1) as g:
                 end = base + (g.value + 1) * size
                 correct(end, end + 1)
                 group = f.index(strand.value * count + g.value)
-                beta = self._column(arrays.beta, own, 0, group)
+                beta = self._column(self.beta, own, 0, group)
                 change = [a.get() - b for a, b in zip(alpha, beta, strict=True)]
                 T = [self._column(self.T, own, c, group) for c in range(own)]
                 moved = self._product(T, [self._entry(change, c) for c in range(own)])
@@ -438,7 +421,7 @@ class EliminationCode(RodCode):
                     variable.set(value)
                 correct(base + (g.value * size + 1), end)
             correct(base, base + 1)
-            self._set_column([each.get() for each in alpha], arrays.unknowns, own, 0, strand)
+            self._set_column([each.get() for each in alpha], self.alpha, own, 0, strand)
 
     def _gathered(self, column: list[Value], rows: list[int]) -> list[Value]:
         """Return rows of a column as a column."""

@@ -74,22 +74,23 @@ class Equations:
         whole_y, whole_history = np.concatenate(self.strand_y), self.joined(np.array(self.strand_history))
         self.unknowns = program.inputs("unknowns", (self.k,), STATE)
 
-        def problem(leaves: Any, c0: Any, t: Any, control: Any, record: Any) -> StepProblem:
+        def problem(step: Any, record: Any) -> StepProblem:
+            leaves, c0, t, control = step
             own = jax.tree.unflatten(tree, leaves)
             return StepProblem(own, t, control, c0, record[None], space)
 
-        def rates(leaves: Any, c0: Any, t: Any, control: Any, s: Any, y: Any, record: Any) -> Any:
-            return problem(leaves, c0, t, control, record).point_rates(s, y, record)
+        def rates(step: Any, s: Any, y: Any, record: Any) -> Any:
+            return problem(step, record).point_rates(s, y, record)
 
-        def base(leaves: Any, c0: Any, t: Any, control: Any, unknowns: Any, record: Any) -> Any:
-            return problem(leaves, c0, t, control, record).base(unknowns)
+        def base(step: Any, unknowns: Any, record: Any) -> Any:
+            return problem(step, record).base(unknowns)
 
-        def tip(leaves: Any, c0: Any, t: Any, control: Any, y: Any, record: Any) -> Any:
-            own = jax.tree.unflatten(tree, leaves)
+        def tip(step: Any, y: Any, record: Any) -> Any:
+            own, (_, c0, t, control) = jax.tree.unflatten(tree, step[0]), step
             return semi_discrete.tip(own, t, control, y, semi_discrete.unpacked_history(own, c0, record))
 
-        def jump(leaves: Any, c0: Any, t: Any, control: Any, acting: Any, y: Any, record: Any) -> Any:
-            return problem(leaves, c0, t, control, record).jump(acting, y, record)
+        def jump(step: Any, acting: Any, y: Any, record: Any) -> Any:
+            return problem(step, record).jump(acting, y, record)
 
         def geometry(leaves: Any) -> Any:
             own = jax.tree.unflatten(tree, leaves)
@@ -97,7 +98,7 @@ class Equations:
             length = jnp.asarray(own.length)[None]
             return 1.0 / scales.y, 1.0 / scales.tip, still.places, still.lengths()[:, 0], length
 
-        one, step = np.zeros(()), (1.0, 0.0, np.zeros(self.nc))
+        one, step = np.zeros(()), (leaves, 1.0, 0.0, np.zeros(self.nc))
         # of the parameters alone: inverse scales, places and lengths of pieces
         self.geometry = [
             np.broadcast_to(nodes, size)
@@ -108,19 +109,19 @@ class Equations:
             )
         ]
         known = [*folded, self.c0, self.t, self.control]
-        traced = jax.make_jaxpr(rates)(leaves, *step, one, np.ones(self.ny), np.zeros(self.numbers))
+        traced = jax.make_jaxpr(rates)(step, one, np.ones(self.ny), np.zeros(self.numbers))
         self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
         record = np.zeros(len(whole_history))
-        traced = jax.make_jaxpr(base)(leaves, *step, np.zeros(self.k), record)
+        traced = jax.make_jaxpr(base)(step, np.zeros(self.k), record)
         [self.base] = program.evaluate(traced, [*known, self.unknowns, whole_history])
-        traced = jax.make_jaxpr(tip)(leaves, *step, np.ones(len(whole_y)), record)
+        traced = jax.make_jaxpr(tip)(step, np.ones(len(whole_y)), record)
         [self.tip] = program.evaluate(traced, [*known, whole_y, whole_history])
         #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
         count = len(system.discontinuities.places)
         self.acting, self.far, self.jumping = program.inputs("acting", (count,), STATE), self.y, []
         if system.discontinuities.jump is not None:
             shapes = np.zeros(count), np.ones(self.ny), np.zeros(self.numbers)
-            traced = jax.make_jaxpr(jump)(leaves, *step, *shapes)
+            traced = jax.make_jaxpr(jump)(step, *shapes)
             [self.far] = program.evaluate(traced, [*known, self.acting, self.y, self.history])
             slopes = program.jacobian(self.far, self.y)
             for i, j in np.ndindex(slopes.shape):
@@ -322,7 +323,7 @@ class TangentEquations(Equations):
 class Elimination:
     """Programs of a piece: A and B are derivatives of its defect by y at its start (before jumps) and end.
 
-    B is factored. A correction x of the start goes on as B⁻¹ (A x + r).
+    B is factored. A correction x of the start becomes B⁻¹ (A x + r) at the end.
     """
 
     def __init__(self, equations: Equations):

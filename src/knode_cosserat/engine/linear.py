@@ -48,23 +48,12 @@ class Add:
 
 @dataclasses.dataclass(frozen=True)
 class Scale:
-    """Multiply a number."""
+    """Multiply a number; without a coefficient, set it to zero."""
 
     target: Number
-    coefficient: Coefficient
+    coefficient: Coefficient | None = None
 
     def transposed(self) -> Scale:
-        """Return the transposed operation."""
-        return self
-
-
-@dataclasses.dataclass(frozen=True)
-class Clear:
-    """Set a number to zero."""
-
-    target: Number
-
-    def transposed(self) -> Clear:
         """Return the transposed operation."""
         return self
 
@@ -79,12 +68,12 @@ class Loop:
     descends: bool = False
 
 
-Operation = Add | Scale | Clear | Loop
+Operation = Add | Scale | Loop
 
 
 def write(memory: Memory, operations: Sequence[Operation], lanes: int, transposed: bool) -> None:
     """Write the code of a map, with as many vectors side by side as there are lanes."""
-    straight: list[Add | Scale | Clear] = []
+    straight: list[Add | Scale] = []
     for operation in reversed(operations) if transposed else operations:
         if not isinstance(operation, Loop):
             straight.append(operation.transposed() if transposed else operation)
@@ -98,7 +87,7 @@ def write(memory: Memory, operations: Sequence[Operation], lanes: int, transpose
     _write_straight(memory, straight, lanes)
 
 
-def _write_straight(memory: Memory, operations: Sequence[Add | Scale | Clear], lanes: int) -> None:
+def _write_straight(memory: Memory, operations: Sequence[Add | Scale], lanes: int) -> None:
     """Write operations without loops: each number is read once and written once."""
     values: dict[Any, Value | None] = {}
     changed: dict[Any, tuple[Array, int, int | Index]] = {}
@@ -120,12 +109,10 @@ def _write_straight(memory: Memory, operations: Sequence[Add | Scale | Clear], l
         target = operation.target
         if target.array is not None:
             changed[target.key] = target.array, target.i, target.j
-        if isinstance(operation, Clear):
-            values[target.key] = None
-            continue
-        value = get(target)
+        coefficient = operation.coefficient
+        value = None if coefficient is None else get(target)
         if isinstance(operation, Scale):
-            values[target.key] = None if value is None else times(operation.coefficient, value)
+            values[target.key] = None if coefficient is None or value is None else times(coefficient, value)
             continue
         source = get(operation.source)
         if source is None:

@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Constants, Core, Shape, States, coefficients_of
+from knode_cosserat.engine.core import Core, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.history import StepCoefficients
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import StepCoefficients, StepRows
 
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 
@@ -39,41 +39,26 @@ def tangents_for(
     return compiled(key, lambda: kind(pattern.system, settings, moving))
 
 
-def loop_one(
-    system: System, settings: Settings, steps: StepCoefficients, controls: Any, past: States,
-    span: tuple[int, int], tip_offset: Any = 0.0,
-) -> tuple[int, States, StepRows]:  # fmt: skip
+def solve_steps(
+    system: System, steps: StepCoefficients, controls: Any, states: Any, span: tuple[int, int]
+) -> tuple[Any, Any, Any]:
     """Solve a span of steps until one fails: the number of steps done, the state after them, and rows.
 
-    The offset (k,) is subtracted from the residual of the tip's conditions.
+    The state is a `StateHistory`; of equilibria, solved in turn, it is y at all points. Controls are (T, c).
+    A batch has controls (B, T, c), as many states, and one system or as many: its robots are solved side by
+    side in the lanes of vectors, each until a step fails (see `Core.integrate`).
     """
-    core = core_of(Pattern.of(system), settings, robots=False)
-    batch = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
-    constants = Constants(parameters_of(system), settings.newton, tip_offset)
-    found = core.integrate(constants, np.asarray(controls)[None], steps, batch, span)
-    done, last, rows = jax.tree.map(lambda leaf: leaf[0], found)
-    return int(done), last, rows
-
-
-def loop_many(
-    system: System, settings: Settings, steps: StepCoefficients, controls: Any, pasts: States, stop: int
-) -> tuple[np.ndarray, States, StepRows]:
-    """Solve all steps of a batch: controls (B, T, c), states (B, ...), and one system or a batch of them.
-
-    Robots are solved side by side in the lanes of vectors; see `Core.integrate`.
-    """
-    core = core_of(Pattern.of(system), settings, robots=len(controls) > 1)
+    alone, is_static = np.ndim(controls) == 2, steps.settings.time is None
+    core = core_of(Pattern.of(system), steps.settings, robots=not alone and len(controls) > 1)
     parameters = parameters_of(system)
     if np.ndim(system.length):
         leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
         parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-    pasts = jax.tree.map(np.asarray, pasts)
-    constants = Constants(parameters, settings.newton)
-    return core.integrate(constants, np.asarray(controls), steps, pasts, (0, stop))
-
-
-#: the coefficients of equilibria
-STILL = StepCoefficients(np.zeros((1, 4)), 0.0)
+    states = Shape(states) if is_static else states
+    controls, states = jax.tree.map(lambda leaf: np.asarray(leaf)[None if alone else ...], (controls, states))
+    done, last, rows = core.integrate(parameters, controls, steps, states, span)
+    found = done, last.y if is_static else last, rows
+    return jax.tree.map(lambda leaf: leaf[0], found) if alone else found
 
 
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
@@ -81,23 +66,9 @@ def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
     return core_of(Pattern.of(system), settings, robots=False).evaluator(parameters_of(system))
 
 
-def static_one(
-    system: System, settings: Settings, controls: Any, y: Any, span: tuple[int, int], tip_offset: Any = 0.0
-) -> Any:
-    """Solve a span of equilibria in turn until one fails: the number done, y at all points, and rows."""
-    done, last, rows = loop_one(system, settings, STILL, controls, Shape(y), span, tip_offset)
-    return done, last.y, rows
-
-
-def static_many(system: System, settings: Settings, controls: Any, y: Any, stop: int) -> Any:
-    """Solve the equilibria of a batch: controls (B, T, c), y (B, points, y), and one system or a batch."""
-    done, last, rows = loop_many(system, settings, STILL, controls, Shape(y), stop)
-    return done, last.y, rows
-
-
-def table_of(settings: Settings, steps: StepCoefficients, count: int, t0: float) -> np.ndarray:
+def table_of(steps: StepCoefficients, count: int, t0: float) -> np.ndarray:
     """Return the coefficients and the time (s) of all stages of the first steps (solves, memory + 3)."""
-    table = coefficients_of(steps, settings.stages, (0, count))
+    table = coefficients_of(steps, (0, count))
     table[..., -1] += t0
     return table.reshape(-1, table.shape[-1])
 

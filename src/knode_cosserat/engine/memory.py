@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -58,7 +59,7 @@ class Memory:
         return found
 
     def _by_rows(self, rows: int, columns: int, count: int) -> Array:
-        """Reserve matrices of which a vector holds a row of all robots, or as many rows as lanes."""
+        """Reserve matrices by columns: a vector has a row of all robots, or as many rows as lanes."""
         size = columns * self._padded(rows)
         if self.batch:
             return self._array(size, count)
@@ -163,6 +164,26 @@ class Memory:
         """
         with self._now.loop(first + count, first, 1 if self.batch else self.L) as j:
             yield j
+
+    def _components(self, size: int, count: int) -> Iterator[tuple[int, Index]]:
+        """Write a loop over places, and yield each component with the place."""
+        with self._places(count) as j:
+            for i in range(size):
+                yield i, j
+
+    def _copy_wide(self, source: Array, target: Array, count: int, shift: int = 0) -> None:
+        """Copy values at places, to places that are earlier by a shift."""
+        for i, j in self._components(source.size, count):
+            self._write_wide(self._wide(source, i, j + shift), target, i, j)
+
+    def _write_shift(self, states: list[Array], count: int) -> None:
+        """Shift earlier states by one step."""
+        for newer, older in reversed(list(itertools.pairwise(states))):
+            self._copy_wide(newer, older, count)
+
+    def _before(self, end: int, j: Index, value: Value) -> Value:
+        """Return a value, but zero in the lanes from a place on."""
+        return value if self.batch else self._now.select(self._inside(j, end), value, 0.0)
 
     def _inside(self, j: Index, end: int) -> Any:
         """Return true for the lanes before a place."""

@@ -51,7 +51,7 @@ class EngineError(KnodeCosseratError, NotImplementedError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Loop:
+class _Loop:
     """A `while` loop: `program` computes the condition and the next state from the state and the inputs.
 
     In `program` the level of inputs is 1, and the level of the state is 2.
@@ -72,7 +72,7 @@ class Loop:
     source: str = ""
 
 
-class Product(NamedTuple):
+class _Product(NamedTuple):
     """Product of a Jacobian with a vector: nodes that depend linearly on inputs."""
 
     inputs: list[int]
@@ -110,7 +110,7 @@ def regular(positions: np.ndarray) -> Positions | None:
 
 
 @dataclasses.dataclass(eq=False)
-class Rule:
+class _Rule:
     """Derivative rule of a JAX function: of `jax.custom_jvp`, or of a linear solver."""
 
     function: Callable[..., Any]
@@ -120,7 +120,7 @@ class Rule:
     #: "hold" nodes of the results
     results: list[Nodes] = dataclasses.field(default_factory=list)
     #: places of the arguments with tangents, and the results' tangents, once needed
-    product: tuple[list[int], Product] | None = None
+    product: tuple[list[int], _Product] | None = None
 
     def traced(self) -> tuple[list[int], Any]:
         """Return the places of the arguments with tangents, and the jaxpr of the results' tangents."""
@@ -172,9 +172,9 @@ class Program:
         self.values: list[Any] = []
         #: 0 of constants, given for inputs, and otherwise the largest of the arguments
         self.levels: list[int] = []
-        self.loops: list[Loop] = []
+        self.loops: list[_Loop] = []
         #: derivative rules of "hold" nodes, by node; None: the derivative is zero
-        self.rules: dict[int, Rule | None] = {}
+        self.rules: dict[int, _Rule | None] = {}
         #: shapes of arrays; other nodes are scalars
         self.shapes: dict[int, tuple[int, ...]] = {}
         self._boolean: list[bool] = []
@@ -378,17 +378,14 @@ class Program:
             return self.apply("not", p)
         return None
 
-    def _simple_and(self, a: int, b: int) -> int | None:
+    def _simple_and(self, a: int, b: int, neutral: bool = True) -> int | None:
         for x, y in ((a, b), (b, a)):
             if self.is_constant(x):
-                return y if self.values[x] else x
+                return y if self.values[x] == neutral else x
         return a if a == b else None
 
     def _simple_or(self, a: int, b: int) -> int | None:
-        for x, y in ((a, b), (b, a)):
-            if self.is_constant(x):
-                return x if self.values[x] else y
-        return a if a == b else None
+        return self._simple_and(a, b, neutral=False)
 
     def _simple_not(self, a: int) -> int | None:
         return self.operations[a][1] if self.operations[a][0] == "not" else None
@@ -402,7 +399,7 @@ class Program:
         stopped = self.operations[a][0] == "hold" and self.rules[a] is None
         return a if stopped else self.held(a, None)
 
-    def held(self, node: int, rule: Rule | None) -> int:
+    def held(self, node: int, rule: _Rule | None) -> int:
         """Return a node of the same value whose derivative follows a rule; None: it is zero."""
         while (known := self._memo.get(("held", node))) is not None:
             if self.rules[known] is rule:
@@ -420,7 +417,7 @@ class Program:
         """Return the results of a function with a derivative rule; `values` evaluates it."""
         key = ("rule", name, *(x for each in arguments for x in (each.shape, each.tobytes())))
         if key not in self._memo:
-            rule = Rule(function, shapes, arguments)
+            rule = _Rule(function, shapes, arguments)
             # before the results, because nodes are in the order of evaluation
             self._all_parts(arguments)
             for array in values():
@@ -429,7 +426,7 @@ class Program:
             self._memo[key] = rule.results
         return self._memo[key]
 
-    def loop(self, loop: Loop) -> list[int]:
+    def loop(self, loop: _Loop) -> list[int]:
         """Return the nodes of the final state of a loop."""
         arguments = [*(node for _, node in loop.inputs), *loop.initial]
         inner = loop.program
@@ -574,7 +571,7 @@ class Program:
         return self.view(other, np.arange(chosen.size).reshape(shape)[..., int(column.argmax())])
 
     def parts(self, nodes: Nodes) -> list[int]:
-        """Return the array of which scalars are entries, or the scalars."""
+        """Return the one array with these scalars as entries, or the scalars."""
         return [self.array(nodes)] if self.is_computed(nodes) else nodes.ravel().tolist()
 
     def _all_parts(self, arrays: Iterable[Nodes]) -> list[int]:
@@ -742,10 +739,10 @@ class Program:
                 found.add(node)
         return found
 
-    def _partial(self, partial: Callable[..., Scalar | float], node: int) -> int:
+    def _partial(self, partial: Callable[..., _Scalar | float], node: int) -> int:
         """Return a partial derivative of an operation."""
-        value = partial(*(Scalar(self, each) for each in (node, *self.operations[node][1:])))
-        return value.node if isinstance(value, Scalar) else self.constant(value)
+        value = partial(*(_Scalar(self, each) for each in (node, *self.operations[node][1:])))
+        return value.node if isinstance(value, _Scalar) else self.constant(value)
 
     def _loop_error(self, node: int) -> EngineError:
         return EngineError(
@@ -824,7 +821,7 @@ class Program:
         keys = dict.fromkeys(key for tangents in moving.values() for key in tangents)
         is_sparse = 2 * sum(map(len, moving.values())) < len(moving) * len(keys)
         if len(moving) < 2 * len(keys) and is_sparse:
-            return {Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
+            return {_Component(int(scalars[k])): self.unit(scalars.size, k) for k in moving}
         zero = np.full(scalars.size, self.constant(0.0))
         tangents = {}
         for key in keys:
@@ -839,7 +836,7 @@ class Program:
         total, zero = dict[Any, int](), self.constant(0.0)
         for key, tangent in found.get(array, {}).items():
             own = int(self.entries(tangent, self.shapes[array]).flat[k])
-            chain = found[key.node] if isinstance(key, Component) else {key: self.constant(1.0)}
+            chain = found[key.node] if isinstance(key, _Component) else {key: self.constant(1.0)}
             for variable, slope in chain.items():
                 total[variable] = self.apply("add", total.get(variable, zero), self.apply("mul", own, slope))
         return self._nonzero(total)
@@ -851,7 +848,7 @@ class Program:
         rule = self.rules[node]
         return () if rule is None else self._all_parts(rule.arguments)
 
-    def _by_rule(self, rule: Rule, found: Tangents) -> None:
+    def _by_rule(self, rule: _Rule, found: Tangents) -> None:
         """Add the tangents of all results of a rule."""
         moving = {node: found[node] for node in self._all_parts(rule.arguments) if found.get(node)}
         results = self._all_parts(rule.results)
@@ -866,7 +863,7 @@ class Program:
                 if not self.is_constant(tangent, 0.0):
                     found[node][key] = tangent
 
-    def _product(self, rule: Rule) -> tuple[list[int], Product]:
+    def _product(self, rule: _Rule) -> tuple[list[int], _Product]:
         """Return the active arguments of a rule, and its results' tangents."""
         if rule.product is None:
             active, jaxpr = rule.traced()
@@ -883,7 +880,7 @@ class Program:
                 if not depending.isdisjoint(self._sources(node)):
                     depending.add(node)
                     steps.append(node)
-            rule.product = active, Product(inputs, outputs, steps)
+            rule.product = active, _Product(inputs, outputs, steps)
         return rule.product
 
     def _sources(self, node: int) -> tuple[int, ...]:
@@ -894,7 +891,7 @@ class Program:
         results = self._all_parts(rule.results)
         return (*self._all_parts(rule.arguments), *(self.operations[each][1] for each in results))
 
-    def _replaced(self, product: Product, new: dict[int, int]) -> list[int]:
+    def _replaced(self, product: _Product, new: dict[int, int]) -> list[int]:
         """Return the outputs with other nodes in the place of the inputs."""
         for node in product.steps:
             rule = self.rules.get(node)
@@ -905,7 +902,7 @@ class Program:
                 continue
             arguments = [self._nodes([new.get(each, each) for each in self.parts(array)], array.shape)
                          for array in rule.arguments]  # fmt: skip
-            copy = Rule(rule.function, rule.shapes, arguments)
+            copy = _Rule(rule.function, rule.shapes, arguments)
             for array in rule.results:
                 parts = self.parts(array)
                 values = [self.operations[each][1] for each in parts]
@@ -942,65 +939,56 @@ class Program:
 
     def evaluate(self, closed_jaxpr: Any, arguments: Sequence[Nodes]) -> list[Nodes]:
         """Return the results of a jaxpr for arrays of nodes."""
-        return Evaluation(self).closed(closed_jaxpr, arguments)
+        return _Evaluation(self).closed(closed_jaxpr, arguments)
 
 
-class Component(NamedTuple):
+class _Component(NamedTuple):
     """Variable of a derivative: a scalar in an array."""
 
     node: int
 
 
-class Scalar:
+def _arithmetic(
+    operation: str,
+) -> tuple[Callable[[_Scalar, Any], _Scalar], Callable[[_Scalar, Any], _Scalar]]:
+    """Return an operator of scalars, and the one for a scalar on its right."""
+    return (
+        lambda x, other: x.of(operation, other),
+        lambda x, other: _Scalar(x.program, x.program.constant(other)).of(operation, x),
+    )
+
+
+class _Scalar:
     """A node with arithmetic, to write formulas."""
 
     def __init__(self, program: Program, node: int) -> None:
         self.program = program
         self.node = node
 
-    def of(self, operation: str, *others: Scalar | float) -> Scalar:
+    def of(self, operation: str, *others: _Scalar | float) -> _Scalar:
         """Return an operation on this and on other scalars or numbers."""
         nodes = [
-            other.node if isinstance(other, Scalar) else self.program.constant(other) for other in others
+            other.node if isinstance(other, _Scalar) else self.program.constant(other) for other in others
         ]
-        return Scalar(self.program, self.program.apply(operation, self.node, *nodes))
+        return _Scalar(self.program, self.program.apply(operation, self.node, *nodes))
 
-    def __neg__(self) -> Scalar:
+    def __neg__(self) -> _Scalar:
         return self.of("neg")
 
-    def __add__(self, other: Scalar | float) -> Scalar:
-        return self.of("add", other)
-
-    def __sub__(self, other: Scalar | float) -> Scalar:
-        return self.of("sub", other)
-
-    def __mul__(self, other: Scalar | float) -> Scalar:
-        return self.of("mul", other)
-
-    def __truediv__(self, other: Scalar | float) -> Scalar:
-        return self.of("div", other)
-
-    def __radd__(self, other: float) -> Scalar:
-        return self + other
-
-    def __rsub__(self, other: float) -> Scalar:
-        return Scalar(self.program, self.program.constant(other)) - self
-
-    def __rmul__(self, other: float) -> Scalar:
-        return self * other
-
-    def __rtruediv__(self, other: float) -> Scalar:
-        return Scalar(self.program, self.program.constant(other)) / self
+    __add__, __radd__ = _arithmetic("add")
+    __sub__, __rsub__ = _arithmetic("sub")
+    __mul__, __rmul__ = _arithmetic("mul")
+    __truediv__, __rtruediv__ = _arithmetic("div")
 
 
-def _share(a: Scalar, b: Scalar, comparison: str) -> Scalar:
+def _share(a: _Scalar, b: _Scalar, comparison: str) -> _Scalar:
     """Return the derivative of max or min by the first argument: a half at ties."""
     tied = a.of("eq", b).of("select", 0.0, 0.5)
     return a.of(comparison, b).of("select", tied, 1.0)
 
 
 #: partial derivatives by each argument, from the result r and the arguments; other operations have none
-PARTIALS: dict[str, tuple[Callable[..., Scalar | float], ...]] = {
+PARTIALS: dict[str, tuple[Callable[..., _Scalar | float], ...]] = {
     "add": (lambda r, a, b: 1.0, lambda r, a, b: 1.0),
     "sub": (lambda r, a, b: 1.0, lambda r, a, b: -1.0),
     "mul": (lambda r, a, b: b, lambda r, a, b: a),
@@ -1032,24 +1020,24 @@ PARTIALS: dict[str, tuple[Callable[..., Scalar | float], ...]] = {
 }
 
 
-def _sinh(x: Scalar) -> Scalar:
+def _sinh(x: _Scalar) -> _Scalar:
     grown = x.of("expm1")
     return 0.5 * (grown + grown / (1.0 + grown))
 
 
-def _cbrt(x: Scalar) -> Scalar:
+def _cbrt(x: _Scalar) -> _Scalar:
     size = (x.of("abs").of("log") / 3.0).of("exp")
     return x.of("sign") * x.of("eq", 0.0).of("select", size, 0.0)
 
 
-def _rounded_to_even(x: Scalar) -> Scalar:
+def _rounded_to_even(x: _Scalar) -> _Scalar:
     up = (x + 0.5).of("floor")
     odd = up.of("rem", 2.0).of("ne", 0.0)
     return odd.of("and", (up - x).of("eq", 0.5)).of("select", up, up - 1.0)
 
 
 #: functions of one number by other operations
-FORMULAS: dict[str, Callable[[Scalar], Scalar]] = {
+FORMULAS: dict[str, Callable[[_Scalar], _Scalar]] = {
     "square": lambda x: x * x,
     "rsqrt": lambda x: 1.0 / x.of("sqrt"),
     "cbrt": _cbrt,
@@ -1071,8 +1059,20 @@ UNCHANGED = frozenset({"copy", "copy_p", "optimization_barrier", "reduce_precisi
 CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 REDUCED = {
     "reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and",
-    "reduce_or": "or", "cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min",
+    "reduce_or": "or",
 }  # fmt: skip
+ACCUMULATED = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+#: primitives that move entries, from arrays of nodes and parameters
+RESHAPED: dict[str, Callable[[Any, Any], Nodes]] = {
+    "reshape": lambda arrays, own: arrays[0].reshape(own["new_sizes"]),
+    "squeeze": lambda arrays, own: np.squeeze(arrays[0], tuple(own["dimensions"])),
+    "expand_dims": lambda arrays, own: np.expand_dims(arrays[0], tuple(own["dimensions"])),
+    "transpose": lambda arrays, own: np.transpose(arrays[0], own["permutation"]),
+    "concatenate": lambda arrays, own: np.concatenate(arrays, axis=own["dimension"]),
+    "stack": lambda arrays, own: np.stack(arrays, axis=own["axis"]),
+    "tile": lambda arrays, own: np.tile(arrays[0], own["reps"]),
+    "rev": lambda arrays, own: np.flip(arrays[0], own["dimensions"]),
+}
 SCATTERED = {
     "scatter-add": "add", "scatter_add": "add", "scatter_mul": "mul", "scatter-mul": "mul",
     "scatter_min": "min", "scatter-min": "min", "scatter_max": "max", "scatter-max": "max",
@@ -1103,7 +1103,7 @@ def source_line(equations: Sequence[Any]) -> str:
     return "unknown line"
 
 
-class Evaluation:
+class _Evaluation:
     """Evaluates jaxprs on the nodes of a program. Methods `_do_…` are of primitives."""
 
     def __init__(self, program: Program) -> None:
@@ -1135,7 +1135,7 @@ class Evaluation:
         name, params = equation.primitive.name, equation.params
         method = getattr(self, f"_do_{name.replace('-', '_')}", None)
         if method is not None:
-            results = method(equation, *arguments, **params)
+            results = method(equation, *arguments)
             return results if isinstance(results, list) else [results]
         if name in UNCHANGED:
             return arguments
@@ -1143,10 +1143,14 @@ class Evaluation:
             return [self._of_one(FORMULAS[name], arguments[0])]
         if name in ELEMENTWISE:
             return [self.elementwise(self._operation(equation, ELEMENTWISE[name]), *arguments)]
+        if name in RESHAPED:
+            return [RESHAPED[name](arguments, params)]
         if name in REDUCED:
-            return [self._reduced(REDUCED[name], arguments[0], **params)]
+            return [self._reduced(REDUCED[name], arguments[0], params["axes"])]
+        if name in ACCUMULATED:
+            return [self._accumulated(ACCUMULATED[name], equation, *arguments)]
         if name in SCATTERED:
-            return [self._scattered(equation, SCATTERED[name], *arguments, **params)]
+            return [self._do_scatter(equation, *arguments)]
         inner = next((params[key] for key in CALLS if key in params), None)
         if inner is None or name in INSTEAD:
             raise self.error(equation)
@@ -1213,52 +1217,28 @@ class Evaluation:
 
     # shapes
 
-    def _do_broadcast_in_dim(
-        self, e: Any, x: Nodes, *_: Any, shape: Any, broadcast_dimensions: Any, **__: Any
-    ) -> Nodes:
+    def _do_broadcast_in_dim(self, e: Any, x: Nodes, *_: Any) -> Nodes:
+        shape = e.params["shape"]
         own = [1] * len(shape)
-        for size, axis in zip(x.shape, broadcast_dimensions, strict=True):
+        for size, axis in zip(x.shape, e.params["broadcast_dimensions"], strict=True):
             own[axis] = size
         return np.broadcast_to(x.reshape(own), shape)
 
-    def _do_reshape(self, e: Any, x: Nodes, *, new_sizes: Any, **_: Any) -> Nodes:
-        return x.reshape(new_sizes)
+    def _do_slice(self, e: Any, x: Nodes) -> Nodes:
+        starts, limits = e.params["start_indices"], e.params["limit_indices"]
+        return x[tuple(map(slice, starts, limits, e.params["strides"] or (1,) * x.ndim))]
 
-    def _do_squeeze(self, e: Any, x: Nodes, *, dimensions: Any) -> Nodes:
-        return np.squeeze(x, tuple(dimensions))
+    def _do_split(self, e: Any, x: Nodes) -> list[Nodes]:
+        return list(np.split(x, np.cumsum(e.params["sizes"])[:-1], e.params["axis"]))
 
-    def _do_expand_dims(self, e: Any, x: Nodes, *, dimensions: Any) -> Nodes:
-        return np.expand_dims(x, tuple(dimensions))
-
-    def _do_transpose(self, e: Any, x: Nodes, *, permutation: Any) -> Nodes:
-        return np.transpose(x, permutation)
-
-    def _do_slice(self, e: Any, x: Nodes, *, start_indices: Any, limit_indices: Any, strides: Any) -> Nodes:
-        strides = strides or (1,) * x.ndim
-        return x[tuple(map(slice, start_indices, limit_indices, strides))]
-
-    def _do_concatenate(self, e: Any, *arrays: Nodes, dimension: int) -> Nodes:
-        return np.concatenate(arrays, axis=dimension)
-
-    def _do_stack(self, e: Any, *arrays: Nodes, axis: int) -> Nodes:
-        return np.stack(arrays, axis=axis)
-
-    def _do_split(self, e: Any, x: Nodes, *, sizes: Any, axis: int) -> list[Nodes]:
-        return list(np.split(x, np.cumsum(sizes)[:-1], axis))
-
-    def _do_tile(self, e: Any, x: Nodes, *, reps: Any) -> Nodes:
-        return np.tile(x, reps)
-
-    def _do_rev(self, e: Any, x: Nodes, *, dimensions: Any) -> Nodes:
-        return np.flip(x, dimensions)
-
-    def _do_iota(self, e: Any, *, dtype: Any, shape: Any, dimension: int, **_: Any) -> Nodes:
+    def _do_iota(self, e: Any) -> Nodes:
+        shape, dimension = e.params["shape"], e.params["dimension"]
         own = [1] * len(shape)
         own[dimension] = -1
         return self.program.constants(np.broadcast_to(np.arange(shape[dimension]).reshape(own), shape))
 
-    def _do_pad(self, e: Any, x: Nodes, fill: Nodes, *, padding_config: Any) -> Nodes:
-        for axis, (low, high, inner) in enumerate(padding_config):
+    def _do_pad(self, e: Any, x: Nodes, fill: Nodes) -> Nodes:
+        for axis, (low, high, inner) in enumerate(e.params["padding_config"]):
             x = np.moveaxis(x, axis, 0)
             size = max(0, len(x) + max(0, len(x) - 1) * inner)
             out = np.full((size + max(low, 0) + max(high, 0), *x.shape[1:]), int(fill))
@@ -1268,8 +1248,8 @@ class Evaluation:
 
     # numbers
 
-    def _do_convert_element_type(self, e: Any, x: Nodes, *, new_dtype: Any, **_: Any) -> Nodes:
-        old = e.invars[0].aval.dtype
+    def _do_convert_element_type(self, e: Any, x: Nodes) -> Nodes:
+        old, new_dtype = e.invars[0].aval.dtype, e.params["new_dtype"]
         if old == new_dtype:
             return x
         zero, one = self.program.constant(0.0), self.program.constant(1.0)
@@ -1281,14 +1261,15 @@ class Evaluation:
             return self.elementwise(self.truncated, x)
         return x
 
-    def _do_integer_pow(self, e: Any, x: Nodes, *, y: int) -> Nodes:
-        return self.elementwise(lambda a: self.program.power(a, y), x)
+    def _do_integer_pow(self, e: Any, x: Nodes) -> Nodes:
+        return self.elementwise(lambda a: self.program.power(a, e.params["y"]), x)
 
-    def _do_round(self, e: Any, x: Nodes, *, rounding_method: Any) -> Nodes:
-        return self._of_one(_rounded_to_even if int(rounding_method) == 1 else FORMULAS["round"], x)
+    def _do_round(self, e: Any, x: Nodes) -> Nodes:
+        is_even = int(e.params["rounding_method"]) == 1
+        return self._of_one(_rounded_to_even if is_even else FORMULAS["round"], x)
 
-    def _of_one(self, formula: Callable[[Scalar], Scalar], x: Nodes) -> Nodes:
-        return self.elementwise(lambda node: formula(Scalar(self.program, node)).node, x)
+    def _of_one(self, formula: Callable[[_Scalar], _Scalar], x: Nodes) -> Nodes:
+        return self.elementwise(lambda node: formula(_Scalar(self.program, node)).node, x)
 
     def _do_xor(self, e: Any, a: Nodes, b: Nodes) -> Nodes:
         return self.elementwise(self._operation(e, "ne"), a, b)
@@ -1313,16 +1294,15 @@ class Evaluation:
 
     # reductions
 
-    def _reduced(
-        self, operation: str, x: Nodes, *, axes: Any = None, axis: Any = None, **options: Any
-    ) -> Nodes:
-        if axis is not None:
-            x = np.moveaxis(x, axis, 0)
-            x = x[::-1] if options["reverse"] else x
-            found = x.copy()
-            for k in range(1, len(x)):
-                found[k] = self.elementwise(operation, found[k - 1], x[k])
-            return np.moveaxis(found[::-1] if options["reverse"] else found, 0, axis)
+    def _accumulated(self, operation: str, e: Any, x: Nodes) -> Nodes:
+        way = slice(None, None, -1 if e.params["reverse"] else 1)
+        x = np.moveaxis(x, e.params["axis"], 0)[way]
+        found = x.copy()
+        for k in range(1, len(x)):
+            found[k] = self.elementwise(operation, found[k - 1], x[k])
+        return np.moveaxis(found[way], 0, e.params["axis"])
+
+    def _reduced(self, operation: str, x: Nodes, axes: Sequence[int]) -> Nodes:
         rest = tuple(k for k in range(x.ndim) if k not in axes)
         shape = tuple(x.shape[k] for k in rest)
         rows = x.transpose(*axes, *rest).reshape(-1, *shape)
@@ -1337,8 +1317,14 @@ class Evaluation:
             total = self.elementwise(operation, total, row)
         return total
 
-    def _do_argmin(self, e: Any, x: Nodes, *, axes: Any, comparison: str = "lt", **_: Any) -> Nodes:
-        f, rows = self.apply, np.moveaxis(x, axes[0], 0)
+    def _do_argmin(self, e: Any, x: Nodes) -> Nodes:
+        return self._best_index("lt", np.moveaxis(x, e.params["axes"][0], 0))
+
+    def _do_argmax(self, e: Any, x: Nodes) -> Nodes:
+        return self._best_index("gt", np.moveaxis(x, e.params["axes"][0], 0))
+
+    def _best_index(self, comparison: str, rows: Nodes) -> Nodes:
+        f = self.apply
         best, index = rows[0], np.full(rows.shape[1:], self.program.constant(0.0))
         for k in range(1, len(rows)):
             # the first NaN counts as the smallest and as the largest number
@@ -1348,13 +1334,11 @@ class Evaluation:
             index = self.elementwise("select", better, index, self.program.constants(k))
         return index
 
-    def _do_argmax(self, e: Any, x: Nodes, *, axes: Any, **_: Any) -> Nodes:
-        return self._do_argmin(e, x, axes=axes, comparison="gt")
-
-    def _do_sort(self, e: Any, *arrays: Nodes, dimension: int, num_keys: int, **_: Any) -> list[Nodes]:
+    def _do_sort(self, e: Any, *arrays: Nodes) -> list[Nodes]:
+        dimension = e.params["dimension"]
         moved = [np.moveaxis(array, dimension, 0) for array in arrays]
         count = len(moved[0])
-        keys = [self._values(key) for key in moved[:num_keys]]
+        keys = [self._values(key) for key in moved[: e.params["num_keys"]]]
         if not any(np.isnan(key).any() for key in keys):
             order = np.lexsort(keys[::-1], axis=0)
             moved = [np.take_along_axis(array, order, axis=0) for array in moved]
@@ -1377,12 +1361,9 @@ class Evaluation:
     # variable indices
 
     def by_index(
-        self,
-        e: Any,
-        nodes: Sequence[int],
-        ranges: Sequence[tuple[int, int]],
+        self, e: Any, nodes: Sequence[int], ranges: Sequence[tuple[int, int]],
         entry: Callable[..., list[Nodes]],
-    ) -> list[Nodes]:
+    ) -> list[Nodes]:  # fmt: skip
         """Return the entry for indices that may be variables: by selects; indices are clipped to ranges."""
         if not nodes:
             return entry()
@@ -1416,7 +1397,8 @@ class Evaluation:
 
         return found(int(nodes[0]))
 
-    def _do_dynamic_slice(self, e: Any, x: Nodes, *starts: Nodes, slice_sizes: Any) -> list[Nodes]:
+    def _do_dynamic_slice(self, e: Any, x: Nodes, *starts: Nodes) -> list[Nodes]:
+        slice_sizes = e.params["slice_sizes"]
         ranges = [(0, size - own) for size, own in zip(x.shape, slice_sizes, strict=True)]
 
         def entry(*first: int) -> list[Nodes]:
@@ -1435,19 +1417,23 @@ class Evaluation:
         return self.by_index(e, [int(start) for start in starts], ranges, entry)
 
     def _windows(
-        self, e: Any, shape: Any, indices: Nodes, axes: Any, batching: Any, sizes: Any, clip: bool,
+        self, e: Any, indices: Nodes, axes: tuple[Any, ...], sizes: Sequence[int],
         entry: Callable[[Any, Any], list[Nodes]],
     ) -> Callable[[Any], list[Nodes]]:  # fmt: skip
-        """Return a function that calls entry(place, slices) for a batch index; slices are None outside."""
-        own, batch_axes = batching
+        """Return a function that calls entry(place, slices) for a batch index; slices are None outside.
+
+        `axes` of the first operand: those of variable indices, of batches, and of batches in the indices.
+        """
+        shape, (moving, own, batch_axes) = e.invars[0].aval.shape, axes
+        # a gather or scatter may skip indices outside of an array
+        margin = 1 if "FILL" in str(e.params["mode"]).upper() else 0
 
         def at(place: Any) -> list[Nodes]:
             fixed = {axis: place[k] for axis, k in zip(own, batch_axes, strict=True)}
-            margin = 0 if clip else 1
-            ranges = [(-margin, shape[axis] - sizes[axis] + margin) for axis in axes]
+            ranges = [(-margin, shape[axis] - sizes[axis] + margin) for axis in moving]
 
             def window(*starts: int) -> list[Nodes]:
-                first = fixed | dict(zip(axes, starts, strict=True))
+                first = fixed | dict(zip(moving, starts, strict=True))
                 inside = all(0 <= k <= shape[axis] - sizes[axis] for axis, k in first.items())
                 slices = tuple(slice(first.get(a, 0), first.get(a, 0) + sizes[a]) for a in range(len(shape)))
                 return entry(place, slices if inside else None)
@@ -1456,33 +1442,24 @@ class Evaluation:
 
         return at
 
-    def _do_gather(
-        self, e: Any, x: Nodes, indices: Nodes, *, dimension_numbers: Any, slice_sizes: Any, mode: Any,
-        fill_value: Any, **_: Any,
-    ) -> Nodes:  # fmt: skip
-        d = dimension_numbers
+    def _do_gather(self, e: Any, x: Nodes, indices: Nodes) -> Nodes:
+        d, sizes, fill_value = (e.params[key] for key in ("dimension_numbers", "slice_sizes", "fill_value"))
         dropped = (*d.collapsed_slice_dims, *d.operand_batching_dims)
-        kept = tuple(size for axis, size in enumerate(slice_sizes) if axis not in dropped)
+        kept = tuple(size for axis, size in enumerate(sizes) if axis not in dropped)
         fill = np.full(kept, self.program.constant(math.nan if fill_value is None else fill_value))
-        batching = d.operand_batching_dims, d.start_indices_batching_dims
+        axes = d.start_index_map, d.operand_batching_dims, d.start_indices_batching_dims
         at = self._windows(
-            e, x.shape, indices, d.start_index_map, batching, slice_sizes, not _fills(mode),
-            lambda _, slices: [fill if slices is None else x[slices].reshape(kept)],
-        )  # fmt: skip
+            e, indices, axes, sizes, lambda _, slices: [fill if slices is None else x[slices].reshape(kept)]
+        )
         batch = indices.shape[:-1]
         out = np.empty((*batch, *kept), dtype=np.int64)
         for place in np.ndindex(*batch):
             out[place] = at(place)[0]
         return np.moveaxis(out, range(len(batch), out.ndim), d.offset_dims)
 
-    def _do_scatter(self, e: Any, *arrays: Nodes, **params: Any) -> Nodes:
-        return self._scattered(e, "", *arrays, **params)
-
-    def _scattered(
-        self, e: Any, operation: str, x: Nodes, indices: Nodes, updates: Nodes, *, dimension_numbers: Any,
-        mode: Any, **_: Any,
-    ) -> Nodes:  # fmt: skip
-        d, batch = dimension_numbers, indices.shape[:-1]
+    def _do_scatter(self, e: Any, x: Nodes, indices: Nodes, updates: Nodes) -> Nodes:
+        operation = SCATTERED.get(e.primitive.name)
+        d, batch = e.params["dimension_numbers"], indices.shape[:-1]
         window = d.update_window_dims
         updates = np.moveaxis(updates, window, range(len(batch), len(batch) + len(window)))
         dropped = (*d.inserted_window_dims, *d.operand_batching_dims)
@@ -1497,18 +1474,16 @@ class Evaluation:
             new[slices] = self.elementwise(operation, out[slices], update) if operation else update
             return [new]
 
-        batching = d.operand_batching_dims, d.scatter_indices_batching_dims
-        at = self._windows(
-            e, x.shape, indices, d.scatter_dims_to_operand_dims, batching, sizes, not _fills(mode), entry
-        )
+        axes = d.scatter_dims_to_operand_dims, d.operand_batching_dims, d.scatter_indices_batching_dims
+        at = self._windows(e, indices, axes, sizes, entry)
         for place in np.ndindex(*batch):
             out = at(place)[0]
         return out
 
     # linear algebra
 
-    def _do_dot_general(self, e: Any, a: Nodes, b: Nodes, *, dimension_numbers: Any, **_: Any) -> Nodes:
-        (summed_a, summed_b), (batch_a, batch_b) = dimension_numbers
+    def _do_dot_general(self, e: Any, a: Nodes, b: Nodes) -> Nodes:
+        (summed_a, summed_b), (batch_a, batch_b) = e.params["dimension_numbers"]
 
         def ordered(x: Nodes, batch: Any, summed: Any) -> tuple[Nodes, tuple[int, ...]]:
             free = [k for k in range(x.ndim) if k not in batch and k not in summed]
@@ -1528,7 +1503,7 @@ class Evaluation:
             total = program.total(self.apply("mul", *views), count)
             return program.entries(total).reshape(*batch, *free_a, *free_b)
         products = self.elementwise("mul", a[:, :, None, :], b[:, None, :, :])
-        return self._reduced("add", products, axes=(3,)).reshape(*batch, *free_a, *free_b)
+        return self._reduced("add", products, (3,)).reshape(*batch, *free_a, *free_b)
 
     def _nonzero(self, x: Nodes) -> Any:
         """Return 1 for entries that are not structural zeros."""
@@ -1548,7 +1523,7 @@ class Evaluation:
             start = self.apply("sub", start, self.apply("mul", int(x), int(y)))
         return start
 
-    def _do_cholesky(self, e: Any, A: Nodes, **_: Any) -> list[Nodes]:
+    def _do_cholesky(self, e: Any, A: Nodes) -> list[Nodes]:
         def factor(A: Nodes) -> list[Nodes]:
             L = self.program.constants(np.zeros(A.shape))
             for j, i in itertools.combinations_with_replacement(range(len(A)), 2):
@@ -1558,11 +1533,9 @@ class Evaluation:
 
         return self._each(factor, A)
 
-    def _do_triangular_solve(
-        self, e: Any, A: Nodes, B: Nodes, *, left_side: bool, lower: bool, transpose_a: bool,
-        unit_diagonal: bool, **_: Any,
-    ) -> list[Nodes]:  # fmt: skip
-        lower = lower != (transpose_a == left_side)
+    def _do_triangular_solve(self, e: Any, A: Nodes, B: Nodes) -> list[Nodes]:
+        left_side, transpose_a = e.params["left_side"], e.params["transpose_a"]
+        lower, unit_diagonal = e.params["lower"] != (transpose_a == left_side), e.params["unit_diagonal"]
 
         def solve(A: Nodes, B: Nodes) -> list[Nodes]:
             A, X = (A.T if transpose_a == left_side else A), (B if left_side else B.T).copy()
@@ -1599,7 +1572,7 @@ class Evaluation:
                 rows = rows[:1]
             sizes = self.elementwise("abs", A[rows, k])
             index = self.by_index(
-                None, [int(self._do_argmax(None, sizes, axes=(0,)))], [(0, len(rows) - 1)],
+                None, [int(self._best_index("gt", sizes))], [(0, len(rows) - 1)],
                 lambda place, rows=rows: [self.program.constants(rows[place])],
             )[0]  # fmt: skip
             pivots[k] = index
@@ -1635,40 +1608,40 @@ class Evaluation:
         name = f"{name} {[atom.val for atom in e.invars if isinstance(atom, Literal)]}"
         return self.program.ruled(name, function, shapes, list(known.values()), values)
 
-    def _do_custom_jvp_call(self, e: Any, *arguments: Nodes, call_jaxpr: Any, **_: Any) -> list[Nodes]:
+    def _do_custom_jvp_call(self, e: Any, *arguments: Nodes) -> list[Nodes]:
+        call_jaxpr = e.params["call_jaxpr"]
         info = call_jaxpr.jaxpr.debug_info
         return self._rule(
             e, arguments, str(info.func_src_info), info, lambda: self.closed(call_jaxpr, arguments)
         )
 
-    def _do_custom_linear_solve(
-        self, e: Any, *arguments: Nodes, const_lengths: Any, jaxprs: Any
-    ) -> list[Nodes]:
+    def _do_custom_linear_solve(self, e: Any, *arguments: Nodes) -> list[Nodes]:
+        const_lengths, jaxprs = e.params["const_lengths"], e.params["jaxprs"]
         first = const_lengths.matvec + const_lengths.vecmat
         last = first + const_lengths.solve
         used = [*arguments[first:last], *arguments[last + const_lengths.transpose_solve :]]
         name, info = f"custom_linear_solve {jaxprs.solve.jaxpr}", jaxprs.solve.jaxpr.debug_info
         return self._rule(e, arguments, name, info, lambda: self.closed(jaxprs.solve, used))
 
-    def _do_platform_index(self, e: Any, *, platforms: Any) -> Nodes:
-        places = [k for k, each in enumerate(platforms) if each is None or "cpu" in each]
+    def _do_platform_index(self, e: Any) -> Nodes:
+        places = [k for k, each in enumerate(e.params["platforms"]) if each is None or "cpu" in each]
         return self.program.constants(places[0])
 
-    def _do_cond(self, e: Any, index: Nodes, *arguments: Nodes, branches: Any, **_: Any) -> list[Nodes]:
+    def _do_cond(self, e: Any, index: Nodes, *arguments: Nodes) -> list[Nodes]:
+        branches = e.params["branches"]
         last = len(branches) - 1
         return self.by_index(e, [int(index)], [(0, last)], lambda k: self.closed(branches[k], arguments))
 
-    def _do_scan(
-        self, e: Any, *arguments: Nodes, jaxpr: Any, length: int, num_consts: int, num_carry: int,
-        reverse: bool, **_: Any,
-    ) -> list[Nodes]:  # fmt: skip
+    def _do_scan(self, e: Any, *arguments: Nodes) -> list[Nodes]:
+        length, num_consts, num_carry = (e.params[key] for key in ("length", "num_consts", "num_carry"))
+        reverse = e.params["reverse"]
         if length > LONGEST_SCAN:
             raise self.error(e, f"of {length} turns is too long for the engine", "use fewer turns")
         constants, carry = arguments[:num_consts], list(arguments[num_consts : num_consts + num_carry])
         rows = []
         for k in reversed(range(length)) if reverse else range(length):
             turn = [each[k] for each in arguments[num_consts + num_carry :]]
-            found = self.closed(jaxpr, [*constants, *carry, *turn])
+            found = self.closed(e.params["jaxpr"], [*constants, *carry, *turn])
             carry = found[:num_carry]
             rows.append(found[num_carry:])
         stacked = [np.stack(each) for each in zip(*(rows[::-1] if reverse else rows), strict=True)]
@@ -1676,17 +1649,10 @@ class Evaluation:
             stacked = [np.empty(var.aval.shape, dtype=np.int64) for var in e.outvars[num_carry:]]
         return [*carry, *stacked]
 
-    def _do_while(
-        self,
-        e: Any,
-        *arguments: Nodes,
-        cond_jaxpr: Any,
-        body_jaxpr: Any,
-        cond_nconsts: int,
-        body_nconsts: int,
-    ) -> list[Nodes]:
+    def _do_while(self, e: Any, *arguments: Nodes) -> list[Nodes]:
         outer, inner = self.program, Program(self.program.limit)
-        count = cond_nconsts + body_nconsts
+        cond_nconsts = e.params["cond_nconsts"]
+        count = cond_nconsts + e.params["body_nconsts"]
         inputs: dict[int, str] = {}
 
         def imported(node: int) -> int:
@@ -1703,10 +1669,10 @@ class Evaluation:
             own = [inner.input(f"state[{k}]", 2, boolean) for k in names]
             state.append(np.array(own, dtype=np.int64).reshape(array.shape))
             kinds += ["b" if boolean else "f"] * array.size
-        condition = inner.evaluate(cond_jaxpr, [*fixed[:cond_nconsts], *state])[0]
-        following = inner.evaluate(body_jaxpr, [*fixed[cond_nconsts:], *state])
+        condition = inner.evaluate(e.params["cond_jaxpr"], [*fixed[:cond_nconsts], *state])[0]
+        following = inner.evaluate(e.params["body_jaxpr"], [*fixed[cond_nconsts:], *state])
 
-        loop = Loop(
+        loop = _Loop(
             inner, [(name, node) for node, name in inputs.items()], _flat(state), _flat(arguments[count:]),
             _flat(following), int(condition), kinds, source_line(self.nested),
         )  # fmt: skip
@@ -1719,8 +1685,3 @@ class Evaluation:
 
 def _flat(arrays: Iterable[Nodes]) -> list[int]:
     return [node for array in arrays for node in array.ravel().tolist()]
-
-
-def _fills(mode: Any) -> bool:
-    """Return True if a gather or scatter skips indices outside of an array."""
-    return "FILL" in str(mode).upper()

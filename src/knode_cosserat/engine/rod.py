@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.engine.arrays import Stored
-from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, Sums, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
 from knode_cosserat.solvers.grid import grid_of
@@ -176,14 +176,14 @@ class RodCode(Memory):
 
     def _evaluated(
         self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any],
-        added: Sequence[tuple[int, Value]] = (), inside: Any = True,
+        sums: Sums = ((), True),
     ) -> list[Value]:  # fmt: skip
         """Write the operations of outputs at a place, and of arrays that are added (`Function.evaluate`)."""
         own = [int(each) for each in outputs]
-        self._outputs = [*own, *(node for node, _ in added)]
+        self._outputs = [*own, *(node for node, _ in sums[0])]
         lanes = self.L if wide else self.P
         known = self._known(j, wide, state)
-        values = self._now.evaluate(self.equations.program, own, known, lanes, added, inside)
+        values = self._now.evaluate(self.equations.program, own, known, lanes, sums)
         return [values[node] for node in own]
 
     def _write_setup(self) -> None:
@@ -276,9 +276,7 @@ class RodCode(Memory):
         e = self.equations
         far = y if self.far is None else self.far
         if self.far is not None:
-            with self._places(self.points) as j:
-                for i in range(e.ny):
-                    self._write_wide(self._wide(y, i, j), far, i, j)
+            self._copy_wide(y, far, self.points)
             with self._places(self.pieces) as j:
                 results = (far, e.far), *(self.jumps if slopes else ())
                 self._write_results(results, j, self._state(y, history, j) | self._acting_at(j))
@@ -289,9 +287,7 @@ class RodCode(Memory):
 
     def _write_ends(self, source: Array, target: Array) -> None:
         """Copy values at places to the ends of pieces."""
-        with self._places(self.pieces) as j:
-            for i in range(source.size):
-                self._write_wide(self._wide(source, i, j + 1), target, i, j)
+        self._copy_wide(source, target, self.pieces, shift=1)
         for k, point in enumerate(self.near):
             for i in range(source.size):
                 self._put(self._get(source, i, self.points + k), target, i, point - 1)
@@ -326,12 +322,11 @@ class RodCode(Memory):
         self, k: int, stage: Stage, y: tuple[Array, Array], rates: tuple[Array, Array], target: Array
     ) -> None:
         """Write y at stage k, from y at starts of pieces and at points, and earlier rates."""
-        with self._places(self.pieces) as j:
-            for i in range(self.equations.ny):
-                ends = self._wide(y[0], i, j), self._wide(y[1], i, j + 1)
-                mean = self._weighted((1.0 - stage.end, stage.end), ends)
-                moved = self._increment(stage.rates, rates, i, j)
-                self._write_wide(mean + moved, target, i, j + k * self.pieces)
+        for i, j in self._components(self.equations.ny, self.pieces):
+            ends = self._wide(y[0], i, j), self._wide(y[1], i, j + 1)
+            mean = self._weighted((1.0 - stage.end, stage.end), ends)
+            moved = self._increment(stage.rates, rates, i, j)
+            self._write_wide(mean + moved, target, i, j + k * self.pieces)
         with self._idle_pieces() as j:
             for i in range(self.equations.ny):
                 self._put(self._get(y[0], i, j), target, i, j + k * self.pieces)
@@ -386,11 +381,10 @@ class RodCode(Memory):
 
     def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
         """Write the defects of all pieces: y at their ends by the scheme, minus y."""
-        with self._places(self.pieces) as j:
-            for i in range(self.equations.ny):
-                change = self._wide(y[0], i, j) - self._wide(y[1], i, j + 1)
-                value = change + self._increment(self.space.formula.weights, rates, i, j)
-                self._write_wide(value, self.r, i, j)
+        for i, j in self._components(self.equations.ny, self.pieces):
+            change = self._wide(y[0], i, j) - self._wide(y[1], i, j + 1)
+            value = change + self._increment(self.space.formula.weights, rates, i, j)
+            self._write_wide(value, self.r, i, j)
         with self._idle_pieces() as j:
             for i in range(self.equations.ny):
                 self._put(0.0, self.r, i, j)

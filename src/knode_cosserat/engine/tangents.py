@@ -7,7 +7,6 @@ tangents in lanes. Cotangents pass through the transposed maps, from the last st
 
 from __future__ import annotations
 
-import ctypes
 import functools
 import itertools
 import operator
@@ -20,14 +19,28 @@ from jaxtyping import Float
 from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Nonzeros, TangentEquations
-from knode_cosserat.engine.linear import Add, Clear, Loop, Number, Operation, Scale, write
+from knode_cosserat.engine.linear import Add, Loop, Number, Operation, Scale, write
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.problem import FILLING
 from knode_cosserat.solvers.settings import Settings
 
 
-class Tangents(NamedTuple):
+class SolvedSteps(NamedTuple):
+    """Solved steps, all stages in turn, from which derivatives are evaluated."""
+
+    parameters: Float[np.ndarray, " n"]
+    #: coefficients and times
+    table: Float[np.ndarray, "solves n"]
+    controls: Float[np.ndarray, "solves c"]
+    rows: Float[Any, "solves nodes x"]
+    unknowns: Float[Any, "solves k"]
+    #: history before the first step
+    records: Float[Any, "memory used x"]
+    rate: Float[Any, "used x"]
+
+
+class _Tangents(NamedTuple):
     """Arrays of the tangents of a step, or of their cotangents."""
 
     #: the step's data: records and rate before it, control
@@ -57,7 +70,7 @@ class Tangents(NamedTuple):
     unknowns: Array
 
 
-class TangentCode(EliminationCode):
+class _TangentCode(EliminationCode):
     """Code of the derivatives of a system's solved steps, by all data of a step.
 
     The system changes in its `moving` parameters, a mask for each of its leaves. Functions are written by
@@ -96,7 +109,7 @@ class TangentCode(EliminationCode):
         groups = self.groups[1] * self.strands
         #: component of a packed row for each number of each strand's record
         self.packed = e.by_strand(np.arange(self.strands * numbers))
-        self.tangents = Tangents(
+        self.tangents = _Tangents(
             records, rate, many(e.nc, 1), many(numbers, self.used), many(nx, self.used),
             many(ny, self.pieces), many(ny, self.pieces), many(ny, self.used - self.ends),
             many(1, self.pieces), many(ny, self.pieces), many(k, 1), many(ny * self.strands, 1),
@@ -109,7 +122,7 @@ class TangentCode(EliminationCode):
         self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
         self._reserve_products()
         self._write()
-        self.compiled = self.module.compile()
+        self._run = self.module.compile()["run"]
 
     def _reserve_state(self) -> None:
         """Reserve arrays that last from step to step, for each column."""
@@ -137,7 +150,7 @@ class TangentCode(EliminationCode):
         self._write_data()
         self._write_solution()
         self._write_derivatives()
-        self._write_shift()
+        self._write_records()
 
     # a solved step
 
@@ -148,11 +161,10 @@ class TangentCode(EliminationCode):
         _, coefficients, control, unknowns = f.arguments
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         weights = [f.load(coefficients, k) for k in self._history_weights]
-        with self._places(self.used) as j:
-            for i in range(e.numbers):
-                parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
-                products = [weight * part for weight, part in zip(weights, parts, strict=False)]
-                self._write_wide(sum(products[1:], products[0]), self.H, i, j)
+        for i, j in self._components(e.numbers, self.used):
+            parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
+            products = [weight * part for weight, part in zip(weights, parts, strict=False)]
+            self._write_wide(sum(products[1:], products[0]), self.H, i, j)
         for i in range(e.k):
             self._put(f.load(unknowns, i), self.unknowns, i)
 
@@ -197,14 +209,11 @@ class TangentCode(EliminationCode):
         """Return the state at the tips and at the bases."""
         return ("tip", self._tip_state(self.y, self.H)), ("base", self._base_state(self.unknowns, self.H))
 
-    def _write_shift(self) -> None:
+    def _write_records(self) -> None:
         """The records after a step."""
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
-        for newer, older in reversed(list(itertools.pairwise(self.records))):
-            with self._places(self.used) as j:
-                for i in range(self.equations.numbers):
-                    self._write_wide(self._wide(newer, i, j), older, i, j)
+        self._write_shift(self.records, self.used)
         for i, j, newest in self._numbers_of(self._evaluated_at(self.y), self.used):
             self._write_wide(newest, self.records[0], i, j)
             if self.settings.uses_rate:
@@ -249,7 +258,7 @@ class TangentCode(EliminationCode):
     def _by_data(self, name: str, j: Any, places: Sequence[Any]) -> list[Operation]:
         """Set results at fixed y, by the history at a place of each strand, and by the control."""
         e, t, target = self.equations, self.tangents, self.results[name]
-        found: list[Operation] = [Clear(Number(target, i, j)) for i in range(target.size)]
+        found: list[Operation] = [Scale(Number(target, i, j)) for i in range(target.size)]
         for nonzeros, matrix, source, at in (
             (e.by_history[name], self.by_history[name], t.history, places),
             (e.by_control[name], self.by_control[name], t.control, (0,)),
@@ -268,13 +277,13 @@ class TangentCode(EliminationCode):
         def at_place(j: Index) -> list[Operation]:
             found = list[Operation]()
             for i in range(t.history.size):
-                found.append(Clear(Number(t.history, i, j)))
+                found.append(Scale(Number(t.history, i, j)))
                 for part, weight in zip((*t.records, t.rate), weights, strict=False):
                     found.append(Add(Number(t.history, i, j), Number(part, i, j), weight))
             return found + self._by_data("rates", j, [j])
 
         def behind(j: Index) -> list[Operation]:
-            return [Clear(Number(t.lengths, 0, j)), *self._by_data("far", j, [j])]
+            return [Scale(Number(t.lengths, 0, j)), *self._by_data("far", j, [j])]
 
         return [
             Loop(0, self.used, at_place), Loop(0, self.pieces, behind),
@@ -335,7 +344,7 @@ class TangentCode(EliminationCode):
             """Set y at a stage at fixed y, and add its part of the rates there."""
             (stage, first), at = stages[k], j + k * self.pieces
             own = [Number(t.between, i, at) for i in range(e.ny)]
-            found: list[Operation] = [Clear(number) for number in own]
+            found: list[Operation] = [Scale(number) for number in own]
             if self.far is not None:
                 found += [Add(own[i], Number(t.far, i, j), 1.0 - stage.end) for i in range(e.ny)]
             found += by_length(stage.rates, own.__getitem__, j)
@@ -344,7 +353,7 @@ class TangentCode(EliminationCode):
 
         def defect(j: Index) -> list[Operation]:
             r = [Number(t.r, i, j) for i in range(e.ny)]
-            found: list[Operation] = [Clear(number) for number in r]
+            found: list[Operation] = [Scale(number) for number in r]
             found += [Add(r[i], Number(t.far, i, j)) for i in range(e.ny)]
             found += by_length(formula.weights, r.__getitem__, j)
             return found + increment(formula.weights, r.__getitem__, t.rates, j)
@@ -361,7 +370,7 @@ class TangentCode(EliminationCode):
 
         def changed(j: Index) -> list[Operation]:
             """Set the change of rates at ends of pieces by y."""
-            found: list[Operation] = [Clear(Number(t.change, i, j)) for i in range(e.ny)]
+            found: list[Operation] = [Scale(Number(t.change, i, j)) for i in range(e.ny)]
             return found + slopes_by((t.change, j), lambda c: Number(t.newest, c, j), j)
 
         def solved_between(k: int, j: Index) -> list[Operation]:
@@ -373,7 +382,7 @@ class TangentCode(EliminationCode):
                 found.append(Add(own[i], Number(t.newest, i, j), 1.0 - stage.end))
                 found.append(Add(own[i], Number(t.y, i, j + 1), stage.end))
             found += increment(stage.rates, own.__getitem__, t.change, j)
-            found += [Clear(Number(t.change, i, j + first)) for i in range(e.ny)]
+            found += [Scale(Number(t.change, i, j + first)) for i in range(e.ny)]
             found += slopes_by((t.change, j + first), own.__getitem__, j + first)
             found += [Add(Number(t.between, i, at), own[i]) for i in range(e.ny)]
             return found + _copies(e.ny, (t.newest, j + first), (t.between, at))
@@ -401,7 +410,7 @@ class TangentCode(EliminationCode):
             found += _products(strains, (self.z_by_y, j), (t.newest, j), (t.newest, j))
             for i in range(e.numbers - e.ny - e.nz):
                 rate = Number(t.newest, e.ny + e.nz + i, j)
-                found += [Clear(rate), Add(rate, Number(t.rates, i, j)), Add(rate, Number(t.change, i, j))]
+                found += [Scale(rate), Add(rate, Number(t.rates, i, j)), Add(rate, Number(t.change, i, j))]
             if self.settings.uses_rate:
                 found += _copies(e.numbers, (t.rate, j), (t.history, j))
                 for i in range(e.numbers):
@@ -436,7 +445,7 @@ class TangentCode(EliminationCode):
         def piece(j: Index) -> list[Operation]:
             end, found = [Number(t.w, i, j + 1) for i in range(ny)], list[Operation]()
             for i in range(ny):
-                found += [Clear(end[i]), Add(end[i], Number(t.r, i, j))]
+                found += [Scale(end[i]), Add(end[i], Number(t.r, i, j))]
             for i, c in zip(*np.nonzero(el.matrix != el.program.constant(0.0)), strict=True):
                 entry: Any = el.program.values[int(el.matrix[i, c])]
                 if (i, c) in entries:
@@ -475,7 +484,7 @@ class TangentCode(EliminationCode):
             found = solved(alpha + 1, end)
             for c in range(own):
                 found += [
-                    Clear(Number(t.alpha, c, alpha)),
+                    Scale(Number(t.alpha, c, alpha)),
                     Add(Number(t.beta, c, group), Number(t.alpha, c, alpha + 1), is_negative=True),
                 ]
             for i, c in np.ndindex(own, own):
@@ -510,7 +519,7 @@ class TangentCode(EliminationCode):
             entry = self._entry_at(self.M, k, i, component, strand)
             at_tip.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))
         alpha = [Number(t.alpha, i % own, i // own * (count + 1) + count) for i in range(k)]
-        at_tip += map(Clear, alpha)
+        at_tip += map(Scale, alpha)
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
             at_tip.append(Add(alpha[i], Number(t.tip, c), entry, is_negative=True))
@@ -519,7 +528,7 @@ class TangentCode(EliminationCode):
         ]  # fmt: skip
 
     def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Number:
-        """Return an entry of a matrix of which a vector holds rows."""
+        """Return an entry of a matrix with rows in lanes."""
         return Number(matrix, c * self._padded(rows) + i, j)
 
     # running
@@ -535,31 +544,24 @@ class TangentCode(EliminationCode):
     def _row_size(self) -> int:
         return len(self.grid.nodes) * self.packed.size
 
-    def _begun(
-        self, parameters: np.ndarray, solved: tuple[Any, Any], controls: Any, table: Any,
-        records: Any, rate: Any,
-    ) -> list[np.ndarray]:  # fmt: skip
+    def _begun(self, solved: SolvedSteps) -> list[np.ndarray]:
         """Return the memory before a run, controls, coefficients, rows and unknowns."""
         memory = self._empty_memory()
-        self._put_in(memory[None], self.params, parameters[None, None, None])
-        for array, values in zip((*self.records, self.rate), (*records, rate), strict=True):
+        self._put_in(memory[None], self.params, solved.parameters[None, None, None])
+        for array, values in zip((*self.records, self.rate), (*solved.records, solved.rate), strict=True):
             self._put_in(memory[None], array, self._by_strand(array, np.asarray(values, float))[None, None])
-        rows, unknowns = solved
-        data = controls, table, np.asarray(rows)[..., : self.packed.size], unknowns
+        rows = np.asarray(solved.rows)[..., : self.packed.size]
+        data = solved.controls, solved.table, rows, solved.unknowns
         return [memory, *(np.ascontiguousarray(each, float) for each in data)]
 
 
-class TangentCore(TangentCode):
+class TangentCore(_TangentCode):
     """Machine code of the tangents of solved steps, as many side by side as there are lanes."""
 
     transposed = False
 
-    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
-        super().__init__(system, settings, moving, lanes)
-        self._run = _callable(self.compiled.address("run"), 11, 3)
-
     def _reserve_state(self) -> None:
-        #: what is added to the residual of the tip's conditions
+        #: added to the residual of the tip's conditions
         self.added_tip = self._tangent_array(self.equations.k, 1, 1)
 
     def _reserve_products(self) -> None:
@@ -654,20 +656,18 @@ class TangentCore(TangentCode):
             f.call(self.shift, memory, table)
 
     def solve(
-        self, parameters: np.ndarray, table: Float[np.ndarray, "solves n"], solved: tuple[Any, Any],
-        controls: Float[np.ndarray, "solves c"], moves: tuple[Any, Any], d_controls: Any, states: Any,
-        d_tip: Any = 0.0,
-    ) -> tuple[Any, Any]:  # fmt: skip
-        """Return the tangents of solved rows (solves, nodes, x, m) and unknowns (solves, k, m), and states.
+        self, solved: SolvedSteps, moves: tuple[Any, Any], d_controls: Any, d_states: Any, d_tip: Any = 0.0
+    ) -> tuple[Any, Any]:
+        """Return states, and the tangents of solved rows (solves, nodes, x, m) and unknowns (solves, k, m).
 
-        `moves` are directions of the moving parameters (d, n) and weights (d, m); `states` are records
-        (memory, used, x) and rate before the first step, and their tangents with one more axis (m). `d_tip`
-        (k, m) is added to the tangents of the tip's residual. The states returned are those after the last
-        step.
+        `moves` are directions of the moving parameters (d, n) and weights (d, m); `d_states` are the tangents
+        of records and rate before the first step, with one more axis (m). `d_tip` (k, m) is added to the
+        tangents of the tip's residual. The states returned are those after the last step: records, rate, and
+        their tangents.
         """
-        e, L, (records, rate, d_records, d_rate) = self.equations, self.L, states
-        (directions, weights), count = moves, len(controls)
-        m, nodes, places = d_controls.shape[-1], len(self.grid.nodes), len(rate)
+        e, L, (d_records, d_rate) = self.equations, self.L, d_states
+        (directions, weights), count = moves, len(solved.controls)
+        m, nodes, places = d_controls.shape[-1], len(self.grid.nodes), len(solved.rate)
         blocks = -(-m // L)
 
         def filled(values: Any) -> np.ndarray:
@@ -676,7 +676,7 @@ class TangentCore(TangentCode):
             found[..., :m] = values
             return found
 
-        begun = self._begun(parameters, solved, controls, table, records, rate)
+        begun = self._begun(solved)
         memory = begun[0]
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
@@ -704,14 +704,10 @@ class TangentCore(TangentCode):
         return found, (d_rows[..., :m], d_unknowns[..., :m])
 
 
-class CotangentCore(TangentCode):
+class CotangentCore(_TangentCode):
     """Machine code of the cotangents of solved steps, one after the other."""
 
     transposed = True
-
-    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
-        super().__init__(system, settings, moving, lanes)
-        self._run = _callable(self.compiled.address("run"), 10, 2)
 
     def _reserve_state(self) -> None:
         e, a = self.equations, self._array
@@ -754,7 +750,7 @@ class CotangentCore(TangentCode):
                 for i, node in enumerate(e.cotangents[name]):
                     here[int(node)] = self._wide(self.results[name], i, j)
                 nodes, added = self._parted(e.pulled[name])
-                *values, place = self._evaluated(nodes, j, True, here, added, inside)
+                *values, place = self._evaluated(nodes, j, True, here, (added, inside))
                 for k, value in enumerate(values):
                     own = f.select(inside, f.splat(value, self.L), 0.0)
                     self._put(self._get(self.term, k, 0, self.L) + own, self.term, k, 0, self.L)
@@ -766,7 +762,7 @@ class CotangentCore(TangentCode):
             for i, node in enumerate(e.cotangents[name]):
                 here[int(node)] = self._get(self.results[name], i)
             nodes, added = self._parted(e.pulled[name])
-            values = self._evaluated(nodes, 0, False, here | known, added)
+            values = self._evaluated(nodes, 0, False, here | known, (added, True))
             sums = [a + b for a, b in zip(sums, values, strict=False)]
         given = self._parameters(e.by_terms) | terms
         given |= {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
@@ -803,7 +799,7 @@ class CotangentCore(TangentCode):
         """Add cotangents of the moving parameters to those known."""
         (nodes, added), program = self._parted(cotangents), self.equations.program
         moving = {k: node for k, node in enumerate(nodes) if not program.is_constant(node, 0.0)}
-        values = self._now.evaluate(program, [*moving.values()], known, 1, added)
+        values = self._now.evaluate(program, [*moving.values()], known, 1, (added, True))
         for k, node in moving.items():
             self._put(self._get(self.parameter, k) + values[node], self.parameter, k)
 
@@ -884,16 +880,13 @@ class CotangentCore(TangentCode):
     def _kept_size(self) -> int:
         return sum(map(self._length_of, self._kept))
 
-    def solve(
-        self, parameters: np.ndarray, table: Float[np.ndarray, "solves n"], solved: tuple[Any, Any],
-        controls: Float[np.ndarray, "solves c"], states: tuple[Any, Any], cotangents: Any,
-    ) -> tuple[Any, Any, Any, Any]:  # fmt: skip
+    def solve(self, solved: SolvedSteps, cotangents: Any) -> tuple[Any, Any, Any, Any]:
         """Return the cotangents of moving parameters (n, m), controls (solves, c, m), records and rate.
 
-        `states` are records (memory, used, x) and rate before the first step. `cotangents` are those of rows
-        (solves, nodes, x, m) and unknowns (solves, k, m), and of records and rate after the last step.
+        `cotangents` are those of rows (solves, nodes, x, m) and unknowns (solves, k, m), and of records and
+        rate after the last step.
         """
-        begun, count = self._begun(parameters, solved, controls, table, *states), len(controls)
+        begun, count = self._begun(solved), len(solved.controls)
         d_rows, d_unknowns, d_records, d_rate = (np.ascontiguousarray(each, float) for each in cotangents)
         m, parts = d_rate.shape[-1], (*self.tangents.records, self.tangents.rate)
         state = np.zeros((m, self.state_size))
@@ -909,10 +902,6 @@ class CotangentCore(TangentCode):
         joined = [self._joined(each, self._numbers(state, each)[:, 0], len(d_rate)) for each in parts]
         before = [np.moveaxis(each, 0, -1) for each in joined]
         return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:-1]), before[-1]
-
-
-def _callable(address: int, pointers: int, numbers: int) -> Any:
-    return ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_long] * numbers)(address)
 
 
 def _nodes(nonzeros: Nonzeros) -> list[int]:
@@ -942,5 +931,5 @@ def _set(pairs: Iterable[tuple[Number, Number]]) -> list[Operation]:
     """Set the first number of each pair to the second."""
     found = list[Operation]()
     for target, source in pairs:
-        found += [Clear(target), Add(target, source)]
+        found += [Scale(target), Add(target, source)]
     return found

@@ -23,14 +23,13 @@ from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
-from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
+from knode_cosserat.solvers.history import StateHistory, StepRows, rest_record, resting_history
 from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import checked_dt
-from knode_cosserat.solvers.steps import StepRows
 
 Actions = Literal["tension", "increment"]
 
@@ -434,7 +433,7 @@ def step_many(
             systems, acting, histories
         )
         return _arrived(spec, arrays, moves, histories, rows)
-    _, histories, rows = task.solve_many(systems, np.asarray(acting), histories)
+    _, histories, rows = task.solve(systems, np.asarray(acting), histories)
     arrived: tuple[EpisodeState, Transition] = _compiled_arrived(spec, arrays, moves, histories, rows)
     return arrived
 

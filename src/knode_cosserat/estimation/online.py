@@ -20,7 +20,7 @@ from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
+from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 
 #: in the place of zero
@@ -113,9 +113,9 @@ class OnlineModel(eqx.Module):
         last = TangentState.of(system, settings.space, past, *columns[:2])
         d_rows = np.zeros((*rows.records.shape, columns[0].shape[-1]))
         if done == steps:
-            changes = SystemMoves(directions, columns[2]), columns[3]
+            changes = Changes(columns[3], directions, columns[2])
             last, (d_solves, _) = tangent_time_loop(
-                settings, task.coefficients, rows.every_stage, (system, controls), changes, last
+                task.coefficients, rows.every_stage, (system, controls), changes, last
             )
             d_rows = d_solves[settings.stages - 1 :: settings.stages]
         d_records, d_rate = (np.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))

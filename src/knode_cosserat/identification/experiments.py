@@ -21,13 +21,12 @@ from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import since_first
-from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.segments import DataError
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 

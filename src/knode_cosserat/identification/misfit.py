@@ -33,8 +33,8 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.replay import at_one_state
-from knode_cosserat.solvers.run import Equilibria, TimeIntegration, run_one, usable_cores
-from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, static_tangents, tangent_time_loop
+from knode_cosserat.solvers.run import TimeIntegration, run_one, usable_cores
+from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
 
@@ -109,10 +109,10 @@ class Misfit:
         acting, slope = _acting(system, data)
         task: Any = TimeIntegration(data.settings, data.dt / data.steps, max(steps, 1), start.known, RECOVERY)
         if data.static:
-            task = Equilibria(dataclasses.replace(data.settings, time=None), max(steps, 1), RECOVERY)
+            task = dataclasses.replace(task, settings=dataclasses.replace(data.settings, time=None), dt=0.0)
         else:
             acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
-        solved_rows, _, cause = run_one(task, system, acting, start.state, start.before)
+        solved_rows, _, cause = run_one(task, system, acting, (start.state, start.before))
         if cause:
             return None
         size = system.y_layout.size + system.z_layout.size
@@ -127,21 +127,21 @@ class Misfit:
 
         def tangents() -> np.ndarray:
             directions, by_latency = _directions(self.model.robot, x)
-            moves = SystemMoves(directions, np.eye(len(x)))
-            d_first, past, d_past = start.tangents(moves)
+            d_first, past, d_past = start.tangents(directions)
             controls = acting[:steps]
             d_controls = np.zeros((*controls.shape, len(x)))
             if slope is not None:
                 d_controls = slope[:steps, :, None] * np.asarray(by_latency)
+            changes = Changes(d_controls, directions, np.eye(len(x)))
             solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             d_records = np.zeros((0, *records.shape[1:], len(x)))
             if steps and data.static:
-                d_rows, *_ = static_tangents(task.settings, solved, (system, controls), (moves, d_controls))
+                d_rows, *_ = static_tangents(task.settings, solved, (system, controls), changes)
                 d_records = d_rows[:, :, :size]
             elif steps:
                 state = TangentState.of(system, data.settings.space, past, *d_past)
                 _, (d_rows, _) = tangent_time_loop(
-                    data.settings, task.coefficients, solved, (system, controls), (moves, d_controls), state
+                    task.coefficients, solved, (system, controls), changes, state
                 )
                 d_records = d_rows[stages - 1 :: stages][compared][:, :, :size]
             whole = np.concatenate([d_first[None, :, :size], d_records])
@@ -160,15 +160,15 @@ class Misfit:
             np.zeros(system.control_layout.size) if data.held is None else np.asarray(data.held, dtype=float)
         )
         still = dataclasses.replace(settings, time=None)
-        rest, y, cause = static_run(Equilibria(still, 1, RECOVERY), system, control[None])
+        rest, y, cause = static_run(TimeIntegration(still, recovery_budget=RECOVERY), system, control[None])
         if cause:
             return None
         record = np.asarray(rest.records[0][:, :size])
         past = None if data.static else at_one_state(system, settings, record, control)
 
-        def tangents(moves: SystemMoves) -> Any:
+        def tangents(directions: Any) -> Any:
             held, solved = control[None], (rest.records, rest.unknowns)
-            changes = moves, np.zeros((*held.shape, len(x)))
+            changes = Changes(np.zeros((*held.shape, len(x))), directions, np.eye(len(x)))
             d_rows, _, d_records = static_tangents(still, solved, (system, held), changes)
             return d_rows[0], past, (np.stack([d_records] * data.settings.memory), np.zeros_like(d_records))
 
@@ -187,7 +187,7 @@ class Misfit:
         known, past = at_start.state.known(settings), at_start.state.history
         record = np.asarray(at_start.record)[:, : system.y_layout.size + system.z_layout.size]
 
-        def tangents(moves: SystemMoves) -> Any:
+        def tangents(directions: Any) -> Any:
             begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings)
             return np.asarray(d_record), begun, d_past
 

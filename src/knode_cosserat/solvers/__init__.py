@@ -8,11 +8,9 @@ from typing import TYPE_CHECKING
 from knode_cosserat._lazy import make_lazy
 
 if TYPE_CHECKING:
-    from knode_cosserat.solvers.boundary import NewtonOptions
     from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
     from knode_cosserat.solvers.result import Result, SimulationError
-    from knode_cosserat.solvers.semi_discrete import History
-    from knode_cosserat.solvers.settings import Settings
+    from knode_cosserat.solvers.settings import NewtonOptions, Settings
     from knode_cosserat.solvers.simulate import simulate
     from knode_cosserat.solvers.space import Euler, Lobatto2, Lobatto4
     from knode_cosserat.solvers.stepper import Stepper
@@ -24,7 +22,6 @@ __all__ = [
     "SDIRK2",
     "BDFAlpha",
     "Euler",
-    "History",
     "Lobatto2",
     "Lobatto4",
     "NewtonOptions",
@@ -42,11 +39,9 @@ __all__ = [
 make_lazy(
     __name__,
     {
-        "knode_cosserat.solvers.boundary": "NewtonOptions",
         "knode_cosserat.solvers.equilibrium": "equilibria equilibrium",
         "knode_cosserat.solvers.result": "Result SimulationError",
-        "knode_cosserat.solvers.semi_discrete": "History",
-        "knode_cosserat.solvers.settings": "Settings",
+        "knode_cosserat.solvers.settings": "NewtonOptions Settings",
         "knode_cosserat.solvers.simulate": "simulate",
         "knode_cosserat.solvers.space": "Euler Lobatto2 Lobatto4",
         "knode_cosserat.solvers.stepper": "Stepper",

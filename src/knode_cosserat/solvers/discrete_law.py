@@ -61,7 +61,7 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
     The rod's `length` (m) is a scale: curvatures are found to a small part of 1 / length.
     """
     if isinstance(law, StressedLaw):
-        return StressedStep(discrete_law(law.law, layout, c0, hz, length), law, c0, hz)
+        return _StressedStep(discrete_law(law.law, layout, c0, hz, length), law, c0, hz)
     if isinstance(law, InternalState):
         internal = {
             name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
@@ -71,7 +71,7 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
         return MaterialStep(law, layout, c0, hz, {}, length)
     if isinstance(law, tuple):
         return LinearStep(LinearLaw(*law), c0, hz)
-    return StatedStrains(law)
+    return _StatedStrains(law)
 
 
 def evolved(evolution: Evolution, h: Any, c0: Any) -> Any:
@@ -85,7 +85,7 @@ def evolved(evolution: Evolution, h: Any, c0: Any) -> Any:
 
 
 @dataclasses.dataclass(frozen=True)
-class StatedStrains:
+class _StatedStrains:
     """Strains that the system states directly."""
 
     z: Float[Any, " z"]
@@ -128,16 +128,23 @@ class LinearStep:
         return self.law.C + self.c0 * self.law.D
 
 
+@dataclasses.dataclass
 class MaterialStep:
     """Strains by their elastic laws of this step, then internal variables."""
 
-    def __init__(self, law: MaterialLaw, layout: Layout, c0: Any, hz: Any, internal: Fields, length: Any):
-        self.law, self.layout, self.c0, self.length = law, layout, c0, length
+    law: MaterialLaw
+    layout: Layout
+    c0: Any
+    hz: Float[Any, " z"]
+    #: internal variables that do not depend on the strains
+    internal: Fields
+    #: length of the rod (m)
+    length: Any
+
+    def __post_init__(self) -> None:
         #: history of each field of z
-        self.history: Fields = dict(zip(layout.names, layout.split(hz), strict=True))
-        #: internal variables that do not depend on the strains
-        self.internal = internal
-        self.elastic = {name: self._elastic(name, strain) for name, strain in law.strains.items()}
+        self.history: Fields = dict(zip(self.layout.names, self.layout.split(self.hz), strict=True))
+        self.elastic = {name: self._elastic(name, strain) for name, strain in self.law.strains.items()}
 
     @property
     def linear(self) -> bool:
@@ -192,7 +199,7 @@ class MaterialStep:
         if strain.moment is None:
             return elastic.strain()
         return nonlinear_strain(
-            NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
+            _NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
         )
 
     def _internal(self, strains: Fields) -> Fields:
@@ -212,7 +219,7 @@ class MaterialStep:
         return (strain - branch.time * self.history[branch.field]) / (1.0 + self.c0 * branch.time)
 
 
-class NonlinearStrain(NamedTuple):
+class _NonlinearStrain(NamedTuple):
     """Law of one strain with a nonlinear moment, for one time step."""
 
     elastic: Elastic
@@ -231,14 +238,14 @@ class NonlinearStrain(NamedTuple):
         return -dot(inverse(jax.jacfwd(self.residual)(strain)), self.residual(strain))
 
 
-def nonlinear_strain(law: NonlinearStrain) -> Float[Any, "3"]:
+def nonlinear_strain(law: _NonlinearStrain) -> Float[Any, "3"]:
     """Return the strain of a nonlinear law; NaN if Newton's method fails."""
     # the search is not differentiated: one more correction has the derivatives of the implicit function
     strain = _searched(jax.lax.stop_gradient(law))
     return strain + law.correction(strain)
 
 
-def _searched(law: NonlinearStrain) -> Float[Any, "3"]:
+def _searched(law: _NonlinearStrain) -> Float[Any, "3"]:
     """Return the strain by Newton's method with a line search; NaN if it does not converge."""
     moving = law.c0 > 0.0
     # without sliding, friction does not make the first corrections overshoot
@@ -265,7 +272,7 @@ def _searched(law: NonlinearStrain) -> Float[Any, "3"]:
 
 
 @dataclasses.dataclass(frozen=True)
-class StressedStep:
+class _StressedStep:
     """A law with another stress of all of z and z_t = c0 z + ʰz."""
 
     nominal: DiscreteLaw

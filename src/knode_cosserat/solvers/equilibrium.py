@@ -14,20 +14,19 @@ from knode_cosserat._numbers import real_array
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
+from knode_cosserat.solvers.history import unloaded_shape
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
-    Equilibria,
+    TimeIntegration,
     failure,
     rows_of,
     warn_of_coarse_grids,
     warn_of_results,
     warn_outside_rod_theory,
 )
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import (
     check_initial,
     checked_controls,
@@ -134,7 +133,7 @@ def equilibria(
     y = before = None
     if initial is not None:
         y, before = grid_of(system).spread(initial.y[-1]), initial.control[-1]
-    task = Equilibria(settings, np.shape(controls)[-2], recovery_budget)
+    task = TimeIntegration(settings, steps=np.shape(controls)[-2], recovery_budget=recovery_budget)
     if is_traced((system, controls, y)):
         rest = unloaded_shape(bare, settings.space) if y is None else y
         if batch and rest.ndim == 2:

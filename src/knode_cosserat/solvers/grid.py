@@ -29,7 +29,7 @@ ON_NODE = 0.1 * INWARD
 NEAREST = 4
 
 
-class Stencil(NamedTuple):
+class _Stencil(NamedTuple):
     """Interpolation from nodes to places: node indices and weights."""
 
     nodes: Int[np.ndarray, "places nearest"]
@@ -91,7 +91,7 @@ class Grid:
         return _joined([start + part * (end - start), values[-1:]])
 
     @functools.cached_property
-    def stencils(self) -> tuple[Stencil, Stencil]:
+    def stencils(self) -> tuple[_Stencil, _Stencil]:
         """Interpolation stencils from nodes to places: for y, and for values that jump (z and y_s)."""
         points = np.append(self.segment + self.bounds[:, 0], self.nodes.size - 1.0)
         starts, ends = points[:-1], points[1:]
@@ -105,11 +105,11 @@ class Grid:
         piece = [of_piece, of_piece[-1:], self.near - 1, *(of_piece for _ in self._stages)]
         return self._stencils(points, np.concatenate(along), np.concatenate(piece))
 
-    def _stencils(self, points: Any, along: Any, piece: Any) -> tuple[Stencil, Stencil]:
+    def _stencils(self, points: Any, along: Any, piece: Any) -> tuple[_Stencil, _Stencil]:
         last = self.nodes.size - 1.0
         edges = np.concatenate([[0.0], points[:-1][self.acting.any(axis=1)], [last]])
         shape = (len(along), min(NEAREST, self.nodes.size))
-        on, over = (Stencil(np.zeros(shape, dtype=int), np.zeros(shape)) for _ in range(2))
+        on, over = (_Stencil(np.zeros(shape, dtype=int), np.zeros(shape)) for _ in range(2))
         for place, (where, k) in enumerate(zip(along, piece, strict=True)):
             low, high = points[k], points[k + 1]
             first, end = edges[edges <= low].max(), edges[edges >= high].min()
@@ -122,7 +122,7 @@ class Grid:
         return on, over
 
 
-def _fill(stencil: Stencil, place: int, known: Float[np.ndarray, " known"], where: float) -> None:
+def _fill(stencil: _Stencil, place: int, known: Float[np.ndarray, " known"], where: float) -> None:
     """Set the weights of the polynomial through the nearest known nodes."""
     nearest = np.sort(known[np.argsort(np.abs(known - where), kind="stable")][:NEAREST])
     for k, node in enumerate(nearest):

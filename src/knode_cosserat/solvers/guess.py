@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.engine.places import values_along
+from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
 from knode_cosserat.rods.rod import SlenderRod
@@ -26,7 +26,7 @@ FEWEST, POINTS = 2, 65
 REACHES = (1.0, 0.3, 3.0)
 
 
-class HeldEnd(NamedTuple):
+class _HeldEnd(NamedTuple):
     """Pose of a held end under a control."""
 
     p: Float[np.ndarray, "3"]
@@ -47,17 +47,17 @@ class HeldEnd(NamedTuple):
         return 0.0 if self.h is None else float(self.turn @ self.tangent)
 
 
-def held_ends(system: System, control: Any) -> tuple[HeldEnd | None, HeldEnd | None]:
+def held_ends(system: System, control: Any) -> tuple[_HeldEnd | None, _HeldEnd | None]:
     """Return the poses in which base and tip are held under a control; None for an end that is free."""
     columns, control = turn_columns(system), np.asarray(control, dtype=float)
     turns = np.where(columns < 0, 0.0, np.append(control, 0.0)[columns])
-    found: list[HeldEnd | None] = []
+    found: list[_HeldEnd | None] = []
     for pose, pinned, turn in zip(*_poses(system, jnp.asarray(control)), turns, strict=True):
         held = pose or pinned
         if held is None:
             found.append(None)
         else:
-            found.append(HeldEnd(np.asarray(held.p), None if held.h is None else np.asarray(held.h), turn))
+            found.append(_HeldEnd(np.asarray(held.p), None if held.h is None else np.asarray(held.h), turn))
     return found[0], found[1]
 
 
@@ -277,7 +277,7 @@ def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarra
     return _evenly(found)
 
 
-def _sagging(system: System, chord: Any, base: HeldEnd) -> Any:
+def _sagging(system: System, chord: Any, base: _HeldEnd) -> Any:
     """Return a unit vector normal to the chord: along gravity, else where the rod bends easily, else any."""
     ways = [getattr(nominal_model(system), "gravity", np.zeros(3))]
     if base.h is not None and hasattr(nominal_model(system), "Kbt"):

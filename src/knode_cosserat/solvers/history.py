@@ -8,18 +8,20 @@ equations (`grid.Grid`). The history stores them there. The rows of a trajectory
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
-from knode_cosserat.engine.places import values_along
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.engine.pattern import values_along
+from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.problem import Evaluated, StepProblem, places_of, row_of
+from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, places_of, row_of
+from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.solvers.time import BDF1, padded
@@ -146,6 +148,23 @@ def unloaded(system: System, space: SpaceScheme) -> tuple[Float[Any, "nodes x"],
     return found[: system.nodes], found[system.nodes :]
 
 
+def unloaded_shape(system: System, space: SpaceScheme) -> Any:
+    """Return y at all points (points, y) of the unloaded robot, or of a batch of robots."""
+    if np.ndim(system.length):
+        return map_robots(lambda one: unloaded_shape(one, space), system)
+    return unloaded(system, space)[1][: grid_of(system).tip + 1, : system.y_layout.size]
+
+
+def map_robots(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
+    """Return the results of a function for each robot of a batch, with its part of the arguments."""
+    if is_traced((system, arguments)):
+        return jax.vmap(function)(system, *arguments)
+    leaves, structure = jax.tree.flatten((system, *arguments))
+    leaves = [np.asarray(leaf) for leaf in leaves]
+    robots = [jax.tree.unflatten(structure, own) for own in zip(*leaves, strict=True)]
+    return jax.tree.map(lambda *parts: np.stack(parts), *(function(*own) for own in robots))
+
+
 def _rest(system: System, s: Any, _: Any) -> Any:
     return system.rest(s)
 
@@ -218,6 +237,111 @@ def still_records(
     return numeric.where(solved, still.records, at_places(system, space, nodes))
 
 
-def rows_suffice(system: System, space: SpaceScheme) -> bool:
-    """True if rows hold every state that steps need: no stages between nodes, no discontinuities, B zero."""
-    return not (system.mixed or space.formula.stages or system.discontinuities.places)
+# the steps of a run, and their results
+
+#: a row is COARSE if its position error is above this part of the length, or its orientation error above this
+#: angle (rad), which is the position error relative to the radius of curvature of a coil
+COARSE_SHARE, COARSE_ANGLE = 0.02, 0.1
+#: tolerance of a step's error estimate relative to its change, and largest number of corrections
+ESTIMATE_TOLERANCE, ESTIMATE_TURNS = 1e-2, 10
+#: misfits below this are rounding errors (natural units)
+ROUNDING = 1e-12
+
+
+class StepRows(NamedTuple):
+    """The steps' results, one row a step; with a batch, one axis more in front.
+
+    A row is that of the step's last stage; `stages` and `stage_unknowns` are those of the stages before it.
+    """
+
+    records: Float[Any, "steps nodes x"]
+    unknowns: Float[Any, "steps k"]
+    #: largest residual, natural units
+    error: Float[Any, " steps"]
+    corrections: Int[Any, " steps"]
+    #: estimated discretisation error of positions (m), the largest over the nodes; NaN: no estimate
+    position_error: Float[Any, " steps"]
+    #: result codes (`result.Result`)
+    result: Int[Any, " steps"]
+    #: estimated error of positions (m) by the time scheme, the largest over the nodes; NaN: no estimate
+    time_error: Float[Any, " steps"]
+    stages: Float[Any, "steps stages nodes x"]
+    stage_unknowns: Float[Any, "steps stages k"]
+
+    @property
+    def every_stage(self) -> tuple[Float[Any, "solves nodes x"], Float[Any, "solves k"]]:
+        """Records and unknowns of all stages of all steps in turn, those of the rows among them."""
+        pairs = (self.stages, self.records), (self.stage_unknowns, self.unknowns)
+        numeric: Any = jnp if is_traced(self) else np
+        joined = [numeric.concatenate([stages, last[:, None]], axis=1) for stages, last in pairs]
+        records, unknowns = (part.reshape(-1, *part.shape[2:]) for part in joined)
+        return records, unknowns
+
+
+class StepCoefficients(NamedTuple):
+    """Coefficients of a run's first steps and of all later ones, and all else that its steps share.
+
+    A scheme of several stages has coefficients (rows, stages, n) and as many ends, as parts of a step.
+    """
+
+    settings: Settings
+    table: Float[Any, "rows n"]
+    #: time step (s)
+    dt: Any
+    ends: Any = 1.0
+    #: subtracted from the residual of the tip's conditions
+    tip_offset: Any = 0.0
+
+    @classmethod
+    def of(cls, settings: Settings, dt: float = 0.0, known: int = 1) -> StepCoefficients:
+        """Return the coefficients of a run with steps of dt (s); `known` as in `coefficient_table`."""
+        ends = np.array(settings.time.ends) if settings.time and settings.stages > 1 else 1.0
+        return cls(settings, coefficient_table(settings, dt, known), dt, ends)
+
+    def at(self, t0: Any, i: Any) -> tuple[Any, Any]:
+        """Return the coefficients of step i, and the times (s) at its end or at those of its stages."""
+        numeric: Any = jnp if is_traced((self, i)) else np
+        row = numeric.minimum(i, len(self.table) - 1)
+        return numeric.asarray(self.table)[row], t0 + (i + self.ends) * self.dt
+
+
+class TimeStep(NamedTuple):
+    """A time step, without its control: the history before it, its coefficients, and the time at its end.
+
+    With several stages, coefficients (stages, 4) and times (stages,).
+    """
+
+    past: StateHistory
+    coefficients: Float[Any, "4"]
+    t: Any
+
+    @classmethod
+    def of(cls, steps: StepCoefficients, past: StateHistory, i: Any) -> TimeStep:
+        """Return step i of a run."""
+        return cls(past, *steps.at(past.t0, i))
+
+
+def stage_extrapolations(settings: Settings) -> Float[np.ndarray, "stages past past"]:
+    """Return for each stage the constant, linear and quadratic extrapolations from the last three states."""
+    assert settings.time is not None
+    ends = np.array(settings.time.ends)
+    times = np.concatenate([ends - 2.0, ends - 1.0, ends])
+    found = np.zeros((len(ends), *EXTRAPOLATIONS.shape))
+    for k in range(len(ends)):
+        now = 2 * len(ends) + k
+        for order in range(GUESS_STATES):
+            nodes = times[now - 1 - order : now][::-1] - times[now]
+            found[k, order, : order + 1] = np.linalg.solve(
+                np.vander(nodes, increasing=True).T, np.eye(order + 1)[0]
+            )
+    return found
+
+
+def no_rows(system: System, shape: tuple[int, ...], stages: int = 1) -> StepRows:
+    """Return rows of steps that were not reached, (steps,) or (robots, steps)."""
+    row, k = (system.nodes, no_history(system, LOBATTO2).shape[-1]), unknown_count(system)
+    return StepRows(
+        np.zeros((*shape, *row)), np.zeros((*shape, k)), np.zeros(shape), np.zeros(shape, dtype=int),
+        np.zeros(shape), np.full(shape, int(Result.NOT_REACHED)), np.full(shape, np.nan),
+        np.zeros((*shape, stages - 1, *row)), np.zeros((*shape, stages - 1, k)),
+    )  # fmt: skip

@@ -13,14 +13,15 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.evaluation import map_robots, unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
     SolverState,
     StateHistory,
+    map_robots,
     rest_record,
     resting_history,
+    unloaded_shape,
 )
 from knode_cosserat.solvers.problem import no_history, row_of
 from knode_cosserat.solvers.replay import (
@@ -32,7 +33,7 @@ from knode_cosserat.solvers.replay import (
 )
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.rollout import static_rollout
-from knode_cosserat.solvers.run import Equilibria, InitialState, warn_of_results
+from knode_cosserat.solvers.run import InitialState, TimeIntegration, warn_of_results
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_run
@@ -83,7 +84,7 @@ def initial_state(
 def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
     """Return y and z of the equilibrium under a control, and COARSE or CONVERGED."""
     many, held = np.ndim(system.length) > 0, control[None]
-    task = Equilibria(Settings(None, settings.space, newton=settings.newton), 1, budget)
+    task = TimeIntegration(Settings(None, settings.space, newton=settings.newton), recovery_budget=budget)
     if is_traced(system):
         find, y = static_rollout(task, Pattern.of(system)), unloaded_shape(system, settings.space)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, held, y) if many else find(system, held, y)
@@ -97,7 +98,9 @@ def _settled(system: System, settings: Settings, budget: float | None, control: 
     return found[..., : system.y_layout.size + system.z_layout.size], result
 
 
-def _settled_one(task: Equilibria, system: System, robot: int | None, held: np.ndarray) -> tuple[Any, Any]:
+def _settled_one(
+    task: TimeIntegration, system: System, robot: int | None, held: np.ndarray
+) -> tuple[Any, Any]:
     rows, _, cause = static_run(task, system, held)
     if rows.result[0] < 0:
         raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)

@@ -1,4 +1,15 @@
-"""The equations of one time step along the rod: the problem that Newton's method (`boundary`) solves."""
+"""The boundary-value problem of one time step, solved at all nodes at once.
+
+Unknown are y at every node and the free numbers ξ at the base. Their equations:
+
+    y_0 = base(ξ),     y_{j+1} = y_j + h Σ bᵢ f(Yᵢ)  (a piece of the space scheme),     tip(y_N) = 0
+
+Newton's method linearises all pieces side by side, and one linear recursion along the rod gives the
+correction (`engine.elimination`). A linearisation costs as much as several corrections. It is kept, also from
+one time step to the next, while corrections converge fast. Corrections are damped by the natural monotonicity
+test: the correction that the same linearisation proposes at the new point must be shorter than the last one
+(Deuflhard, Newton Methods for Nonlinear Problems, 2004, ch. 3).
+"""
 
 from __future__ import annotations
 
@@ -8,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Shaped
+from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
@@ -58,7 +69,7 @@ def places_of(system: System, space: SpaceScheme) -> Float[Any, " places"]:
     return numeric.concatenate([first, last, near, *stages])
 
 
-class Stages(NamedTuple):
+class _Stages(NamedTuple):
     """Rates and strains of a state: at the ends of pieces, then at each stage between them."""
 
     y: list[Any]
@@ -119,7 +130,8 @@ class StepProblem(eqx.Module):
 
     def jump(self, acting: Any, y: Float[Any, " y"], history: Float[Any, " x"]) -> Float[Any, " y"]:
         """Return y on the far side of the active discontinuities."""
-        return semi_discrete.jump(self.system, acting, self.t, y, self.control, self._unpack(history))
+        point = Point(None, self.t, y, self.control, self._unpack(history))
+        return semi_discrete.jump(self.system, acting, point)
 
     def far(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y where pieces start, on the far side of their discontinuities."""
@@ -144,17 +156,13 @@ class StepProblem(eqx.Module):
 
     def _evaluated(self, lanes: slice, y: Float[Any, "n y"]) -> tuple[Any, Any]:
         """Return f and z at places, from y there."""
-        s, history = self._each_strand(self.places[lanes]), self.history_by_strand(self.history[lanes])
-        f, z = jax.vmap(self.point_rates)(s, self.by_strand(y), history)
+        system, s = self.system, self.places[lanes]
+        count = strand_count(system)
+        s = jnp.repeat(s, count) if count > 1 else s
+        # a lane for each strand
+        parts = in_strands(system, y), records_in_strands(system, self.history[lanes])
+        f, z = jax.vmap(self.point_rates)(s, *(part.reshape(-1, part.shape[-1]) for part in parts))
         return f.reshape(len(y), -1), z.reshape(len(y), -1)
-
-    def _ends(self, y: Float[Any, "points y"], every: bool) -> tuple[slice, Any]:
-        """Return the places at the ends of pieces that the scheme uses (all if `every`), and y there."""
-        far = self.far(y)
-        if not (every or self.space.implicit):
-            return slice(0, self.grid.tip), far
-        grid = self.grid
-        return slice(0, grid.ends), jnp.concatenate([far, y[-1:], taken(y, grid.near)])
 
     def lengths(self) -> Float[Any, "pieces 1"]:
         """Return the lengths of all pieces (m)."""
@@ -167,12 +175,12 @@ class StepProblem(eqx.Module):
         end = taken(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
         return values[: grid.tip], end
 
-    def stages(self, y: Float[Any, "points y"], formula: Formula, known: Stages | None = None) -> Stages:
+    def stages(self, y: Float[Any, "points y"], formula: Formula, known: _Stages | None = None) -> _Stages:
         """Evaluate the stages of a formula that are not known yet.
 
         Without known stages, only those ends of pieces are evaluated that the scheme uses (`ends` gives all).
         """
-        found = self.ends(y, every=False) if known is None else Stages(*map(list, known))
+        found = self.ends(y, every=False) if known is None else _Stages(*map(list, known))
         rates = [*self.at_ends(found.f[0]), *found.f[1:]]
         for k in range(len(found.f) - 1, len(formula.stages)):
             between = self.between(formula.stages[k], found.y[0][: self.grid.tip], y[1:], rates)
@@ -182,40 +190,36 @@ class StepProblem(eqx.Module):
                 values.append(new)
         return found
 
-    def ends(self, y: Float[Any, "points y"], every: bool = True) -> Stages:
-        """Evaluate the equations at the ends of pieces."""
-        lanes, ends = self._ends(y, every)
-        f, z = self._evaluated(lanes, ends)
-        return Stages([ends], [f], [z])
+    def ends(self, y: Float[Any, "points y"], every: bool = True) -> _Stages:
+        """Evaluate the equations at the ends of pieces: at `every` end, or at those that the scheme uses."""
+        grid, ends = self.grid, self.far(y)
+        if every or self.space.implicit:
+            ends = jnp.concatenate([ends, y[-1:], taken(y, grid.near)])
+        f, z = self._evaluated(slice(0, len(ends)), ends)
+        return _Stages([ends], [f], [z])
 
     def between(self, stage: Any, start: Any, end: Any, rates: list[Any]) -> Any:
         """Return y at a stage, from y at both ends of the pieces and earlier rates."""
         moved = sum(x * f for x, f in zip(stage.rates, rates, strict=False) if x)
         return (1.0 - stage.end) * start + stage.end * end + self.lengths() * moved
 
-    def reached_by(self, formula: Formula, found: Stages) -> Float[Any, "pieces y"]:
-        """Return y at the ends of pieces by a formula, from its stages."""
-        rates = [*self.at_ends(found.f[0]), *found.f[1:]]
-        moved = sum(b * f for b, f in zip(formula.weights, rates, strict=False) if b)
-        return found.y[0][: self.grid.tip] + self.lengths() * moved
-
     def reached(self, y: Float[Any, "points y"]) -> Float[Any, "pieces y"]:
         """Return y at the ends of all pieces by the scheme."""
         formula = self.space.formula
-        return self.reached_by(formula, self.stages(y, formula))
+        found = self.stages(y, formula)
+        rates = [*self.at_ends(found.f[0]), *found.f[1:]]
+        moved = sum(b * f for b, f in zip(formula.weights, rates, strict=False) if b)
+        return found.y[0][: self.grid.tip] + self.lengths() * moved
 
     def residuals(self, y: Float[Any, "points y"]) -> tuple[Any, Any]:
         """Return the defects of all pieces (y at the end by the scheme, minus y), and the tip's residual."""
         return self.reached(y) - y[1:], self.tip_residual(y[-1])
 
-    def packed(self, found: Stages) -> Float[Any, "places x"]:
-        """Pack stages into the records that later steps need: y, z and, if B is not zero, y_s."""
+    def records(self, y: Float[Any, "points y"]) -> Float[Any, "places x"]:
+        """Return the records that later steps need, at every place: y, z and, if B is not zero, y_s."""
+        found = self.stages(y, self.space.check, self.ends(y))
         parts = [found.y, found.z, found.f] if self.system.mixed else [found.y, found.z]
         return jnp.concatenate([jnp.concatenate(part) for part in parts], axis=-1)
-
-    def records(self, y: Float[Any, "points y"]) -> Float[Any, "places x"]:
-        """Return the records of a state at every place."""
-        return self.packed(self.stages(y, self.space.check, self.ends(y)))
 
     def evaluated(self, y: Float[Any, "n y"]) -> Evaluated:
         """Return the state of y at all points, or at the nodes."""
@@ -250,19 +254,3 @@ class StepProblem(eqx.Module):
             return y.at[1:].add(jnp.where(before, change, 0.0))
 
         return jax.lax.fori_loop(0, FILLING * most, corrected, found)
-
-    # strands
-
-    def _each_strand(self, values: Shaped[Any, "n ..."]) -> Shaped[Any, "n_strands ..."]:
-        count = strand_count(self.system)
-        return jnp.repeat(values, count, axis=0) if count > 1 else values
-
-    def by_strand(self, rows: Float[Any, "n x"]) -> Float[Any, "n_strands x_of_strand"]:
-        """Return rows of y or z split by strand."""
-        own = in_strands(self.system, rows)
-        return own.reshape(-1, own.shape[-1])
-
-    def history_by_strand(self, records: Float[Any, "n x"]) -> Float[Any, "n_strands own"]:
-        """Return packed records of history split by strand."""
-        own = records_in_strands(self.system, records)
-        return own.reshape(-1, own.shape[-1])

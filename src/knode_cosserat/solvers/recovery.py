@@ -1,7 +1,6 @@
 """Recovery of a failed step: other guesses, load continuation, easing, then a method of the kind of problem.
 
 It runs outside the compiled loop, step by step in plain Python, by the machine code of the run.
-`recovery_methods` has the methods of time steps and of equilibria.
 """
 
 from __future__ import annotations
@@ -12,19 +11,27 @@ import time
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.engine.places import values_along
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers.history import EXTRAPOLATIONS
+from knode_cosserat.solvers.guess import curve_guesses
+from knode_cosserat.solvers.history import (
+    EXTRAPOLATIONS,
+    StepCoefficients,
+    StepRows,
+    TimeStep,
+    repeated_record_history,
+)
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.steps import StepCoefficients, StepRows, TimeStep
+from knode_cosserat.solvers.time import BDF1, BDF2, padded
 
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
@@ -38,22 +45,26 @@ ABSURD = 1e4
 BUDGET_SHARE, BUDGET_LEAST = 20.0, 5.0
 
 
-class BudgetError(KnodeCosseratError):
-    """The time for recovery is used up."""
-
-    code = "recovery-budget"
+#: smallest substep as a part of a time step, and largest number of substeps tried
+LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
+#: friction and contact are eased only in substeps below this part of a step: smaller substeps mostly suffice
+EASE_BELOW = 1.0 / 16.0
+#: part of the distance that a tip is moved in one step of relaxation
+DRAWN = 0.05
 
 
 class Budget:
-    """The time (s) that recovery may take in one run."""
+    """The time (s) that recovery may take in one run; none from when `stop` returns True."""
 
-    def __init__(self, seconds: float | None):
+    def __init__(self, seconds: float | None, stop: Callable[[], bool] | None = None):
         """Set a fixed budget in seconds; None: in proportion to the run's own time."""
-        self._fixed, self._own, self._used = seconds, 0.0, 0.0
+        self._fixed, self._stop, self._own, self._used = seconds, stop, 0.0, 0.0
 
     @property
     def seconds(self) -> float:
         """Total time (s) that recovery may take."""
+        if self._stop is not None and self._stop():
+            return 0.0
         return max(BUDGET_LEAST, BUDGET_SHARE * self._own) if self._fixed is None else self._fixed
 
     def ran(self, seconds: float) -> None:
@@ -61,10 +72,10 @@ class Budget:
         self._own += seconds
 
     def spend(self, seconds: float) -> None:
-        """Count time of recovery. Raises `BudgetError` if the budget is used up."""
+        """Count time of recovery. Raises `TimeoutError` if the budget is used up."""
         self._used += seconds
         if self._used > self.seconds:
-            raise BudgetError
+            raise TimeoutError
 
 
 class SolvedStep(NamedTuple):
@@ -75,29 +86,6 @@ class SolvedStep(NamedTuple):
     row: StepRows
     #: likely cause of a failure
     cause: str = ""
-
-
-def attempt(
-    system: System, settings: Settings, step: TimeStep | None, control: Any, y: Any, tip_offset: Any
-) -> SolvedStep:
-    """Solve one boundary-value problem, of a time step or of an equilibrium (None), from y at all points.
-
-    The search is long. The offset (k,) is subtracted from the residual of the tip's boundary conditions.
-    """
-    patient = dataclasses.replace(
-        settings, newton=dataclasses.replace(settings.newton, max_linearisations=MOST_LINEARISATIONS)
-    )
-    controls = np.asarray(control)[None]
-    if step is None:
-        _, state, rows = engine.static_one(system, patient, controls, y, (0, 1), tip_offset)
-    else:
-        past, weights = step.past, EXTRAPOLATIONS[0]
-        # the first guess is the newest of the earlier states
-        guess = past._replace(y=np.stack([y, *past.y[:-1]]), weights=weights, t0=0.0)
-        one = StepCoefficients(np.asarray(step.coefficients)[None], step.t)
-        _, after, rows = engine.loop_one(system, patient, one, controls, guess, (0, 1), tip_offset)
-        state = after._replace(y=np.stack([after.y[0], *past.y[:-1]]), weights=weights, t0=past.t0)
-    return SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))
 
 
 class Recovery(abc.ABC):
@@ -130,9 +118,28 @@ class Recovery(abc.ABC):
     def solve(
         self, control: Any, guess: Any, tip_offset: Any = 0.0, system: System | None = None
     ) -> SolvedStep:
-        """Solve the step under a control; arguments as in `attempt`."""
-        began, own = time.perf_counter(), system or self.system
-        found = attempt(own, self.settings, self.step, control, guess, tip_offset)
+        """Solve the step under a control, from y at all points, with a long search.
+
+        The offset (k,) is subtracted from the residual of the tip's boundary conditions.
+        """
+        began, newton = time.perf_counter(), self.settings.newton
+        newton = dataclasses.replace(newton, max_linearisations=MOST_LINEARISATIONS)
+        patient = dataclasses.replace(self.settings, newton=newton)
+        start, weights, step = guess, EXTRAPOLATIONS[0], self.step
+        if step is None:
+            steps = StepCoefficients.of(patient)
+        else:
+            steps = StepCoefficients(patient, np.asarray(step.coefficients)[None], step.t)
+            # the first guess is the newest of the earlier states
+            start = step.past._replace(y=np.stack([guess, *step.past.y[:-1]]), weights=weights, t0=0.0)
+        _, state, rows = engine.solve_steps(
+            system or self.system, steps._replace(tip_offset=tip_offset), np.asarray(control)[None], start,
+            (0, 1),
+        )  # fmt: skip
+        if step is not None:
+            y = np.stack([state.y[0], *step.past.y[:-1]])
+            state = state._replace(y=y, weights=weights, t0=step.past.t0)
+        found = SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))
         self.corrections += int(found.row.corrections)
         self.budget.spend(time.perf_counter() - began)
         return found
@@ -141,17 +148,24 @@ class Recovery(abc.ABC):
         """Return True if the attempt is a solution."""
         return bool(found.row.error <= self.settings.newton.acceptable)
 
-    def recover(self, controls: tuple[Any, Any]) -> SolvedStep:
-        """Solve the step by all methods in order. `controls` are the previous step's and this one's."""
+    def recover(
+        self, controls: tuple[Any, Any], has_direct: bool = True, has_last: bool = True
+    ) -> SolvedStep:
+        """Solve the step by all methods in order. `controls` are the previous step's and this one's.
+
+        The direct methods solve the step itself, the last one may change the problem on the way.
+        """
         if self.budget.seconds <= 0.0:
             return self._given_up(controls[1])
         best: list[SolvedStep] = []
         cause = ""
         try:
-            found = self._by_all_methods(controls, best)
+            found = self._directly(controls, best) if has_direct else None
+            if found is None and has_last:
+                found = self.last_method(controls)
             if found is not None:
                 return self._outcome(*found)
-        except BudgetError:
+        except TimeoutError:
             cause = f"Recovery was stopped after {self.budget.seconds:.3g} s (recovery_budget)."
         # an attempt that is only reported
         self.budget = Budget(np.inf)
@@ -177,10 +191,10 @@ class Recovery(abc.ABC):
             result = Result.COARSE
         return SolvedStep(found.state, row._replace(corrections=self.corrections, result=int(result)))
 
-    def _by_all_methods(
+    def _directly(
         self, controls: tuple[Any, Any], best: list[SolvedStep]
     ) -> tuple[Result, SolvedStep] | None:
-        """Try all methods in order; attempts from direct guesses are added to `best`."""
+        """Try guesses, load continuation and easing; attempts from guesses are added to `best`."""
         for guess in self.first_guesses(controls[1]):
             found = self.solve(controls[1], guess)
             best.append(found)
@@ -190,9 +204,7 @@ class Recovery(abc.ABC):
         if continued is not None:
             return Result.RECOVERED_LOAD_CONTINUATION, continued
         eased = self.ease(controls[1])
-        if eased is not None:
-            return Result.RECOVERED_EASING, eased
-        return self.last_method(controls)
+        return None if eased is None else (Result.RECOVERED_EASING, eased)
 
     def continue_load(self, before: Any, now: Any) -> SolvedStep | None:
         """Continue from the previous control to this one in load steps, each from the last solution."""
@@ -236,6 +248,165 @@ class Recovery(abc.ABC):
             if reached == 1.0:
                 return found
         return None
+
+
+class StepRecovery(Recovery):
+    """Recovery of a time step. Its last method divides the step into substeps."""
+
+    step: TimeStep
+
+    def __init__(self, system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget):
+        super().__init__(system, settings, budget)
+        self.step = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=float), step)
+        self.dt = dt
+
+    @property
+    def state(self) -> Any:
+        """History before the step."""
+        return self.step.past
+
+    def guesses(self) -> list[Any]:
+        """Return the last state, and its linear extrapolation."""
+        return [np.einsum("p,pny->ny", w, self.step.past.y) for w in EXTRAPOLATIONS[:2]]
+
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
+        """Divide the step into substeps: with a constant control first, then with a ramp."""
+        for before in (controls[1], controls[0]):
+            found = self._in_substeps(before, controls[1])
+            if found is not None:
+                return Result.RECOVERED_STEP_HALVING, found
+        return None
+
+    def _in_substeps(self, before: Any, now: Any) -> SolvedStep | None:
+        """Solve the step by adaptive substeps, with coefficients for unequal time steps.
+
+        The substeps of a scheme of several stages are those of BDF2.
+        """
+        settings, past, dt = self.settings, self.step.past, self.dt
+        before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
+        reached, part, memory = 0.0, 0.5, settings.memory
+        #: lengths of earlier steps, the last one first
+        previous = [dt] * (memory - 1)
+        assert settings.time is not None
+        regular = settings.time if settings.stages == 1 else BDF2()
+        scheme = settings.time if settings.start == "paper" and settings.stages == 1 else BDF1()
+        for _ in range(MOST_SUBSTEPS):
+            until = min(1.0, reached + part)
+            coefficients = padded(scheme.coefficients((until - reached) * dt, *previous), memory)
+            step = TimeStep(past, coefficients, float(self.step.t) - (1.0 - until) * dt)
+            substep = StepRecovery(self.system, settings, step, dt, self.budget)
+            found = substep.direct(before + until * (now - before), ease=part < EASE_BELOW)
+            if found is None:
+                part /= 4.0
+                if part < LEAST_SUBSTEP:
+                    return None
+                continue
+            self.corrections = substep.corrections
+            if until == 1.0:
+                return found._replace(state=self._whole(found.state))
+            past, scheme = found.state, regular
+            previous = [(until - reached) * dt, *previous[:-1]]
+            reached, part = until, 2.0 * (until - reached)
+        return None
+
+    def direct(self, control: Any, ease: bool) -> SolvedStep | None:
+        """Return a solution from the guesses, or by easing."""
+        for guess in self.guesses():
+            found = self.solve(control, guess)
+            if self.solved(found):
+                return found
+        return self.ease(control) if ease else None
+
+    def _whole(self, after: Any) -> Any:
+        """Return the history of the next step, which holds whole steps, not substeps."""
+        before = self.step.past
+        return after._replace(
+            records=np.stack([after.records[0], *before.records[:-1]]),
+            y=np.stack([after.y[0], *before.y[:-1]]),
+            error=np.stack([after.error[0], *before.error[:-2], after.error[-1]]),
+        )
+
+
+def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedStep:
+    """Recover a step of several stages: each stage, or all of them by substeps of a multistep scheme."""
+    system, settings, step, dt, budget = whole.system, whole.settings, whole.step, whole.dt, whole.budget
+    shape = settings.stages, system.control_layout.size
+    before, now = (np.broadcast_to(np.reshape(each, (-1, shape[1])), shape) for each in controls)
+    last, past, found = before[-1], step.past, []
+    for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):
+        stage = StepRecovery(system, settings, TimeStep(past, coefficients, t), dt, budget)
+        # the whole step is divided, not a stage
+        solved = stage.recover((last, own), has_last=False)
+        if solved.row.result < 0:
+            break
+        found.append(solved.row)
+        past, last = solved.state, own
+    else:
+        row = found[-1]._replace(
+            error=max(each.error for each in found), corrections=sum(each.corrections for each in found),
+            result=max(int(each.result) for each in found),
+            stages=np.stack([each.records for each in found[:-1]]),
+            stage_unknowns=np.stack([each.unknowns for each in found[:-1]]),
+        )  # fmt: skip
+        past = past._replace(time_error=np.full_like(past.time_error, np.nan))
+        return SolvedStep(past, row)
+    one = TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
+    # without direct methods: a whole step of one stage would be another scheme's
+    divided = StepRecovery(system, settings, one, dt, budget)
+    solved = divided.recover((before[-1], now[-1]), has_direct=False)
+    lost = solved.state._replace(time_error=np.full_like(solved.state.time_error, np.nan))
+    row, count = solved.row, settings.stages - 1
+    # between the ends of such a step no stages are known
+    stages, unknowns = (np.repeat(each[None], count, axis=0) for each in (row.records, row.unknowns))
+    return solved._replace(state=lost, row=row._replace(stages=stages, stage_unknowns=unknowns))
+
+
+class StaticRecovery(Recovery):
+    """Recovery of an equilibrium. Its last method relaxes the robot in a damped motion."""
+
+    def __init__(self, system: System, settings: Settings, y: Any, budget: Budget):
+        super().__init__(system, settings, budget)
+        self._y = np.asarray(y)
+
+    @property
+    def state(self) -> Any:
+        """y at all points before the equilibrium."""
+        return self._y
+
+    def guesses(self) -> list[Any]:
+        """Return the state before."""
+        return [self._y]
+
+    def first_guesses(self, control: Any) -> list[Any]:
+        """Return curves of the rod's length between held ends, then the state before."""
+        return [*curve_guesses(self.system, control), *self.guesses()]
+
+    def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
+        """Relax by implicit Euler with growing time steps, then solve the equilibrium; it is then stable.
+
+        The tip's boundary conditions are applied gradually in the first steps.
+        """
+        system, part = self.system, 0.0
+        settings = Settings(BDF1(), self.settings.space, newton=self.settings.newton)
+        still = still_state(system, settings.space, controls[1], self._y)
+        past = repeated_record_history(system, settings, still.records, self._y, 0.0)
+        natural = natural_time(system) or 0.1
+        dt, longest = 0.1 * natural, 1e5 * natural
+        for _ in range(80):
+            step = TimeStep(past, BDF1().coefficients(dt), 0.0)
+            moving = StepRecovery(system, settings, step, dt, self.budget)
+            target = min(1.0, part + DRAWN)
+            found = moving.solve(controls[1], moving.guesses()[0], (1.0 - target) * still.tip)
+            if not moving.solved(found):
+                dt /= 4.0
+                continue
+            # short steps until the tip's boundary conditions hold
+            past, dt = found.state, 2.0 * dt if part == 1.0 else dt
+            part = target
+            if dt > longest:
+                break
+        found = self.solve(controls[1], past.y[0])
+        return (Result.RECOVERED_RELAXATION, found) if self.solved(found) else None
 
 
 def likely_cause(result: Result, system: System, settings: Settings, control: Any) -> str:

@@ -7,6 +7,7 @@ an earlier version. Rows hold the nodes only; the equations give the other place
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -14,13 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.engine import loops as engine
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.evaluation import evaluator, still_state
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
     SolverState,
     StateHistory,
+    StepCoefficients,
     advanced,
     at_stages,
     constant_history,
@@ -30,14 +32,36 @@ from knode_cosserat.solvers.history import (
     resting_history,
     still_records,
 )
-from knode_cosserat.solvers.problem import no_history, row_of
+from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, row_of
 from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.steps import StepCoefficients
 from knode_cosserat.trajectory import Trajectory
 
 #: row 0 is the state at rest if it differs by less than this (natural units)
 AT_REST = 1e-12
+
+
+def evaluator(system: System, settings: Settings, traced: bool = False) -> Callable[..., Evaluated]:
+    """Return a function that evaluates states.
+
+    Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at the
+    nodes. Inside JAX's transformations, all may be `traced`.
+    """
+    if not traced:
+        return engine.evaluator(system, settings)
+    return lambda c0, t, control, history, y: _evaluated(
+        StepProblem(system, t, control, c0, history, settings.space), y
+    )
+
+
+@jax.jit
+def _evaluated(problem: StepProblem, y: Any) -> Evaluated:
+    return problem.evaluated(y)
+
+
+def still_state(system: System, space: SpaceScheme, control: Any, y: Any, t: Any = 0.0) -> Evaluated:
+    """Return the state at rest of y at all points, or at the nodes, under a control."""
+    return evaluator(system, Settings(None, space))(0.0, t, control, no_history(system, space), y)
 
 
 def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> StateHistory:
@@ -49,7 +73,7 @@ def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0:
     return repeated_record_history(system, settings, records, still.y, t0)
 
 
-class Replay(NamedTuple):
+class _Replay(NamedTuple):
     """Solver states along the rows of a trajectory."""
 
     #: first row whose step has a known history
@@ -60,7 +84,7 @@ class Replay(NamedTuple):
     state: SolverState
 
 
-def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> Replay | None:
+def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> _Replay | None:
     """Return the histories along a motion's rows by a system's equations; None if the rows do not suffice.
 
     `dt` is the time step (s) of rows whose times are traced.
@@ -93,7 +117,7 @@ def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> R
     history, terms = _along(system, made, past, (rows, controls), steps)
     last = state.after(history, apart, len(time) - 1 - row, made)
     last = dataclasses.replace(last, rate_known=state.rate_known and made.uses_rate)
-    return Replay(row + 1, terms[made.stages - 1 :: made.stages], last)
+    return _Replay(row + 1, terms[made.stages - 1 :: made.stages], last)
 
 
 def history_settings(settings: Settings) -> Settings:

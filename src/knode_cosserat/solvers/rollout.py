@@ -21,16 +21,15 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from knode_cosserat.engine.core import Constants, Shape
+from knode_cosserat.engine.core import Shape
 from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.engine.tangents import CotangentCore, TangentCore
+from knode_cosserat.engine.tangents import CotangentCore, SolvedSteps, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory, used_places
+from knode_cosserat.solvers.history import StateHistory, StepRows, no_rows, used_places
 from knode_cosserat.solvers.problem import no_history
-from knode_cosserat.solvers.run import Equilibria, TimeIntegration
-from knode_cosserat.solvers.steps import StepRows, no_rows
+from knode_cosserat.solvers.run import TimeIntegration
 
 Arrays = Sequence[Any]
 
@@ -39,7 +38,7 @@ Arrays = Sequence[Any]
 class Solves:
     """All that the code of a primitive depends on, but for the shapes of its arrays."""
 
-    task: TimeIntegration | Equilibria
+    task: TimeIntegration
     pattern: Pattern
     #: true for leaves of the system that have tangents
     moving: tuple[bool, ...] = ()
@@ -138,18 +137,11 @@ def _core_of_solves(spec: Solves, *operands: Any) -> Any:
     return core_of(spec.pattern, spec.task.settings, robots=operands[spec.leaves].shape[0] > 1)
 
 
-def _states_of(spec: Solves, states: Arrays) -> Any:
-    return Shape(*states) if isinstance(spec.task, Equilibria) else StateHistory(*states)
-
-
 def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
     leaves, controls = arrays[: spec.leaves], arrays[spec.leaves]
     task, parameters = spec.task, np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-    states, constants = (
-        _states_of(spec, arrays[spec.leaves + 1 :]),
-        Constants(parameters, task.settings.newton),
-    )
-    done, last, rows = core.integrate(constants, controls, task.coefficients, states, (0, task.steps))
+    states = (StateHistory if task.settings.time else Shape)(*arrays[spec.leaves + 1 :])
+    done, last, rows = core.integrate(parameters, controls, task.coefficients, states, (0, task.steps))
     return [done, *last, *rows]
 
 
@@ -198,7 +190,7 @@ def _core_of_linear(kind: Any, spec: Solves, *operands: Any) -> Any:
 
 
 def _each_robot(function: Callable[..., Any], spec: Solves, arrays: Arrays) -> list[np.ndarray]:
-    """Return results of a function of each robot's parameters, solved steps, and tangents.
+    """Return results of a function of each robot's solved steps and tangents.
 
     Tangents and results have columns as the last axis in the function, and as the first one here.
     """
@@ -208,10 +200,10 @@ def _each_robot(function: Callable[..., Any], spec: Solves, arrays: Arrays) -> l
         own = [each[min(k, len(each) - 1)] for each in arrays]
         *leaves, controls, records, rate, t0, rows, unknowns = own[:n]
         parameters = np.concatenate([leaf.reshape(-1) for leaf in leaves])
-        table = table_of(task.settings, task.coefficients, task.steps, float(t0))
+        table = table_of(task.coefficients, task.steps, float(t0))
         at = at_all_stages(system, task.settings, controls)
         columns = [np.moveaxis(each, 0, -1) for each in own[n:]]
-        results = function(parameters, table, (rows, unknowns), at, (records, rate), columns)
+        results = function(SolvedSteps(parameters, table, at, rows, unknowns, records, rate), columns)
         found.append([np.moveaxis(each, -1, 0) for each in results])
     return [np.stack(each) for each in zip(*found, strict=True)]
 
@@ -219,18 +211,14 @@ def _each_robot(function: Callable[..., Any], spec: Solves, arrays: Arrays) -> l
 def _push(core: TangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.ndarray]:
     system, settings = spec.pattern.system, spec.task.settings
 
-    def push(
-        parameters: Any, table: Any, solved: Any, controls: Any, states: Any, columns: Any
-    ) -> tuple[Any, ...]:
+    def push(solved: SolvedSteps, columns: Any) -> tuple[Any, ...]:
         *leaves, d_controls, d_records, d_rate = columns
         m = d_rate.shape[-1]
         moved = [leaf.reshape(-1, m).T for leaf in leaves]
         directions = np.concatenate(moved, axis=1) if moved else np.zeros((0, 0))
         moves = directions, np.eye(len(directions), m)
         d_own = at_all_stages(system, settings, d_controls)
-        after, found = core.solve(
-            parameters, table, solved, controls, moves, d_own, (*states, d_records, d_rate)
-        )
+        after, found = core.solve(solved, moves, d_own, (d_records, d_rate))
         return *found, *after[2:]
 
     return _each_robot(push, spec, arrays)
@@ -241,8 +229,8 @@ def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.nda
     ends, steps = np.cumsum([int(np.prod(shape)) for shape in shapes])[:-1], spec.task.steps
     held = arrays[spec.leaves].shape[2] == spec.pattern.system.control_layout.size
 
-    def pull(*given: Any) -> tuple[Any, ...]:
-        moved, controls, *states = core.solve(*given)
+    def pull(solved: SolvedSteps, cotangents: Any) -> tuple[Any, ...]:
+        moved, controls, *states = core.solve(solved, cotangents)
         leaves = np.split(moved, ends) if shapes else []
         leaves = [leaf.reshape(*shape, moved.shape[-1]) for leaf, shape in zip(leaves, shapes, strict=True)]
         controls = controls.reshape(steps, spec.task.settings.stages, -1, controls.shape[-1])
@@ -324,7 +312,9 @@ def rollout(
         past = primals[2]
         states = past.records[:, :used], past.rate[:used], past.t0
         d_states = d_past.records[:, :used], d_past.rate[:used]
-        d_rows, d_records, d_rate = _pushed(task, pattern, primals, tangents, rows, states, d_states)
+        d_rows, d_records, d_rate = _pushed(
+            Solves(task, pattern), primals, tangents, rows, (states, d_states)
+        )
         # first guesses, error estimates and the extra stages of these count as constants
         d_last = jax.tree.map(jnp.zeros_like, last)
         d_last = d_last._replace(
@@ -338,7 +328,7 @@ def rollout(
 
 
 @functools.lru_cache(maxsize=64)
-def static_rollout(task: Equilibria, pattern: Pattern) -> Callable[[System, Any, Any], StepRows]:
+def static_rollout(task: TimeIntegration, pattern: Pattern) -> Callable[[System, Any, Any], StepRows]:
     """Return a differentiable function from (system, controls (T, c), y at all points) to all rows."""
 
     @jax.custom_jvp
@@ -349,7 +339,8 @@ def static_rollout(task: Equilibria, pattern: Pattern) -> Callable[[System, Any,
         rows, system = run(*primals), primals[0]
         none = no_history(system, task.settings.space)[: used_places(system, task.settings.space)]
         still = jnp.stack([none] * task.settings.memory), none
-        return rows, _pushed(task, pattern, primals, tangents, rows, (*still, jnp.zeros(())), still)[0]
+        states = (*still, jnp.zeros(())), still
+        return rows, _pushed(Solves(task, pattern), primals, tangents, rows, states)[0]
 
     run.defjvp(tangent, symbolic_zeros=True)
     return run
@@ -370,15 +361,18 @@ def _solved(spec: Solves, system: System, controls: Any, states: Any) -> tuple[A
 
 
 def _pushed(
-    task: Any, pattern: Pattern, primals: Any, tangents: Any, rows: StepRows, states: Any, d_states: Any
+    spec: Solves, primals: Any, tangents: Any, rows: StepRows, states: tuple[Any, Any]
 ) -> tuple[StepRows, Any, Any]:
-    """Return the tangents of rows, and of the records and the rate after the last step."""
-    system, controls = primals[:2]
+    """Return the tangents of rows, and of the records and the rate after the last step.
+
+    `states` are records, rate and time before the first step, and the tangents of records and rate.
+    """
+    (system, controls, *_), task, (before, d_before) = primals, spec.task, states
     d_leaves = jax.tree.leaves(tangents[0], is_leaf=_is_zero)
     moving = tuple(not _is_zero(leaf) for leaf in d_leaves)
-    spec = Solves(task, pattern, moving)
-    residuals = *jax.tree.leaves(system), controls, *states, *rows.every_stage
-    moved = *spec.moved(d_leaves), _instantiated(tangents[1]), *d_states
+    spec = dataclasses.replace(spec, moving=moving)
+    residuals = *jax.tree.leaves(system), controls, *before, *rows.every_stage
+    moved = *spec.moved(d_leaves), _instantiated(tangents[1]), *d_before
     operands = [*map(_one_robot, residuals), *(_one_robot(_one_robot(each)) for each in moved)]
     d_records, d_unknowns, *after = (each[0, 0] for each in push_p.bind(*operands, spec=spec))
     d_records, d_unknowns = (

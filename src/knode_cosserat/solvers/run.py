@@ -8,7 +8,7 @@ import logging
 import os
 import time
 import warnings
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,15 +20,24 @@ from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.evaluation import map_robots
 from knode_cosserat.solvers.guess import materials
-from knode_cosserat.solvers.history import SolverState, StateHistory
-from knode_cosserat.solvers.recovery import Budget, SolvedStep
-from knode_cosserat.solvers.recovery_methods import StaticRecovery, StepRecovery, recovered_stages
+from knode_cosserat.solvers.history import (
+    SolverState,
+    StepCoefficients,
+    StepRows,
+    TimeStep,
+    map_robots,
+)
+from knode_cosserat.solvers.recovery import (
+    Budget,
+    SolvedStep,
+    StaticRecovery,
+    StepRecovery,
+    recovered_stages,
+)
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
-from knode_cosserat.solvers.steps import StepCoefficients, StepRows, TimeStep
 
 log = logging.getLogger(__name__)
 
@@ -52,21 +61,18 @@ class InitialState(NamedTuple):
     result: Any = int(Result.CONVERGED)
 
 
-class Run(NamedTuple):
-    """Rows of a run, its last state (`SolvedStep.state`), and the likely cause of a failure."""
-
-    rows: StepRows
-    state: Any
-    cause: str
-
-
 @dataclasses.dataclass(frozen=True)
 class TimeIntegration:
-    """The time steps of a run: settings and sizes shared by all its robots."""
+    """The steps of a run, shared by all its robots.
+
+    Without a time scheme they are equilibria, each solved from the one before. The state of a motion is a
+    `StateHistory`, that of equilibria y at all points.
+    """
 
     settings: Settings
-    dt: float
-    steps: int
+    #: time step (s)
+    dt: float = 0.0
+    steps: int = 1
     #: states before the first step (`SolverState.known`)
     known: int = 1
     #: seconds that recovery may take; None: 20 times the run's own time or 5 s, whichever is more
@@ -77,74 +83,55 @@ class TimeIntegration:
         """Coefficients of the steps."""
         return StepCoefficients.of(self.settings, self.dt, self.known)
 
-    def solve(self, system: System, controls: Any, state: StateHistory, span: tuple[int, int]) -> Any:
-        """Solve a span of steps until one fails: number of steps done, the last state, rows of the span."""
-        return engine.loop_one(system, self.settings, self.coefficients, controls, state, span)
+    def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int] | None = None) -> Any:
+        """Solve steps, all by default, until one fails: the number done, the last state, rows of the span.
 
-    def solve_many(self, system: System, controls: Any, states: StateHistory) -> Any:
-        """Solve all steps of a batch of robots, each until one fails: as `solve`, for each robot."""
-        return engine.loop_many(system, self.settings, self.coefficients, controls, states, self.steps)
+        A batch of robots has controls (B, T, c) and as many states; each is solved until one of its steps
+        fails.
+        """
+        return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps))
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
+        if self.settings.time is None:
+            return StaticRecovery(system, self.settings, state, budget).recover(controls)
         step = TimeStep.of(self.coefficients, state, i)
-        if self.settings.stages > 1:
-            return recovered_stages(system, self.settings, step, self.dt, budget, controls)
-        return StepRecovery(system, self.settings, step, self.dt, budget).recover(controls)
-
-
-@dataclasses.dataclass(frozen=True)
-class Equilibria:
-    """A list of equilibria, each solved from the one before. Its states are y at all points."""
-
-    settings: Settings
-    steps: int
-    recovery_budget: float | None = None
-
-    @property
-    def coefficients(self) -> StepCoefficients:
-        """Coefficients of the steps: zeros."""
-        return engine.STILL
-
-    def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int]) -> Any:
-        """Solve a span of equilibria until one fails: the number done, the last state, rows of the span."""
-        return engine.static_one(system, self.settings, controls, state, span)
-
-    def solve_many(self, system: System, controls: Any, states: Any) -> Any:
-        """Solve the lists of a batch of robots, each until one fails: as `solve`, for each robot."""
-        return engine.static_many(system, self.settings, controls, states, self.steps)
-
-    def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
-        """Recover an equilibrium; `controls` are the previous one's and its own."""
-        return StaticRecovery(system, self.settings, state, budget).recover(controls)
+        recovery = StepRecovery(system, self.settings, step, self.dt, budget)
+        return (
+            recovered_stages(recovery, controls) if self.settings.stages > 1 else recovery.recover(controls)
+        )
 
 
 def run_one(
-    task: TimeIntegration | Equilibria, system: System, controls: np.ndarray, state: Any, before: Any,
-    progress: bool = False, response: float = RESPONSE,
-) -> Run:  # fmt: skip
-    """Solve all steps of one robot, with recovery, from a state and the control before it.
+    task: TimeIntegration, system: System, controls: np.ndarray, start: tuple[Any, Any],
+    watch: Literal["signals", "bar"] | None = "signals",
+) -> tuple[StepRows, Any, str]:  # fmt: skip
+    """Return all steps of one robot, with recovery, the last state, and the likely cause of a failure.
 
-    The compiled loop returns about every `response` seconds, to check for signals. Pieces change the result
-    within the tolerance: if it has to be the same bits in each run, `response` is infinite, one piece.
+    They start from a state and the control before it. To watch for signals, the compiled loop returns about
+    every `RESPONSE` seconds; a progress bar shows it. Pieces change the result within the tolerance: if it
+    has to be the same bits in each run, nothing is watched, and there is one piece.
     """
-    total = task.steps
-    piece = FIRST_STEPS if np.isfinite(response) else total
+    total, (state, before) = task.steps, start
+    piece = FIRST_STEPS if watch else total
     budget = Budget(task.recovery_budget)
     rows: StepRows | None = None
     done, cause = 0, ""
-    with tqdm(total=total, disable=not progress, unit="step", leave=False) as bar:
+    with tqdm(total=total, disable=watch != "bar", unit="step", leave=False) as bar:
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
             reached, state, new = task.solve(system, controls, state, (done, stop))
-            reached = int(reached)
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
-            if np.isfinite(response):
+            if watch:
                 # short enough to respond to an interruption, long enough to cost nothing
-                piece = max(piece, int((reached - done) * response / max(elapsed, 1e-6)))
-            rows = _merged(rows, new, done, reached, total)
+                piece = max(piece, int((reached - done) * RESPONSE / max(elapsed, 1e-6)))
+            if rows is None:
+                rows = StepRows(*(np.zeros((total, *leaf.shape[1:]), leaf.dtype) for leaf in new))
+                rows.result[:] = int(Result.NOT_REACHED)
+            for every, leaf in zip(rows, new, strict=True):
+                every[done:reached] = leaf[: reached - done]
             if reached < stop:
                 pair = (controls[reached - 1] if reached else before), controls[reached]
                 solved = task.recover(system, state, pair, reached, budget)
@@ -156,22 +143,7 @@ def run_one(
             bar.update(reached - done)
             done = reached
     assert rows is not None
-    return Run(rows, state, cause)
-
-
-def _merged(rows: StepRows | None, new: StepRows, first: int, last: int, total: int) -> StepRows:
-    """Add the rows `first` to `last` of a compiled loop to the existing rows."""
-    if rows is None:
-        rows = StepRows(*(np.zeros((total, *leaf.shape[1:]), leaf.dtype) for leaf in new))
-        rows.result[:] = int(Result.NOT_REACHED)
-    for every, leaf in zip(rows, new, strict=True):
-        every[first:last] = leaf[: last - first]
-    return rows
-
-
-def with_carried_results(rows: StepRows, before: Any) -> StepRows:
-    """Return the rows of a motion with results that hold for all later rows, too; see `carried_results`."""
-    return rows._replace(result=carried_results(rows.result, before))
+    return rows, state, cause
 
 
 def carried_results(result: Any, before: Any) -> Any:
@@ -274,25 +246,19 @@ def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> Simulat
     return SimulationError(number, t, float(rows.error[i]), Result(int(rows.result[i])), cause, robot)
 
 
-def time_error_of(system: System, rows: StepRows) -> Any:
-    """Return the estimated errors in time (m); NaN if there is none, or if it is more than the length."""
-    numeric: Any = jnp if is_traced(rows) else np
-    length = system.length[..., None] if np.ndim(system.length) else system.length
-    known = (numeric.asarray(rows.result) >= 0) & (rows.time_error <= length)
-    return numeric.where(known, rows.time_error, numeric.nan)
-
-
 def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
     """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
     numeric: Any = jnp if is_traced(rows) else np
     ny, nz = system.y_layout.size, system.z_layout.size
     invalid = numeric.asarray(rows.result) < 0
+    length = system.length[..., None] if np.ndim(system.length) else system.length
     records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
     found = {
         "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
         "residual": rows.error, "iterations": rows.corrections,
         "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
-        "time_error": time_error_of(system, rows),
+        # an estimate beyond the rod's length is none
+        "time_error": numeric.where(~invalid & (rows.time_error <= length), rows.time_error, numeric.nan),
     }  # fmt: skip
     if rows.stages.shape[-3]:
         found["stages"] = numeric.where(invalid[..., None, None, None], numeric.nan, rows.stages)
@@ -300,26 +266,26 @@ def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
 
 
 def run_batch(
-    task: TimeIntegration | Equilibria, system: System, controls: np.ndarray, states: Any, before: Any,
-    progress: bool = False,
+    task: TimeIntegration, system: System, controls: np.ndarray, start: tuple[Any, Any],
+    watch: Literal["signals", "bar"] | None = "signals",
 ) -> tuple[StepRows, Any, dict[int, str]]:  # fmt: skip
     """Return the rows and last states of all robots, and the likely cause for each robot that failed.
 
-    Robots are solved in chunks, one thread a core. A robot with a failed step is then run by itself, with
-    recovery.
+    Arguments as in `run_one`. Robots are solved in chunks, one thread a core. A robot with a failed step is
+    then run by itself, with recovery.
     """
-    size, batched = controls.shape[0], np.ndim(system.length) > 0
+    size, batched, (states, before) = controls.shape[0], np.ndim(system.length) > 0, start
     workers = usable_cores()
     chunk = min(CHUNK, -(-size // workers))
 
     def robot(index: Any) -> System:
         return _picked(system, index) if batched else system
 
-    with tqdm(total=size, disable=not progress, unit="robot", leave=False) as bar:
+    with tqdm(total=size, disable=watch != "bar", unit="robot", leave=False) as bar:
 
         def work(first: int) -> Any:
             index = slice(first, first + chunk)
-            done, lasts, rows = task.solve_many(robot(index), controls[index], _picked(states, index))
+            done, lasts, rows = task.solve(robot(index), controls[index], _picked(states, index))
             bar.update(len(done))
             return done, lasts, *rows
 
@@ -330,13 +296,11 @@ def run_batch(
     )
     rows, causes = StepRows(*leaves), {}
     for i in np.flatnonzero(done < task.steps):
-        alone = run_one(task, robot(i), controls[i], _picked(states, i), before[i])
-        for every, one in zip(rows, alone.rows, strict=True):
+        *solved, cause = run_one(task, robot(i), controls[i], (_picked(states, i), before[i]))
+        for every, one in zip(jax.tree.leaves((rows, lasts)), jax.tree.leaves(solved), strict=True):
             every[i] = one
-        for every, one in zip(jax.tree.leaves(lasts), jax.tree.leaves(alone.state), strict=True):
-            every[i] = one
-        if alone.cause:
-            causes[int(i)] = alone.cause
+        if cause:
+            causes[int(i)] = cause
     return rows, lasts, causes
 
 

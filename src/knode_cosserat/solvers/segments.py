@@ -11,6 +11,7 @@ side, and its sample has y there.
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -23,12 +24,11 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.strands import in_strands, strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import at_places, grid_of, inside
-from knode_cosserat.solvers.history import coefficient_table, history_of, rows_suffice
+from knode_cosserat.solvers.grid import ON_NODE, at_places, grid_of, inside
+from knode_cosserat.solvers.history import coefficient_table, history_of
 from knode_cosserat.solvers.replay import replay, replayed_settings
-from knode_cosserat.solvers.semi_discrete import Point, records_in_strands, unpacked_history
+from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.settings import MEASURED, Settings
-from knode_cosserat.solvers.slopes import slopes_of
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -161,7 +161,7 @@ def predict_segment(
         history = unpacked_history(system, sample.c0, records[0])
         if system.discontinuities.jump is not None:
             acting = jnp.asarray(grid.acting)[own]
-            beyond = semi_discrete.jump(system, acting, sample.t, y, sample.control, history)
+            beyond = semi_discrete.jump(system, acting, Point(None, sample.t, y, sample.control, history))
             y = jnp.where(k > 0, beyond, y)
 
         def corrected(_: Any, end: Any) -> Any:
@@ -210,8 +210,11 @@ def samples(
 
 def rows_are_states(knowledge: System, trajectories: Sequence[Trajectory]) -> bool:
     """True if the rows hold every state that steps need, or were not simulated."""
-    made = [each.settings for each in trajectories]
-    return all(settings is None or rows_suffice(knowledge, settings.space) for settings in made)
+    if not any(each.settings for each in trajectories):
+        return True
+    # no stages between nodes, no discontinuities, B zero
+    stages = any(each.settings.space.formula.stages for each in trajectories if each.settings)
+    return not (knowledge.mixed or stages or knowledge.discontinuities.places)
 
 
 def strand_samples(knowledge: System, data: Dataset) -> Dataset:
@@ -258,7 +261,13 @@ def _of_one(
         parts = [(each[..., : y.shape[-1]], each[..., y.shape[-1] :][..., : z.shape[-1]]) for each in between]
         stages = np.stack([recorded(*part, slopes_of(settings, part[0])[0]) for part in parts], axis=1)
     c0, history = histories(settings, dt, record, stages)
-    beyond = _far_side(knowledge, time, c0, y, control, history)
+    ny, nz, rest = y.shape[-1], z.shape[-1], np.zeros_like(y)
+    terms = (
+        history[..., :ny],
+        history[..., ny : ny + nz],
+        history[..., ny + nz :] if knowledge.mixed else rest,
+    )
+    beyond = _far_side(knowledge, Point(None, time, y, control, History(c0, *terms)))
     if knowledge.discontinuities.places:
         slope, doubt = slopes_of(settings, y, beyond, knowledge.discontinuities.places)
     # earlier rows equal the first row if that is the start of a motion, and are unknown otherwise
@@ -305,16 +314,13 @@ def _past_of_rows(
     simulated = trajectory.settings is not None
     known = replay(trajectory, model) if model is not None and simulated else None
     if known is None:
-        past = jax.vmap(lambda each: segment_history(knowledge, space, each))(history)
+        past = jax.vmap(lambda each: in_segments(knowledge, space, at_places(knowledge, space, each)))(
+            history
+        )
     else:
         along = known.terms[rows - known.first]
         past = jax.vmap(lambda each: in_segments(knowledge, space, each))(along)
     return np.asarray(past[0]), np.asarray(past[1])
-
-
-def segment_history(knowledge: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Any:
-    """Return `Samples.history` and `Samples.later` of one row's segments, from its history at the nodes."""
-    return in_segments(knowledge, space, at_places(knowledge, space, records))
 
 
 def in_segments(knowledge: System, space: SpaceScheme, records: Float[Any, "places x"]) -> Any:
@@ -341,11 +347,9 @@ def histories(
     return c0, history
 
 
-def _far_side(
-    knowledge: System, t: Float[Any, " T"], c0: Float[Any, " T"], y: Float[Any, "T N y"],
-    control: Float[Any, "T c"], history: Float[Any, "T N x"],
-) -> Float[Any, "T N y"]:  # fmt: skip
-    """Return y at all nodes, on the far side of the nominal model's discontinuities."""
+def _far_side(knowledge: System, rows: Point) -> Float[Any, "T N y"]:
+    """Return y at all nodes of rows (T, …), on the far side of the nominal model's discontinuities."""
+    y = rows.y
     if not (knowledge.discontinuities.places and knowledge.discontinuities.jump):
         return y
     # the discontinuities at the exact start of each segment
@@ -354,20 +358,18 @@ def _far_side(
     jumping = np.flatnonzero(acting.any(axis=1))
     if not len(jumping):
         return y
-    beyond = y.copy()
-    beyond[:, jumping] = _jump(knowledge, acting[jumping], t, c0, y[:, jumping], control, history[:, jumping])
+    beyond, terms = y.copy(), [each[:, jumping] for each in rows.history[1:]]
+    rows = rows._replace(y=y[:, jumping], history=History(rows.history.c0, *terms))
+    beyond[:, jumping] = _jump(knowledge, acting[jumping], rows)
     return beyond
 
 
 @jax.jit
-def _jump(knowledge, acting, t, c0, y, control, history):  # type: ignore[no-untyped-def]
-    def at_node(acting: Any, t: Any, c0: Any, y: Any, control: Any, record: Any) -> Any:
-        return semi_discrete.jump(knowledge, acting, t, y, control, unpacked_history(knowledge, c0, record))
-
-    at_row = jax.vmap(at_node, in_axes=(0, None, None, 0, None, 0))
-    return jax.vmap(at_row, in_axes=(None, 0, 0, 0, 0, 0))(
-        jnp.asarray(acting), *map(jnp.asarray, (t, c0, y, control, history))
-    )
+def _jump(knowledge: System, acting: Any, rows: Point) -> Any:
+    own = History(None, 0, 0, 0)
+    at_node = functools.partial(semi_discrete.jump, knowledge)
+    at_row = jax.vmap(at_node, in_axes=(0, Point(None, None, 0, None, own)))
+    return jax.vmap(at_row, in_axes=(None, Point(None, 0, 0, 0, own._replace(c0=0))))(acting, rows)
 
 
 def undivided(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
@@ -454,3 +456,88 @@ def _checked_nodes(knowledge: System, nodes: Sequence[int] | None) -> np.ndarray
     ):
         raise DataError(f"nodes is {nodes!r}; allowed is different whole numbers from 1 to {last}")
     return np.array(sorted(chosen))
+
+
+# rates along the rod of a trajectory's rows
+
+
+def slopes_of(
+    settings: Settings, y: np.ndarray, beyond: np.ndarray | None = None, cuts: tuple[float, ...] = ()
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return y_s times the length (T, N, y), from the states alone, and its estimated error (y,).
+
+    Exact if a segment is one Euler step. Otherwise from splines; the error estimate is the difference from
+    splines of the next lower order. For the trapezoidal rule the slopes are the nearest ones to the splines'
+    whose means equal the changes over segments. No spline spans a discontinuity: with `beyond` (y on the far
+    side), slopes at discontinuities are those on the far side.
+    """
+    last = y.shape[1] - 1
+    beyond = y if beyond is None else beyond
+    if settings.space.order == 1:
+        forward = (y[:, 1:] - beyond[:, :-1]) * last
+        return np.concatenate([forward, forward[:, -1:]], axis=1), np.zeros(y.shape[-1])
+    slope, wrong = np.zeros_like(y), np.zeros_like(y)
+    for first, end in pieces(cuts, last + 1):
+        values = y[:, first : end + 1].copy()
+        values[:, 0] = beyond[:, first]
+        rates, doubt = _spline_slopes(values, last)
+        if settings.space.order == 2:
+            rates = _trapezoidal_slopes(values, rates, last)
+        slope[:, first : end + 1], wrong[:, first : end + 1] = rates, doubt
+    # a node alone between discontinuities has no spline: use the slope of the segment, with a large error
+    alone = [first for first, end in pieces(cuts, last + 1) if first == end]
+    for node in alone:
+        other = node if node < last else node - 1
+        slope[:, node] = (y[:, other + 1] - beyond[:, other]) * last
+        wrong[:, node] = slope[:, node]
+    return slope, 0.1 * np.sqrt(np.mean(np.square(wrong), axis=(0, 1)))
+
+
+def pieces(cuts: tuple[float, ...], nodes: int) -> list[tuple[int, int]]:
+    """Return the first and last node of each smooth stretch; neighbours share a node on a discontinuity."""
+    along = np.asarray(cuts) * (nodes - 1)
+    nearest = np.round(along)
+    is_node = np.abs(nearest - along) < ON_NODE * (nodes - 1)
+    on_node = set(nearest[is_node].astype(int).tolist())
+    between = set(np.floor(along[~is_node]).astype(int).tolist())
+    found: list[tuple[int, int]] = []
+    first = 0
+    for node in range(nodes - 1):
+        if node in between:
+            found.append((first, node))
+            first = node + 1
+        elif node + 1 in on_node and node + 1 < nodes - 1:
+            found.append((first, node + 1))
+            first = node + 1
+    return [*found, (first, nodes - 1)]
+
+
+def _trapezoidal_slopes(values: np.ndarray, near: np.ndarray, last: int) -> np.ndarray:
+    """Return the slopes nearest to `near` whose means over segments equal the changes of values."""
+    if values.shape[1] < 3:
+        return near
+    signs = (-1.0) ** np.arange(values.shape[1])[:, None]
+    change = np.diff(values, axis=1) * last
+    steps = np.cumsum(2.0 * change * signs[1:], axis=1)
+    found = signs * np.concatenate([np.zeros_like(steps[:, :1]), steps], axis=1)
+    # the alternating component is free
+    return found + signs * np.mean(signs * (near - found), axis=1, keepdims=True)
+
+
+def _spline_slopes(values: np.ndarray, last: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return spline slopes of one smooth stretch, and their difference from the next lower order."""
+    # imported here: it takes a third of a second
+    from scipy.interpolate import make_interp_spline
+
+    count = values.shape[1]
+    if count == 1:
+        return np.zeros_like(values), np.zeros_like(values)
+    place = np.arange(count) / last
+    orders = min(7, count - 1), min(5, count - 2)
+    high, low = (
+        make_interp_spline(place, values, k=order, axis=1).derivative()(place)
+        if order > 0
+        else np.zeros_like(values)
+        for order in orders
+    )
+    return high, high - low

@@ -188,8 +188,6 @@ def tip(system: System, t: Any, control: Any, y: Float[Any, " y"], history: Hist
     return system.tip(t, control, y, history.y_t(y))
 
 
-def jump(
-    system: System, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], control: Any, history: History
-) -> Float[Any, " y"]:
-    """Return y on the far side of the acting cuts."""
-    return system.discontinuities.jump(acting, t, y, history.y_t(y), control)
+def jump(system: System, acting: Float[Any, " cuts"], point: Point) -> Float[Any, " y"]:
+    """Return y on the far side of the acting cuts; their place is not used."""
+    return system.discontinuities.jump(acting, point.t, point.y, point.y_t, point.control)

@@ -15,26 +15,29 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.engine.loops import STILL, at_all_stages, table_of, tangents_for
+from knode_cosserat.engine.loops import at_all_stages, table_of, tangents_for
 from knode_cosserat.engine.pattern import Pattern, parameters_of
-from knode_cosserat.engine.tangents import TangentCore
+from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory, used_places
+from knode_cosserat.solvers.history import StateHistory, StepCoefficients, used_places
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.steps import StepCoefficients
 
 
-class SystemMoves(NamedTuple):
-    """Directions in which the system changes, and the weight of each in one tangent.
+class Changes(NamedTuple):
+    """Tangents of controls, of the system, and of the residual of the tip's conditions.
 
-    The equations are differentiated once for each direction, whatever the number of tangents.
+    The equations are differentiated once for each direction of the system, whatever the number of tangents.
     """
 
+    controls: Float[Any, "T c m"]
     #: tangent systems, stacked; None: the system does not change
-    directions: Any
-    weights: Float[Any, "directions ..."]
+    directions: Any = None
+    #: weight of each direction in each tangent
+    weights: Float[Any, "directions m"] | None = None
+    #: added to the residual of the tip's conditions
+    tip: Any = 0.0
 
 
 class TangentState(NamedTuple):
@@ -59,17 +62,16 @@ class TangentState(NamedTuple):
 
 
 def tangent_time_loop(
-    settings: Settings, steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any],
-    changes: tuple[SystemMoves, Any], state: TangentState, d_tip: Any = 0.0,
+    steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes,
+    state: TangentState,
 ) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
     """Return the state after the last of some solved rows, and the tangents of all rows and unknowns.
 
-    They are linear in `changes`, the tangents of system and controls, in those of `state`, and in `d_tip`
-    (k, ...), which is added to the residual of the tip's conditions. `solved` are all rows and unknowns, and
+    They are linear in `changes` and in the tangents of `state`. `solved` are all rows and unknowns, and
     with several stages those of every stage, like the result; `at` are system and controls. Tangents are
     columns: weights, controls, state and results have one more axis, the last.
     """
-    (system, controls), ((directions, weights), d_controls) = at, changes
+    (system, controls), settings, (d_controls, directions, weights, d_tip) = at, steps.settings, changes
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
     if directions is None:
         stacked = [np.zeros((0, *leaf.shape)) for leaf in leaves]
@@ -86,26 +88,24 @@ def tangent_time_loop(
         axis=1,
     )
     own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
-    table = table_of(settings, steps, len(controls), float(state.t0))
-    after, found = core.solve(
-        parameters_of(system), table, solved, own, (moved, weights), d_own, state[:4], d_tip
-    )
+    table = table_of(steps, len(controls), float(state.t0))
+    known = SolvedSteps(parameters_of(system), table, own, *solved, state.records, state.rate)
+    after, found = core.solve(known, (moved, weights), d_own, (state.d_records, state.d_rate), d_tip)
     return TangentState._make((*after, state.t0)), found
 
 
 def static_tangents(
-    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: tuple[SystemMoves, Any],
-    d_tip: Any = 0.0,
-) -> tuple[Any, Any, Any]:  # fmt: skip
+    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes
+) -> tuple[Any, Any, Any]:
     """Return the tangents of rows and unknowns of solved equilibria, and of the records of the last.
 
     Arguments as in `tangent_time_loop`. Records are those at the places of the scheme.
     """
-    system, (_, d_controls) = at[0], changes
+    system = at[0]
     none = no_history(system, settings.space)[: used_places(system, settings.space)]
-    d_none = np.zeros((*none.shape, d_controls.shape[-1]))
+    d_none = np.zeros((*none.shape, changes.controls.shape[-1]))
     still = dataclasses.replace(settings, time=None)
     before, d_before = (np.stack([each] * still.memory) for each in (none, d_none))
     state = TangentState(before, none, d_before, d_none, 0.0)
-    after, found = tangent_time_loop(still, STILL, solved, at, changes, state, d_tip)
+    after, found = tangent_time_loop(StepCoefficients.of(still), solved, at, changes, state)
     return *found, after.d_records[0]

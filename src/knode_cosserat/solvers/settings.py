@@ -3,15 +3,44 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterator
 from typing import Any, Literal, Self
 
-from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.solvers.time import BDF2, TWO_STAGES, TimeScheme
 
 Start = Literal["paper", "consistent"]
 Between = Literal["held", "linear"]
+
+
+@dataclasses.dataclass(frozen=True)
+class NewtonOptions:
+    """Tolerances and limits of Newton's method.
+
+    Residuals are measured in the system's natural units (`System.scales`). A step is solved when the largest
+    is below `tolerance`, or below `acceptable` where rounding allows no further progress, and the correction
+    that is left is small.
+    """
+
+    tolerance: float = 1e-10
+    acceptable: float = 1e-8
+    max_linearisations: int = 12
+    #: linearise again when the old linearisation is expected to need more corrections than this
+    patience: int = 6
+    least_damping: float = 1e-3
+
+    def __post_init__(self) -> None:
+        for name, allowed, holds in (
+            ("tolerance", "a number above 0", lambda x: 0.0 < x < math.inf),
+            ("acceptable", "a number from the tolerance on", lambda x: x >= self.tolerance),
+            ("max_linearisations", "a whole number from 1", lambda x: x >= 1 and x == int(x)),
+            ("patience", "a whole number from 1", lambda x: x >= 1 and x == int(x)),
+            ("least_damping", "a number above 0, at most 1", lambda x: 0.0 < x <= 1.0),
+        ):
+            given = getattr(self, name)
+            if not isinstance(given, int | float) or not holds(given):
+                raise ValueError(f"NewtonOptions: {name} is {given!r}; allowed is {allowed}")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -17,25 +17,22 @@ from knode_cosserat._numbers import real_array
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
-from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
-from knode_cosserat.solvers.history import at_stages
+from knode_cosserat.solvers.history import StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.rollout import rollout
+from knode_cosserat.solvers.rollout import Solves, rollout
 from knode_cosserat.solvers.run import (
-    InitialState,
     TimeIntegration,
+    carried_results,
     failure,
     rows_of,
     run_batch,
     run_one,
     warn_of_coarse_grids,
     warn_outside_rod_theory,
-    with_carried_results,
 )
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.steps import StepRows
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -128,12 +125,14 @@ def simulate(
     if initial is not None:
         check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
-    bare, before = without_range(system), without_range(unmarked(initial))
+    bare, before = without_range(system), None
+    if initial is not None:
+        before = without_range(dataclasses.replace(initial, extrapolated=None))
+    task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
     if is_traced((system, controls, initial)):
-        found = _traced(bare, controls, before, settled, settings, dt, Pattern.of(bare))
+        found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
     else:
-        at_start, task, acting = _initial(bare, controls, before, settled, settings, dt, recovery_budget)
-        found = _plain(bare, acting, at_start, task, on_failure, progress)
+        found = _plain(bare, _initial(bare, controls, before, settled, task), on_failure, progress)
     return marked(dataclasses.replace(found, system=system), initial)
 
 
@@ -147,11 +146,6 @@ def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
             f'initial is a {type(initial).__name__}{given}; allowed is a Trajectory, "equilibrium", or None'
         )
     return initial, False
-
-
-def unmarked(initial: Trajectory | None) -> Trajectory | None:
-    """Return a trajectory without marks of extrapolation."""
-    return None if initial is None else dataclasses.replace(initial, extrapolated=None)
 
 
 def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
@@ -318,55 +312,53 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 # runs
 
 
-def _initial(
-    system: Any, controls: Any, initial: Any, settled: bool, settings: Settings, dt: float, budget: Any
-) -> Any:
+def _initial(system: Any, controls: Any, initial: Any, settled: bool, task: TimeIntegration) -> Any:
     """Return the initial state of a run, its time steps, and the controls of their stages."""
+    settings = task.settings
     if initial is None:
         batch = len(controls) if np.ndim(controls) == 3 else None
         held = np.zeros(system.control_layout.size) if settled else None
-        at_start = initial_state(system, settings, batch, budget, held)
+        at_start = initial_state(system, settings, batch, task.recovery_budget, held)
     else:
-        at_start = continued_state(system, initial, settings, dt)
-    known = at_start.state.known(settings)
+        at_start = continued_state(system, initial, settings, task.dt)
+    task = dataclasses.replace(task, known=at_start.state.known(settings))
     acting = at_stages(system, settings, controls, at_start.control[..., None, :], at_start.state.dt is None)
-    return at_start, TimeIntegration(settings, dt, np.shape(controls)[-2], known, budget), acting
+    return at_start, task, acting
 
 
-def _plain(
-    system: Any, controls: Any, at_start: InitialState, task: TimeIntegration, on_failure: str, progress: bool
-) -> Trajectory:
-    """Simulate with recovery."""
-    run = run_batch if np.ndim(controls) == 3 else run_one
-    rows, history, causes = run(task, system, controls, at_start.state.history, at_start.control, progress)
+def _plain(system: System, run: Any, on_failure: str, progress: bool) -> Trajectory:
+    """Simulate with recovery; `run` as from `_initial`."""
+    at_start, task, controls = run
+    solve = run_batch if np.ndim(controls) == 3 else run_one
+    start = at_start.state.history, at_start.control
+    rows, history, causes = solve(task, system, controls, start, "bar" if progress else "signals")
     if on_failure == "raise" and causes:
         times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
         raise failure(rows, causes, times)
-    rows = with_carried_results(rows, at_start.result)
+    rows = rows._replace(result=carried_results(rows.result, at_start.result))
     warn_of_coarse_grids(system, task.settings, rows)
     warn_outside_rod_theory(system, rows)
-    return _trajectory(system, controls, at_start, task, rows, history)
+    return _trajectory(system, run, rows, history)
 
 
-@functools.partial(jax.jit, static_argnames=("settled", "settings", "dt", "pattern"))
-def _traced(system, controls, initial, settled, settings, dt, pattern):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("settled", "spec"))
+def _traced(system, controls, initial, settled, spec):  # type: ignore[no-untyped-def]
     """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    at_start, task, controls = _initial(system, controls, initial, settled, settings, dt, None)
-    run: Any = rollout(task, pattern)
+    at_start, task, acting = run = _initial(system, controls, initial, settled, spec.task)
+    solve: Any = rollout(task, spec.pattern)
     if np.ndim(controls) == 3:
-        run = jax.vmap(run, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
-    rows, history = run(system, controls, at_start.state.history)
-    rows = with_carried_results(rows, at_start.result)
-    return _trajectory(system, controls, at_start, task, rows, history)
+        solve = jax.vmap(solve, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
+    rows, history = solve(system, acting, at_start.state.history)
+    rows = rows._replace(result=carried_results(rows.result, at_start.result))
+    return _trajectory(system, run, rows, history)
 
 
-def _trajectory(
-    system: System, controls: Any, at_start: InitialState, task: TimeIntegration, rows: StepRows, history: Any
-) -> Trajectory:
+def _trajectory(system: System, run: Any, rows: StepRows, history: Any) -> Trajectory:
     """Return the trajectory: the initial row, then the steps."""
+    at_start, task, controls = run
     settings, dt = task.settings, task.dt
     numeric: Any = jnp if is_traced((at_start.record, rows)) else np
     axis, ny = np.ndim(controls) - 2, system.y_layout.size

@@ -18,7 +18,6 @@ import numpy as np
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
-from knode_cosserat.solvers.evaluation import unloaded_shape
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import (
     are_clamped,
@@ -28,9 +27,9 @@ from knode_cosserat.solvers.guess import (
     rotations,
     turn_columns,
 )
+from knode_cosserat.solvers.history import StepRows, unloaded_shape
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.run import Equilibria, Run, run_batch, run_one
-from knode_cosserat.solvers.steps import StepRows
+from knode_cosserat.solvers.run import TimeIntegration, run_batch, run_one
 
 #: largest rotation (rad) of an end from one equilibrium to the next
 LARGEST_TURN = 1.0
@@ -44,7 +43,9 @@ STRAIGHT = 0.999
 COMPRESSED = 1e-9
 
 
-def static_run(task: Equilibria, system: System, controls: Any, y: Any = None, before: Any = None) -> Run:
+def static_run(
+    task: TimeIntegration, system: System, controls: Any, y: Any = None, before: Any = None
+) -> tuple[StepRows, Any, str]:
     """Solve the equilibria under controls (T, c) in turn, with recovery, from y at all points.
 
     `before` is the control of y. Without y, the equilibria start from the unloaded shape. They are then
@@ -54,7 +55,9 @@ def static_run(task: Equilibria, system: System, controls: Any, y: Any = None, b
     return walk.from_rest(controls) if y is None else walk.along(controls, y, before)
 
 
-def static_batch(task: Equilibria, system: System, controls: Any, y: Any = None, before: Any = None) -> Any:
+def static_batch(
+    task: TimeIntegration, system: System, controls: Any, y: Any = None, before: Any = None
+) -> Any:
     """Solve the equilibria of a batch as `run_batch`, but robots that need `static_run` by themselves.
 
     There are controls (B, T, c) for one system, or for as many of them.
@@ -72,7 +75,7 @@ def static_batch(task: Equilibria, system: System, controls: Any, y: Any = None,
     runs: dict[int, tuple[StepRows, Any, str]] = {}
     if len(plain):
         own = jax.tree.map(lambda leaf: leaf[plain], system) if many else system
-        rows, states, causes = run_batch(task, own, controls[plain], guess[plain], last[plain])
+        rows, states, causes = run_batch(task, own, controls[plain], (guess[plain], last[plain]))
         for k, i in enumerate(plain):
             one, state = jax.tree.map(lambda leaf, k=k: leaf[k], (rows, states))
             runs[i] = one, state, causes.get(k, "")
@@ -91,12 +94,12 @@ def static_batch(task: Equilibria, system: System, controls: Any, y: Any = None,
 class _Walk:
     """Equilibria of one robot, each from the one before."""
 
-    def __init__(self, task: Equilibria, system: System):
+    def __init__(self, task: TimeIntegration, system: System):
         self.task, self.system, self.grid = task, system, grid_of(system)
         #: chord of the unloaded shape (m) while unstable shapes are replaced
         self.chord = 0.0
 
-    def from_rest(self, controls: np.ndarray) -> Run:
+    def from_rest(self, controls: np.ndarray) -> tuple[StepRows, Any, str]:
         """Start from the unloaded shape, or from a curve between ends nearer than the length; test all."""
         y, before = unloaded_shape(self.system, self.task.settings.space), np.zeros_like(controls[0])
         if "p" in self.system.y_layout.names and strand_count(self.system) == 1:
@@ -106,18 +109,20 @@ class _Walk:
         if self.chord > STRAIGHT * float(self.system.length) and self._compressed(controls[0]):
             guess = self._best(controls[0], curve_guesses(self.system, controls[0]))[0]
         if guess is None:
-            run = self.along(controls, y, before, fits=False)
-            if np.any(run.rows.result < 0) and np.all(self._angles(controls) <= np.pi):
+            rows, state, cause = self.along(controls, y, before, fits=False)
+            if np.any(rows.result < 0) and np.all(self._angles(controls) <= np.pi):
                 # no turns can be lost: at once, where recovery starts from curves between the ends
-                run = run_one(self.task, self.system, controls, y, before)
+                rows, state, cause = run_one(self.task, self.system, controls, (y, before))
         else:
-            run = self.along(controls, guess, controls[0])
-        for k in np.flatnonzero((run.rows.result >= 0) & (run.rows.result != Result.OTHER_TURNS)):
-            if self.is_unstable(run.rows.records[k], controls[k]):
-                run.rows.result[k] = Result.UNSTABLE
-        return run
+            rows, state, cause = self.along(controls, guess, controls[0])
+        for k in np.flatnonzero((rows.result >= 0) & (rows.result != Result.OTHER_TURNS)):
+            if self.is_unstable(rows.records[k], controls[k]):
+                rows.result[k] = Result.UNSTABLE
+        return rows, state, cause
 
-    def along(self, controls: np.ndarray, y: Any, before: Any, fits: bool = True) -> Run:
+    def along(
+        self, controls: np.ndarray, y: Any, before: Any, fits: bool = True
+    ) -> tuple[StepRows, Any, str]:
         """Solve the equilibria from y, which meets the conditions of both ends if it `fits`."""
         path, wanted = self.path(controls, before, fits)
         # one row for each control of the path that is done
@@ -126,9 +131,9 @@ class _Walk:
         divisions, missing, cause = 0, 0, ""
         while len(rows) < len(path):
             task = dataclasses.replace(self.task, steps=len(path) - len(rows))
-            run = run_one(task, self.system, path[len(rows) :], y, path[len(rows) - 1] if rows else before)
-            y, cause = run.state, run.cause
-            for row in map(StepRows._make, zip(*run.rows, strict=True)):
+            start = y, path[len(rows) - 1] if rows else before
+            new, y, cause = run_one(task, self.system, path[len(rows) :], start)
+            for row in map(StepRows._make, zip(*new, strict=True)):
                 control, solved = path[len(rows)], row.result >= 0
                 turns = self._turns(last, row.records) if solved and last is not None else 0
                 if turns and rows and divisions < DIVISIONS:
@@ -146,7 +151,7 @@ class _Walk:
                     y = self._points(last)
                     break
         leaves = (np.stack(leaf)[wanted] for leaf in zip(*rows, strict=True))
-        return Run(StepRows(*leaves), y, cause)
+        return StepRows(*leaves), y, cause
 
     def path(self, controls: np.ndarray, before: Any, fits: bool = True) -> tuple[np.ndarray, np.ndarray]:
         """Return controls (P, c) from `before` on, with ends turned in parts, and the indices of `controls`.

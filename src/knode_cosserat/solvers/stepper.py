@@ -11,30 +11,16 @@ import numpy as np
 from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.history import SolverState, StateHistory, at_stages
+from knode_cosserat.solvers.history import SolverState, StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, carried_results, rows_of
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, split_initial
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.steps import StepRows
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
-
-
-class _StoppableBudget(Budget):
-    """Time for recovery that is zero from when `stop` returns True."""
-
-    def __init__(self, seconds: float | None, stop: Callable[[], bool] | None):
-        super().__init__(seconds)
-        self._stop = stop
-
-    @property
-    def seconds(self) -> float:
-        return 0.0 if self._stop is not None and self._stop() else super().seconds
 
 
 class Stepper:
@@ -160,7 +146,7 @@ class Stepper:
         done, after, rows = self._task.solve(self.robot, controls, self._past, (i, i + 1))
         row, cause = StepRows(*(leaf[0] for leaf in rows)), ""
         if int(done) == i:
-            budget = _StoppableBudget(self._task.recovery_budget, stop)
+            budget = Budget(self._task.recovery_budget, stop)
             pair = self._control, control
             after, row, cause = self._task.recover(self.robot, self._past, pair, i, budget)
         result = Result(int(row.result))

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 
 

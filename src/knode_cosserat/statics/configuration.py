@@ -9,7 +9,7 @@ import numpy as np
 
 from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
+from knode_cosserat.solvers.settings import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
 from knode_cosserat.statics.response import Pose, first_solved, tip_pose
@@ -157,18 +157,3 @@ def configuration(
         control, np.asarray(found.position), turned, np.asarray(found.jacobian),
         np.asarray(found.compliance), float(system.length),
     )  # fmt: skip
-
-
-def jacobian(robot: System, control: Any, **options: Any) -> np.ndarray:
-    """Return the twist of the tip per unit of each control (6, c); see `Configuration.jacobian`."""
-    return configuration(robot, control, **options).jacobian
-
-
-def compliance(robot: System, control: Any, **options: Any) -> np.ndarray:
-    """Return the twist of the tip per wrench there (6, 6); see `Configuration.compliance`."""
-    return configuration(robot, control, **options).compliance
-
-
-def manipulability(robot: System, control: Any, **options: Any) -> Manipulability:
-    """Return the manipulability of the tip; see `configuration` and `Manipulability`."""
-    return configuration(robot, control, **options).manipulability

@@ -17,15 +17,13 @@ from knode_cosserat.rods.law import InternalState, MaterialLaw
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.boundary import NewtonOptions
-from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import used_places
-from knode_cosserat.solvers.run import Equilibria
-from knode_cosserat.solvers.sensitivity import SystemMoves, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.history import StepCoefficients, used_places
+from knode_cosserat.solvers.replay import still_state
+from knode_cosserat.solvers.run import TimeIntegration
+from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import Lobatto4
-from knode_cosserat.solvers.steps import StepCoefficients
 
 #: nodes of the two grids that are compared: for robots of at most as many nodes as the finer one, or the last
 GRIDS = ((11, 21), (21, 41))
@@ -49,7 +47,7 @@ TOGETHER = 1e-6
 SAME = 0.02
 
 
-class Modes(NamedTuple):
+class _Modes(NamedTuple):
     """Resolved modes of small motions about an equilibrium: the fastest growing first."""
 
     #: λ: growth rate and angular frequency (1/s); of a complex pair, the one with positive frequency
@@ -73,7 +71,7 @@ class Modes(NamedTuple):
         return ~self.growing & (np.maximum(self.values.real, self.coarse) > self.rounding)
 
 
-def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Modes:
+def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Modes:
     """Return the modes of small motions about an equilibrium y (nodes, y).
 
     Raises `ValueError`, with a reason, if they cannot be computed.
@@ -125,7 +123,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> Mode
     order = np.lexsort((np.abs(fine), -growth))
     first = _motion(own, step, moving, factors[order[0]])
     found = [each[order] / time for each in (fine, uncertainty, rounding, other.real)]
-    return Modes(found[0], found[1], found[2], found[3], first)
+    return _Modes(found[0], found[1], found[2], found[3], first)
 
 
 def _history_size(system: System) -> int:
@@ -139,7 +137,7 @@ def _step(
     space, used, ny = Lobatto4(), used_places(system, Lobatto4()), system.y_layout.size
     still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
     y = still_state(system, space, control, guess).y
-    _, y, found = Equilibria(still, 1).solve(system, control[None], y, (0, 1))
+    _, y, found = TimeIntegration(still).solve(system, control[None], y)
     records = still_state(system, space, control, y).records[:used]
     steps = StepCoefficients.of(settings, 1.0 / c0, settings.memory)
     count, past, parts = records.size, np.stack([records] * settings.memory), []
@@ -149,10 +147,9 @@ def _step(
         d_past[0, k : k + m] = np.eye(m)
         d_past = d_past.reshape(settings.memory, *records.shape, m)
         state = TangentState(past, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
-        changes = SystemMoves(None, np.zeros((0, m))), np.zeros((1, system.control_layout.size, m))
-        after, _ = tangent_time_loop(
-            settings, steps, (found.records, found.unknowns), (system, control[None]), changes, state
-        )
+        changes = Changes(np.zeros((1, system.control_layout.size, m)))
+        solved = found.records, found.unknowns
+        after, _ = tangent_time_loop(steps, solved, (system, control[None]), changes, state)
         parts.append(after.d_records[0].reshape(count, -1))
     return found.records[0, :, :ny], float(found.error[0]), np.concatenate(parts, axis=1)
 

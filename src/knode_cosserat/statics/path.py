@@ -20,12 +20,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import System, unknowns_of
-from knode_cosserat.solvers.boundary import NewtonOptions, pivots_of
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
 from knode_cosserat.statics.response import node_values
@@ -129,7 +128,7 @@ class _Walk:
         y = np.asarray(still_state(system, settings.space, ends[0], nodes).y)
         self.y, self.parts, self.errors = [y], [0.0], [0.0]
         zero = np.zeros_like(self.y[0])
-        y, _, _, _, tangent = _corrected(system, settings, ends, (y, 0.0), (zero, 1.0), (y, 0.0))
+        y, _, _, _, tangent = _corrected(system, settings, ends, (y, 0.0), (zero, 1.0))
         self.tangent, self.step, self.complete = tangent, FIRST, False
 
     def advance(self) -> bool:
@@ -142,11 +141,10 @@ class _Walk:
                 # the last point is at the last control
                 share = (1.0 - part) / (guess[1] - part)
                 guess = (y + share * self.step * ty, 1.0)
-                found = _corrected(
-                    self.system, self.settings, self.ends, guess, (np.zeros_like(y), 1.0), guess
-                )
+                tangent = np.zeros_like(y), 1.0
             else:
-                found = _corrected(self.system, self.settings, self.ends, guess, self.tangent, guess)
+                tangent = self.tangent
+            found = _corrected(self.system, self.settings, self.ends, guess, tangent)
             y_new, part_new, error, count, (way, rate) = found
             if error <= self.settings.newton.acceptable:
                 scale = np.asarray(self.system.scales().y)
@@ -222,7 +220,8 @@ def _directions(
     scale, rows = np.asarray(scales.y), np.asarray(scales.tip)
     error = float(np.maximum(np.max(np.abs(defects) / scale), np.max(np.abs(tip) / rows)))
     try:
-        rod = _Elimination(*pieces, *at_ends, pivots=pivots_of(system))
+        pivots = np.asarray(system.y_layout.indices(system.base_unknowns))
+        rod = _Elimination(*pieces, *at_ends, pivots=pivots)
         at_tip, columns = rod.M @ rod.X[-1], scale[rod.pivots]
         # of a neutral family, the smallest solutions
         inverse = np.linalg.pinv(at_tip * columns / rows[:, None], NEUTRAL)
@@ -239,7 +238,7 @@ def _directions(
 
 def _corrected(
     system: System, settings: Settings, ends: tuple[Any, Any], start: tuple[np.ndarray, float],
-    tangent: tuple[np.ndarray, float], plane: tuple[np.ndarray, float],
+    tangent: tuple[np.ndarray, float],
 ) -> tuple[np.ndarray, float, float, int, tuple[np.ndarray, float]]:  # fmt: skip
     """Return y, part, error, corrections and the new tangent, by Newton's method across the tangent."""
     scale, (ty, tp), (y, part) = np.asarray(system.scales().y), tangent, start
@@ -249,7 +248,7 @@ def _corrected(
 
     for count in range(MOST_CORRECTIONS + 1):
         error, remove, follow = _directions(system, settings, ends, y, part)
-        across = along(y - plane[0]) + tp * (part - plane[1])
+        across = along(y - start[0]) + tp * (part - start[1])
         solved = error <= settings.newton.tolerance and abs(across) <= 1e-9
         if solved or count == MOST_CORRECTIONS or not error < LARGEST_ERROR:
             break

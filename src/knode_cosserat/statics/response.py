@@ -16,11 +16,11 @@ import numpy as np
 
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers.evaluation import still_state, unloaded_shape
-from knode_cosserat.solvers.history import rest_record
+from knode_cosserat.solvers.history import rest_record, unloaded_shape
 from knode_cosserat.solvers.problem import row_of
-from knode_cosserat.solvers.run import Equilibria
-from knode_cosserat.solvers.sensitivity import SystemMoves, static_tangents
+from knode_cosserat.solvers.replay import still_state
+from knode_cosserat.solvers.run import TimeIntegration
+from knode_cosserat.solvers.sensitivity import Changes, static_tangents
 from knode_cosserat.solvers.settings import Settings
 
 #: function from a system and its last node's y to position (d,) in m and quaternion (scalar first) or None
@@ -60,11 +60,6 @@ def node_values(system: System, settings: Settings, control: Any, y: Any) -> tup
     return record[:, :ny], record[:, ny : ny + system.z_layout.size]
 
 
-def wrench_fields(system: System) -> tuple[str, ...]:
-    """Return the tip's conditions to which a force and a moment at the tip are added."""
-    return tuple(name for name in ("n", "m") if name in Ends.of(system).layout.names)
-
-
 def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
     """Return the pose's twist for a change dy of the last node's y."""
     (_, h), (dp, dh) = jax.jvp(lambda y: pose(system, y), (y,), (dy,))
@@ -78,14 +73,16 @@ def twist(system: System, pose: Pose, y: Any, dy: Any) -> Any:
 def respond(system: System, settings: Settings, pose: Pose, control: Any, guess: Any) -> Response:
     """Return the equilibrium found from a guess of y at all points, its pose, and the pose's derivatives."""
     control, c, ny = np.asarray(control, dtype=float), system.control_layout.size, system.y_layout.size
-    _, y, rows = Equilibria(settings, 1).solve(system, control[None], np.asarray(guess), (0, 1))
-    names = wrench_fields(system)
-    wrench = np.asarray(Ends.of(system).layout.indices(names) if names else [], dtype=int)
+    _, y, rows = TimeIntegration(settings).solve(system, control[None], np.asarray(guess))
+    # a force and a moment at the tip are added to its conditions on n and m
+    layout = Ends.of(system).layout
+    names = tuple(name for name in ("n", "m") if name in layout.names)
+    wrench = np.asarray(layout.indices(names) if names else [], dtype=int)
     d_controls, d_tip = np.eye(c, c + len(wrench))[None], np.zeros((unknown_count(system), c + len(wrench)))
     d_tip[wrench, c + np.arange(len(wrench))] = 1.0
-    changes = SystemMoves(None, np.zeros((0, d_tip.shape[1]))), d_controls
     solved = rows.records, rows.unknowns
-    d_rows, _, _ = static_tangents(settings, solved, (system, control[None]), changes, d_tip)
+    changes = Changes(d_controls, tip=d_tip)
+    d_rows, _, _ = static_tangents(settings, solved, (system, control[None]), changes)
     position, quaternion, twists = _pose_of(system, pose, y[-1], d_rows[0, -1, :ny])
     return Response(y, rows.error[0], position, quaternion, twists[:, :c], twists[:, c:])
 
@@ -104,7 +101,7 @@ def equilibrium_poses(system: System, settings: Settings, pose: Pose, controls: 
     """
     y, size, ny = unloaded_shape(system, settings.space), len(controls), system.y_layout.size
     y = np.broadcast_to(y, (size, *y.shape))
-    rows = Equilibria(settings, 1).solve_many(system, controls[:, None], y)[2]
+    rows = TimeIntegration(settings).solve(system, controls[:, None], y)[2]
     records = rows.records[:, 0]
     strain = (records - rest_record(system))[..., ny : ny + system.z_layout.size]
     lengths = [np.max(np.linalg.norm(part, axis=-1), axis=-1) for part in system.z_layout.split(strain)]

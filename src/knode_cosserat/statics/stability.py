@@ -26,8 +26,8 @@ from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4, SpaceScheme

@@ -24,9 +24,9 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
-from knode_cosserat.solvers.evaluation import still_state
 from knode_cosserat.solvers.grid import grid_of, inside
 from knode_cosserat.solvers.problem import StepProblem, no_history
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.space import Lobatto4
 
 #: fields of y that a strand with pose and stress needs
@@ -45,7 +45,7 @@ MET = 1e-11
 NEUTRAL = 1e-3
 
 
-class Ends(NamedTuple):
+class _Ends(NamedTuple):
     """Linearised conditions at the two ends, in equilibrium."""
 
     #: y at the base and at the tip
@@ -68,7 +68,7 @@ class Pieces(NamedTuple):
     part: np.ndarray
     #: rates (per length of the rod) of the other fields of y under poses and stresses, natural units
     moved: Float[np.ndarray, " y"]
-    ends: Ends
+    ends: _Ends
 
 
 # transformations between y and poses and stresses
@@ -136,7 +136,7 @@ def _ends(system: System, base: Any, tip: Any, control: Any, history: Any) -> tu
 
 @jax.jit
 def _along(
-    system: System, y: Any, control: Any, low: Any, high: Any, acting: Any
+    system: System, y: Any, control: Any, bounds: tuple[Any, Any], acting: Any
 ) -> tuple[Any, Any, Any, Any]:
     """Return for all pieces: y at the end, the jump at the beginning, H at Gauss's places, other rates."""
     strand = strand_of(system)
@@ -170,7 +170,7 @@ def _along(
         return y, jump, H[:-1], moved[:-1]
 
     of_strands = jax.vmap(piece, in_axes=(0, None, None, None))
-    return jax.vmap(of_strands)(y, low, high, acting)
+    return jax.vmap(of_strands)(y, *bounds, acting)
 
 
 def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator[Pieces]:
@@ -184,9 +184,9 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
     bounds = (points.segment[:, None] + points.bounds) * length / (system.nodes - 1)
     found = np.asarray(still_state(system, Lobatto4(), control, np.asarray(y)).y)
 
-    def ends(y: np.ndarray) -> Ends:
+    def ends(y: np.ndarray) -> _Ends:
         asked = _ends(system, jnp.asarray(y[0]), jnp.asarray(y[-1]), control, history)
-        return Ends((y[0], y[-1]), *map(np.asarray, asked))
+        return _Ends((y[0], y[-1]), *map(np.asarray, asked))
 
     def integrated(y: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return F of the pieces, the gaps of y at the ends of the divided intervals, and other rates."""
@@ -195,7 +195,7 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
         for k in range(count):
             low = bounds[:, 0] + k * ds
             acting = points.acting if k == 0 else np.zeros_like(points.acting)
-            at, jump, H, also = _along(system, at, control, low, low + ds, acting)
+            at, jump, H, also = _along(system, at, control, (low, low + ds), acting)
             F.append(_integrated(np.asarray(H), ds) @ np.asarray(jump))
             moved.append(np.asarray(also).max(axis=(0, 1, 2)))
         return np.stack(F, axis=1), np.asarray(at).reshape(y[1:].shape) - y[1:], np.max(moved, axis=0)
@@ -225,7 +225,7 @@ def _at_points(system: System, y: np.ndarray, way: Any) -> np.ndarray:
     return np.asarray(jax.vmap(jax.vmap(lambda each: way(strand_of(system), each)))(own))
 
 
-def _correction(system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, ends: Ends) -> np.ndarray:
+def _correction(system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, ends: _Ends) -> np.ndarray:
     """Return the change of y at all points that closes the gaps; of several, the smallest."""
     strands, to, back = strand_count(system), _at_points(system, y, narrow), _at_points(system, y, wide)
     gaps = to[1:] @ in_strands(system, off)[..., None]

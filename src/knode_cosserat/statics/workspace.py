@@ -17,11 +17,10 @@ from knode_cosserat._reprs import quantity, robot_text, wrapped
 from knode_cosserat.io import container
 from knode_cosserat.io.container import Variable
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.boundary import NewtonOptions
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import (
     checked_limits,

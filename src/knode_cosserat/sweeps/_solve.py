@@ -123,7 +123,7 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
     start, marks, reasons = _equilibria(plan, system, values)
     task = TimeIntegration(settings, plan.sweep.dt, steps)
     systems, start = _started(system, values, start, settings, CHUNK)
-    done, _, rows = task.solve_many(systems, cases.controls[index], start.history)
+    done, _, rows = task.solve(systems, cases.controls[index], start.history)
     stored = _stored(systems, start.record, rows, plan.sweep.store)
     columns: dict[str, Any] = jax.tree.map(lambda leaf: np.array(leaf[:count]), stored)
     for k in range(count):
@@ -191,7 +191,7 @@ def _failed(
     if plan.sweep.recovery:
         at = initial_state(system, task.settings, None, np.inf)
         task = dataclasses.replace(task, recovery_budget=np.inf)
-        rows, _, cause = run_one(task, system, controls, at.state.history, at.control, response=np.inf)
+        rows, _, cause = run_one(task, system, controls, (at.state.history, at.control), watch=None)
         record, rows = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (at.record, rows))
         for name, column in _stored(system, record, rows, plan.sweep.store).items():
             columns[name][k] = np.asarray(column[0])
