@@ -19,7 +19,6 @@ LAYERS = (
     ("rods", "robots"),
     ("controls",),
     ("solvers", "engine", "trajectory"),
-    ("named_controls",),
     ("metrics", "evaluation.metrics", "evaluation.state_errors"),
     ("recordings", "statics", "estimation"),
     ("control",),

@@ -78,7 +78,7 @@ def reach(
     cannot be reached, it returns the nearest pose and says so.
     """
     import knode_cosserat as kc
-    from knode_cosserat import named_controls
+    from knode_cosserat.controls import labels, units
 
     system = load_system(robot, changes, nodes)
     size = system.control_size
@@ -101,8 +101,8 @@ def reach(
         "result": found.result.name.lower(),
         "converged": bool(found.converged),
         "control": found.control.tolist(),
-        "names": named_controls.labels(system.control_layout),
-        "units": named_controls.units(system.control_layout),
+        "names": labels(system.control_layout),
+        "units": units(system.control_layout),
         "position": _plain(found.position),
         "quaternion": _plain(found.quaternion),
         "position_error": float(found.position_error) if np.isfinite(found.position_error) else None,

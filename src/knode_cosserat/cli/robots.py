@@ -119,7 +119,7 @@ def simulate(
     if dt is None:
         tensions_only = system.control_layout.names == ("tension",)
         dt = kc.controls.load(controls).dt if os.path.isfile(controls) and tensions_only else 0.05
-    sequence = kc.named_controls.parse(system, controls, steps, dt)
+    sequence = kc.controls.parse(controls, steps, dt, system)
     began = perf_counter()
     with coarse_grid_in_output():
         trajectory = kc.simulate(
@@ -289,10 +289,10 @@ def _stability(rest: Any, space: str) -> tuple[dict[str, Any], list[str]]:
 
 def _control(system: System, tension: str | None, control: str | None) -> Any:
     """Return the constant control: from tensions, from numbers in order, or by name."""
-    from knode_cosserat import named_controls
+    from knode_cosserat.controls import labels, parse_signals
 
     layout = system.control_layout
-    names = named_controls.labels(layout)
+    names = labels(layout)
     tensions = [field.size for field in layout.fields if field.name == "tension"]
     if tension is None and control is None and names:
         raise ValueError(
@@ -309,7 +309,7 @@ def _control(system: System, tension: str | None, control: str | None) -> Any:
         values = zip(names[layout.slice("tension")], _tensions(tension, tensions[0]), strict=True)
         # first, so that a tension that --control repeats is refused
         words = [f"{name}=constant:{value!r}" for name, value in values] + words
-    return named_controls.parse_signals(layout, words, {"middle": np.ones(1), "end": np.ones(1)})[0]
+    return parse_signals(layout, words, {"middle": np.ones(1), "end": np.ones(1)})[0]
 
 
 def _control_words(control: str, names: list[str]) -> list[str]:

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from knode_cosserat.controls import labels
 from knode_cosserat.evaluation.style import DASHES, PALETTE
-from knode_cosserat.named_controls import labels
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
