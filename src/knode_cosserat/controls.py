@@ -561,7 +561,7 @@ def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
         try:
             arguments[key] = kinds[key](word)
         except ValueError:
-            allowed = {float: "a number", int: "a whole number"}.get(kinds[key], "tendons like 1+4")
+            allowed = {int: "a whole number", _tendons: "tendons like 1+4"}.get(kinds[key], "a number")
             raise ControlsError(f"{key} is {word!r}; allowed is {allowed}") from None
     return arguments
 
