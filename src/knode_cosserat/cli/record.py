@@ -4,14 +4,49 @@ from __future__ import annotations
 
 from pathlib import Path
 from time import perf_counter
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from knode_cosserat.cli.arguments import Json, NetCDF, require_trajectory_name, require_writable
+from knode_cosserat.cli.arguments import (
+    Json,
+    NetCDF,
+    argument,
+    option,
+    require_trajectory_name,
+    require_writable,
+)
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.recordings.formats import written_suffixes
+
+
+class _Motion(NamedTuple):
+    """Motion of a virtual robot, and its noise."""
+
+    signal: Annotated[
+        str,
+        argument(
+            "CONTROLS",
+            "Commanded tensions: sine:PERIOD (s), step:HEIGHT (N, after 2 s) or random:SEED, around the "
+            "paper's rest tension; or any controls of `simulate`, after 1 s of rest.",
+        ),
+    ]
+    seconds: Annotated[float, option("S", "Duration (s).")] = 16.0
+    seed: Annotated[int, option("N", "Random seed of sensor noise and body mounting.", min=0)] = 0
+    swap: Annotated[
+        float | None, option("S", "Time when a tracked body swaps axes (s).", show_default="never")
+    ] = None
+
+
+class _Files(NamedTuple):
+    """Files of a recording and of the truth."""
+
+    out: Annotated[Path, option("FILE", f"Write this recording: {', '.join(written_suffixes())}.")]
+    truth: Annotated[
+        Path | None, option("FILE", "Write the robot with --imperfections to this YAML file.")
+    ] = None
+    states: Annotated[Path | None, NetCDF] = None
 
 
 @app.command(
@@ -23,46 +58,19 @@ from knode_cosserat.recordings.formats import written_suffixes
     )
 )
 def record_virtual(
-    signal: Annotated[
-        str,
-        typer.Argument(
-            metavar="CONTROLS",
-            help="Commanded tensions: sine:PERIOD (s), step:HEIGHT (N, after 2 s) or random:SEED, around the "
-            "paper's rest tension; or any controls of `simulate`, after 1 s of rest.",
-        ),
-    ],
-    out: Annotated[
-        Path,
-        typer.Option(
-            metavar="FILE",
-            help=f"Write this recording: {', '.join(written_suffixes())}.",
-        ),
-    ],
-    seconds: Annotated[float, typer.Option(metavar="S", help="Duration (s).")] = 16.0,
-    seed: Annotated[
-        int,
-        typer.Option(metavar="N", min=0, help="Random seed of sensor noise and body mounting."),
-    ] = 0,
-    swap: Annotated[
-        float | None,
-        typer.Option(metavar="S", help="Time when a tracked body swaps axes (s).", show_default="never"),
-    ] = None,
+    motion: _Motion,
+    files: _Files,
     imperfections: Annotated[
         int | None,
-        typer.Option(
-            metavar="SEED",
+        option(
+            "SEED",
+            "Record the paper's robot with random imperfections (friction, sleeve, load-cell errors, …) "
+            "instead; equal seeds give equal robots.",
             min=0,
             max=2**32 - 1,
-            help="Record the paper's robot with random imperfections (friction, sleeve, load-cell errors, …) "
-            "instead; equal seeds give equal robots.",
             show_default="the virtual robot",
         ),
     ] = None,
-    truth: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Write the robot with --imperfections to this YAML file."),
-    ] = None,
-    states: Annotated[Path | None, NetCDF] = None,
     as_json: Json = False,
 ) -> None:
     """Record a simulated robot as a bag or table.
@@ -71,6 +79,8 @@ def record_virtual(
     have: tendon friction, ribs with masses, a sleeve, motor lag and sensor noise. --states writes the true
     states. With --imperfections the robot is the paper's with random effects that `identify` can find.
     """
+    signal, seconds, seed, swap = motion
+    out, truth, states = files
     require_trajectory_name(states)
     for path in (out, states, truth):
         require_writable(path)
@@ -78,14 +88,17 @@ def record_virtual(
         raise typer.BadParameter("--truth needs --imperfections SEED: it writes that robot")
     import knode_cosserat as kc
     from knode_cosserat.identification.imperfections import drawn_robot
-    from knode_cosserat.recordings.virtual import Sensors
-    from knode_cosserat.recordings.virtual import record_virtual as record
+    from knode_cosserat.recordings import virtual
 
-    _require_motion(signal, seconds)
+    begin = virtual.BEFORE_STEP if signal.startswith("step") else virtual.RESTING
+    if 0.0 < seconds <= begin and not signal.startswith("constant"):
+        raise ValueError(
+            f"--seconds must be above {begin:g}, when the signal {signal} begins (got {seconds:g})"
+        )
     began = perf_counter()
     drawn = None if imperfections is None else drawn_robot(imperfections)
-    motion = record(
-        out, signal, seconds, seed, Sensors(swap=swap), robot=None if drawn is None else drawn.robot
+    true = virtual.record_virtual(
+        out, signal, seconds, seed, virtual.Sensors(swap=swap), robot=None if drawn is None else drawn.robot
     )
     elapsed = perf_counter() - began
     facts: dict[str, Any] = {
@@ -94,7 +107,7 @@ def record_virtual(
     lines = [f"recorded {seconds:g} s of {signal} (simulated) in {elapsed:.1f} s"]
     written = {"out": out} | ({"states": states} if states or as_json else {})
     if states:
-        motion.save(states)
+        true.save(states)
     if drawn is not None:
         facts["imperfections"] = dict(drawn.values)
         lines.append(f"effects of the robot: {', '.join(drawn.effects)}")
@@ -102,14 +115,3 @@ def record_virtual(
         kc.save_robot(drawn.robot, truth)
         written["truth"] = truth
     write_output(as_json, facts | {"computing_time": round(elapsed, 2)}, lines, **written)
-
-
-def _require_motion(signal: str, seconds: float) -> None:
-    """Raise `ValueError` if the recording ends before the signal begins."""
-    from knode_cosserat.recordings.virtual import BEFORE_STEP, RESTING
-
-    begin = BEFORE_STEP if signal.startswith("step") else RESTING
-    if 0.0 < seconds <= begin and not signal.startswith("constant"):
-        raise ValueError(
-            f"--seconds must be above {begin:g}, when the signal {signal} begins (got {seconds:g})"
-        )
