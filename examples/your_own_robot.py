@@ -12,7 +12,8 @@ from pathlib import Path
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation import figures, recording_figures
+from knode_cosserat import figures
+from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.evaluation.metrics import rms_distance
 from knode_cosserat.recordings.virtual import lagged
 from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation import figures
+from knode_cosserat import figures
 from knode_cosserat.evaluation.metrics import dtw_distance
 from knode_cosserat.evaluation.style import PALETTE
 

@@ -374,7 +374,7 @@ def shows_progress(progress: bool | None) -> bool:
 
 def figures() -> Any:
     """Return the module of figures. Raises `ImportError` without matplotlib."""
-    from knode_cosserat.evaluation import figures
+    from knode_cosserat import figures
 
     figures.require_matplotlib()
     return figures

@@ -219,7 +219,7 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
             )
         log.estimated.save(output.states)
     if output.figure is not None:
-        from knode_cosserat.evaluation.control_figures import closed_loop
+        from knode_cosserat.figures import closed_loop
 
         closed_loop(log).savefig(output.figure)
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}

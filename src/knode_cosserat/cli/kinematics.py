@@ -195,8 +195,7 @@ def workspace(
     require_writable(out, picture)
     if out.suffix not in FORMATS:
         raise ValueError(f"{out}: the name must end in {', '.join(FORMATS)}")
-    if picture:
-        figures()
+    drawing = figures() if picture else None
     import knode_cosserat as kc
 
     system = model.load()
@@ -206,10 +205,8 @@ def workspace(
     )
     seconds = perf_counter() - began
     found.save(out)
-    if picture:
-        from knode_cosserat.evaluation.workspace_figures import workspace_seen
-
-        workspace_seen(found).savefig(picture)
+    if drawing:
+        drawing.workspace(found).savefig(picture)
     inside = found.position[found.valid]
     box = [inside.min(axis=0).tolist(), inside.max(axis=0).tolist()] if len(inside) else None
     facts = {

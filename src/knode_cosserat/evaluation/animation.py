@@ -17,9 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from knode_cosserat._files.writing import replacing
-from knode_cosserat.evaluation.drawing import legend_above
+from knode_cosserat.evaluation.drawing import (
+    View,
+    by_label,
+    checked_view,
+    curves_of,
+    flat_height,
+    legend_above,
+    valid_rows,
+)
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
-from knode_cosserat.evaluation.views import View, by_label, checked_view, curves_of, flat_height, valid_rows
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
