@@ -3,8 +3,10 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings import CommandSource, MarkerSource, RecordingConfig, TensionSource
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings import RecordingConfig
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
+from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.write import MocapPoses, write_recording
 
 LENGTH = 0.635
 PAPER = RecordingConfig.paper_robot()
@@ -48,11 +50,11 @@ def made(seconds=3.0, noise=1e-4, seed=0, config=PAPER):
     sent = np.round(np.arange(0.0, seconds, 0.05), 6)
     phase = 2 * np.pi * (sent[:, None] - np.arange(config.tendons) / config.tendons)
     grams = np.round(500.0 + np.where(sent[:, None] < 1.0, 0.0, 200.0 * np.cos(phase)))
-    command = Pulls(sent, grams * 9.81e-3)
+    command = Tensions(sent, grams * 9.81e-3)
     seen = np.round(np.arange(0.0, seconds, 0.02), 6)
     return (
         poses,
-        Pulls(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.tendons))),
+        Tensions(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.tendons))),
         command,
     )
 

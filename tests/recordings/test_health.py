@@ -12,7 +12,8 @@ from knode_cosserat.cli import app
 from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.recordings.frame import leans_of, rod_lengths
 from knode_cosserat.recordings.recording import Body
-from knode_cosserat.recordings.write import MocapPoses, Pulls
+from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.write import MocapPoses
 from tests.recordings.made import LAG, PAPER, changed, made, write
 
 NOISE = 2e-4
@@ -84,7 +85,9 @@ def test_a_pure_delay_is_found_and_said_if_it_is_not_the_stated_one(tmp_path):
     poses, _, command = made(seconds=8.0)
     time = np.round(np.arange(0.0, 8.0, 0.01), 6)
     held = command.tension[np.maximum(np.searchsorted(command.time, time - 0.15 + 1e-9, side="right") - 1, 0)]
-    report = kc.load_recording(write(tmp_path / "it.bag", (poses, Pulls(time, held + 0.1), command))).health()
+    report = kc.load_recording(
+        write(tmp_path / "it.bag", (poses, Tensions(time, held + 0.1), command))
+    ).health()
     assert report.latency.shift == pytest.approx(0.15, abs=0.011)
     assert report.latency.delay == pytest.approx(0.15, abs=0.006)
     assert report.latency.lag < 0.006

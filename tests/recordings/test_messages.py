@@ -5,16 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from knode_cosserat.recordings import (
-    CommandSource,
-    MarkerSource,
-    MotorSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    load_recording,
-    proposed_config,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording, proposed_config
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, MotorSource, TensionSource
 from knode_cosserat.recordings.messages import typestore
 from tests.commands import succeeded
 from tests.recordings.formats.exported import bent, times
@@ -502,14 +494,15 @@ def test_compressed_messages_stay_within_the_limits(tmp_path, monkeypatch):
 
 
 def test_parts_of_messages_are_not_written(tmp_path):
-    from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+    from knode_cosserat.recordings.streams import Tensions
+    from knode_cosserat.recordings.write import MocapPoses, write_recording
 
     config = of("/poses[1]")
     poses = {"tip": MocapPoses(TIME, POSITION, QUATERNION)}
     with pytest.raises(
         RecordingError, match=r"topic /poses\[1\] cannot be written; allowed is one topic for each"
     ):
-        write_recording(tmp_path / "it.bag", config, poses, Pulls(TIME, PULLS))
+        write_recording(tmp_path / "it.bag", config, poses, Tensions(TIME, PULLS))
     assert not list(tmp_path.iterdir())
 
 

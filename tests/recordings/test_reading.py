@@ -9,16 +9,11 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import (
-    CommandSource,
-    MarkerSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    messages,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, messages
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
 from knode_cosserat.recordings.formats import written_suffixes
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.write import MocapPoses, write_recording
 from tests.recordings.made import LAG, PAPER, SMALL, changed, moved, write
 
 
@@ -52,7 +47,7 @@ def test_the_papers_robot_comes_back(tmp_path, exact, ending):
 def test_another_robot_of_three_tendons_and_one_body_that_has_no_orientation_comes_back(tmp_path, ending):
     time = np.round(np.arange(0.0, 2.0, 0.02), 6)
     position, _ = moved(time, 1.0)
-    pulls = Pulls(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
+    pulls = Tensions(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
     write_recording(tmp_path / f"it{ending}", SMALL, {"tip": MocapPoses(time, position)}, pulls, pulls)
     recording = kc.load_recording(tmp_path / f"it{ending}", SMALL)
     (tip,) = recording.bodies
@@ -96,7 +91,7 @@ def test_arrays_have_no_stamps_and_are_taken_when_they_were_recorded(tmp_path):
     config = dataclasses.replace(SMALL, tension=TensionSource("/pull", (2, 1)), command=None)
     time = np.round(np.arange(0.0, 1.0, 0.01), 6)
     tip = {"tip": MocapPoses(time, moved(time, 1.0)[0])}
-    pulls = Pulls(time, np.stack([5.0 + time, 6.0 - time], axis=1))
+    pulls = Tensions(time, np.stack([5.0 + time, 6.0 - time], axis=1))
     write_recording(tmp_path / "it.mcap", config, tip, pulls)
     recording = kc.load_recording(tmp_path / "it.mcap", config)
     np.testing.assert_allclose(recording.tension.tension, pulls.tension, rtol=0, atol=1e-12)
@@ -352,7 +347,7 @@ def test_short_gaps_are_bridged_and_long_ones_split(tmp_path, exact):
 def test_a_gap_in_the_measured_tensions_splits_too(tmp_path, exact):
     poses, tension, command = exact
     known = (tension.time < 1.5) | (tension.time > 2.0)
-    streams = poses, Pulls(tension.time[known], tension.tension[known]), command
+    streams = poses, Tensions(tension.time[known], tension.tension[known]), command
     measured = kc.load_recording(write(tmp_path / "it.bag", streams)).sampled(0.05)
     assert [round(part.time[0], 2) for part in measured.parts()] == [0.0, 2.05]
 

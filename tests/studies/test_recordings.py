@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 import knode_cosserat as kc
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.write import MocapPoses, write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendon_friction import TendonFriction
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -48,7 +49,7 @@ def recorded(path, tension, seed):
         )
     still = np.tile([0.0, 0.0, PAPER.base.height], (len(time), 1))
     poses["base"] = MocapPoses(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
-    pulled = Pulls(time[::2][: len(control[::2])], control[::2])
+    pulled = Tensions(time[::2][: len(control[::2])], control[::2])
     write_recording(path, PAPER, poses, pulled, pulled)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -22,8 +21,8 @@ from knode_cosserat.recordings.config import (
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
-from knode_cosserat.recordings.recording import Body, Tensions, bridge
-from knode_cosserat.recordings.streams import SLOW, period
+from knode_cosserat.recordings.recording import Body, bridge
+from knode_cosserat.recordings.streams import SLOW, Tensions, period
 
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
@@ -128,9 +127,9 @@ def cleaned_body(
         quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
         quaternion, swaps, unclear = swaps_undone(rows.time, quaternion)
         rows.values = np.concatenate([rows.values[:, :3], quaternion], axis=1)
-        for swap in swaps:
-            when = float(rows.time[swap.row])
-            turned = f"by {swap.angle:.0f} degrees about {swap.axis}"
+        for row, angle, axis in swaps:
+            when = float(rows.time[row])
+            turned = f"by {angle:.0f} degrees about {axis}"
             what = f"its axes were swapped at {when:.3f} s, {turned}; undone"
             rows.findings.append(Finding("warning", topic, what, (when,)))
     wrong = np.zeros(len(rows.time), dtype=bool)
@@ -179,7 +178,7 @@ def cleaned_tensions(
             topic = source.topic
             rows = _cleaned_rows(source, seconds[topic], values[topic], kind, path)
             if len(rows.time):
-                tensions = Tensions(topic, rows.time, rows.values)
+                tensions = Tensions(rows.time, rows.values, topic)
                 if kind == "measured":
                     rows.add_pauses(config.longest_gap)
             elif config.tensions == kind:
@@ -273,20 +272,6 @@ def outliers(
 # swapped axes
 
 
-class Swap(NamedTuple):
-    """Swap of a body's axes at a row; it also applies to all later rows.
-
-    Attributes:
-        row: index of the row.
-        angle: angle of the swap (degrees).
-        axis: its rotation axis in the body's axes.
-    """
-
-    row: int
-    angle: float
-    axis: tuple[int, ...]
-
-
 #: largest rotation by motion between two frames (rad): a larger one cannot be distinguished from a swap
 _LARGEST_TURN = np.radians(45.0)
 #: smallest tolerance of a swap about a multiple of 90 degrees, for motion between the two frames (rad)
@@ -297,8 +282,10 @@ _CUBE = Rotation.create_group("O")
 
 def swaps_undone(
     time: Float[np.ndarray, " n"], quaternion: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 4"], list[Swap], list[int]]:
+) -> tuple[Float[np.ndarray, "n 4"], list[tuple[int, float, tuple[int, ...]]], list[int]]:
     """Return orientations without swapped axes, the swaps, and the rows of other large rotations.
+
+    A swap is its row (it applies to all later rows, too), its angle (degrees), and its axis among the body's.
 
     Between two frames a swap rotates a body by one of the 23 rotations of a cube, plus its motion. The
     neighbouring rotations bound that motion. A large rotation is left unchanged if it is not a multiple of
@@ -314,7 +301,7 @@ def swaps_undone(
     rate = np.where(angle > _LARGEST_TURN, 0.0, angle / np.diff(time))
     undo = Rotation.identity()
     pieces: list[Rotation] = []
-    swaps: list[Swap] = []
+    swaps: list[tuple[int, float, tuple[int, ...]]] = []
     unclear: list[int] = []
     begin = 0
     for step in np.flatnonzero(angle > _LARGEST_TURN):
@@ -331,7 +318,7 @@ def swaps_undone(
         # rotations are measured in the swapped axes: undo the swaps in reverse order
         undo = _CUBE[nearest].inv() * undo
         axis = np.sign(np.round(_CUBE[nearest].as_rotvec(), 6)).astype(int).tolist()
-        swaps.append(Swap(begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))
+        swaps.append((begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))
     if not swaps:
         return quaternion, [], unclear
     pieces.append(rotation[begin:] * undo)

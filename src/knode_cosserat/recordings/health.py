@@ -15,7 +15,8 @@ from knode_cosserat.recordings.frame import NORMAL, rest_mask, rest_positions, r
 from knode_cosserat.recordings.streams import period
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.recording import Body, Recording, Tensions
+    from knode_cosserat.recordings.recording import Body, Recording
+    from knode_cosserat.recordings.streams import Tensions
 
 #: smallest standard deviation of commands for an estimate of their latency (N)
 QUIET = 0.05
@@ -79,7 +80,7 @@ class Latency:
 
 
 @dataclasses.dataclass(frozen=True)
-class TensionError:
+class _TensionError:
     """Measured minus commanded tension of one tendon (N), with commands delayed by their latency."""
 
     tendon: int
@@ -111,7 +112,7 @@ class Health:
     rod_length: tuple[float, ...]
     streams: tuple[StreamHealth, ...]
     latency: Latency | None
-    tension_errors: tuple[TensionError, ...]
+    tension_errors: tuple[_TensionError, ...]
     findings: tuple[Finding, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -246,7 +247,7 @@ def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, la
     return np.asarray(filtered)
 
 
-def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[TensionError, ...]:
+def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[_TensionError, ...]:
     tension, command = recording.tension, recording.command
     if tension is None or command is None:
         return ()
@@ -257,7 +258,7 @@ def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[Tens
     last = np.searchsorted(command.time, tension.time[known] - late + 1e-9, side="right") - 1
     error = tension.tension[known] - command.tension[np.maximum(last, 0)]
     return tuple(
-        TensionError(k + 1, float(column.mean()), float(np.sqrt(np.mean(column**2))))
+        _TensionError(k + 1, float(column.mean()), float(np.sqrt(np.mean(column**2))))
         for k, column in enumerate(error.T)
     )
 

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat._reprs import count_of
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, counted
 
@@ -47,6 +48,19 @@ class Stream:
     values: Float[np.ndarray, "n size"]
     broken: int = 0
     remarks: tuple[Finding, ...] = ()
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tensions:
+    """Tensions of all tendons (N), or angles (rad) or lengths (m) of all motors, the first one first."""
+
+    time: Float[np.ndarray, " n"]
+    tension: Float[np.ndarray, "n tendons"]
+    topic: str = ""
+
+    def __repr__(self) -> str:
+        tendons = count_of(self.tension.shape[-1], "tendon")
+        return f"Tensions of {tendons} (topic {self.topic}): {count_of(len(self.time), 'row')}"
 
 
 class OutgoingStream(NamedTuple):

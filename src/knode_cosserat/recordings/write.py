@@ -20,7 +20,7 @@ from knode_cosserat.recordings.config import (
 )
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import formats, written_suffixes
-from knode_cosserat.recordings.streams import Outgoing, OutgoingStream
+from knode_cosserat.recordings.streams import Outgoing, OutgoingStream, Tensions
 
 #: default of time zero on the clock of a bag (s since 1970)
 START = 1_720_000_000
@@ -41,20 +41,12 @@ class MocapPoses:
     quaternion: Float[np.ndarray, "n 4"] | None = None
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class Pulls:
-    """Tensions (N), tendon 1 first, and the times of their measurement or command (s)."""
-
-    time: Float[np.ndarray, " n"]
-    tension: Float[np.ndarray, "n tendons"]
-
-
 def write_recording(
     path: str | Path,
     config: RecordingConfig,
     poses: Mapping[str, MocapPoses],
-    tension: Pulls | None = None,
-    command: Pulls | None = None,
+    tension: Tensions | None = None,
+    command: Tensions | None = None,
     *,
     start: int = START,
     delays: Mapping[str, float] | None = None,
