@@ -15,9 +15,9 @@ import knode_cosserat as kc
 from knode_cosserat import figures
 from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.evaluation.metrics import rms_distance
-from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.virtual import lagged
-from knode_cosserat.recordings.write import MocapPoses, write_recording
+from knode_cosserat.recordings.write import write_recording
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 
 HERE = Path(__file__).parent
@@ -55,7 +55,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
     seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
     turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
     pulled = Tensions(time[::4], (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2))
-    write_recording(path, config, {"tip": MocapPoses(time[::2], seen.round(5), turned.round(4))}, pulled)
+    write_recording(path, config, {"tip": Body(time[::2], seen.round(5), turned.round(4))}, pulled)
 
 
 def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:

@@ -7,8 +7,7 @@ import pytest
 
 from knode_cosserat.recordings import Recording, RecordingConfig, RecordingError
 from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
-from knode_cosserat.recordings.recording import Body
-from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.streams import Body, Tensions
 
 LATENCY = 0.06
 CONFIG = RecordingConfig(
@@ -23,7 +22,7 @@ TIMES = np.round(0.02 * np.arange(201) + np.random.default_rng(0).uniform(0.0, 0
 def recorded(time, tension, command=None, until=4.0):
     """A recording whose tensions are known; its body stands still."""
     frames = np.round(np.arange(0.0, until + 1e-9, 0.01), 6)
-    body = Body("tip", "tip", 1.0, frames, np.tile([0.0, 0.0, 0.5], (len(frames), 1)), None)
+    body = Body(frames, np.tile([0.0, 0.0, 0.5], (len(frames), 1)), None, "tip", "tip", 1.0)
     return Recording(
         source="it", config=CONFIG, bodies=(body,), base=None, tension=Tensions(time, tension, "tension"),
         command=command, rest=None, simulated=True, findings=(), delays={},

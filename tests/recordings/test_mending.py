@@ -10,8 +10,8 @@ import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, checks
 from knode_cosserat.recordings.config import MarkerSource, TensionSource
 from knode_cosserat.recordings.formats import bag
-from knode_cosserat.recordings.streams import Tensions
-from knode_cosserat.recordings.write import START, MocapPoses, write_recording
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import START, write_recording
 from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
 TIP = "/vicon/continuum_3/pose"
@@ -193,7 +193,7 @@ def test_messages_out_of_order_and_twice_are_sorted(tmp_path, streams):
     poses = {name: pose for name, pose in streams[0].items() if name != "base"}
     order = np.r_[0:100, 101, 100, 102:200, 199, 200:300]
     tip = poses["rib 4"]
-    poses["rib 4"] = MocapPoses(tip.time[order], tip.position[order], tip.quaternion[order])
+    poses["rib 4"] = Body(tip.time[order], tip.position[order], tip.quaternion[order])
     recording = read(tmp_path, (poses, *streams[1:]), config)
     assert said(recording, "a stamp is before the one in front of it; the messages were sorted").topic == TIP
     assert said(recording, "1 stamp is there twice").times == pytest.approx((1.99,))
@@ -377,7 +377,7 @@ def test_two_tendons_and_a_rod_that_hardly_moves(tmp_path):
     )
     time = np.round(np.arange(0.0, 2.0, 0.01), 6)
     turned = np.tile(TURNED[1].as_quat(scalar_first=True), (len(time), 1))
-    tip = MocapPoses(time, np.tile([0.0, 0.0, 0.4], (len(time), 1)), turned)
+    tip = Body(time, np.tile([0.0, 0.0, 0.4], (len(time), 1)), turned)
     write_recording(tmp_path / "it.db3", config, {"tip": tip}, Tensions(time, np.full((len(time), 2), 4.0)))
     recording = kc.load_recording(tmp_path / "it.db3", config)
     assert recording.rest == pytest.approx((0.0, 1.99))

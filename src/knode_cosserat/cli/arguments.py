@@ -286,6 +286,18 @@ def load_trajectory_file(path: Path) -> Trajectory:
     return kc.load_trajectory(path)
 
 
+def trajectories_by_name(files: Sequence[str | Path]) -> dict[str, Trajectory]:
+    """Return the trajectories by the stems of their files, or by paths if stems are equal."""
+    stems = [Path(file).stem for file in files]
+    trajectories: dict[str, Trajectory] = {}
+    for file, stem in zip(files, stems, strict=True):
+        name = stem if stems.count(stem) == 1 else str(file)
+        while name in trajectories:
+            name += " (again)"
+        trajectories[name] = load_trajectory_file(Path(file))
+    return trajectories
+
+
 def require_writable(
     file: Path | None = None, figure: Path | None = None, folders: Sequence[Path | None] = ()
 ) -> None:

@@ -25,6 +25,7 @@ from knode_cosserat.cli.arguments import (
     load_trajectory_file,
     option,
     require_writable,
+    trajectories_by_name,
 )
 from knode_cosserat.cli.identify import evaluate_on_recordings
 from knode_cosserat.cli.output import table, write_output
@@ -191,7 +192,7 @@ def plot(
     """
     require_writable(figure=out)
     drawing = figures()
-    states = _by_stem(trajectories)
+    states = _each_once(trajectories)
     first, *others = states.values()
     if others and kind is _Kind.overview:
         kind = _Kind.compare
@@ -235,19 +236,17 @@ def animate(
     """
     require_writable(out)
     drawing = figures()
-    states = _by_stem(trajectories)
+    states = _each_once(trajectories)
     view = look.of(next(iter(states.values())))
     drawing.animate(states, out, fps=pace.fps, speed=pace.speed, view=view, columns=look.columns)
     write_output(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
 
 
-def _by_stem(paths: list[Path]) -> dict[str, Trajectory]:
-    """Return the trajectories by the stems of their files, or by their paths if stems are equal."""
-    stems = [path.stem for path in paths]
-    names = stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
-    if len(set(names)) < len(names):
-        raise ValueError(f"{names[0]}: given twice; allowed is each file once")
-    return {name: load_trajectory_file(path) for name, path in zip(names, paths, strict=True)}
+def _each_once(paths: list[Path]) -> dict[str, Trajectory]:
+    """Return the trajectories by name. Raises `ValueError` if one is there twice."""
+    if len(set(paths)) < len(paths):
+        raise ValueError(f"{paths[0]}: given twice; allowed is each file once")
+    return trajectories_by_name(paths)
 
 
 def _require_one_kind(prediction: str, references: list[Path], config: Path | None) -> None:

@@ -25,6 +25,7 @@ from knode_cosserat.cli.arguments import (
     coarse_grid_in_output,
     figures,
     load_system,
+    option,
     parse_numbers,
     require_trajectory_name,
     require_writable,
@@ -60,9 +61,9 @@ class _Run(NamedTuple):
 
     controls: Annotated[
         str,
-        typer.Option(
-            metavar="CONTROLS",
-            help="Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or step:HEIGHT,at=S), ramp:HEIGHT "
+        option(
+            "CONTROLS",
+            "Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or step:HEIGHT,at=S), ramp:HEIGHT "
             "(N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any controls by name: "
             "NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat info ROBOT` lists the "
             "names), the others zero; or none.",
@@ -70,20 +71,18 @@ class _Run(NamedTuple):
     ]
     steps: Annotated[
         int | None,
-        typer.Option(metavar="N", help="Number of time steps; required unless a file gives the controls."),
+        option("N", "Number of time steps; required unless a file gives the controls."),
     ] = None
-    dt: Annotated[
-        float | None, typer.Option(metavar="S", help="Time step (s).", show_default="0.05, or the file's")
-    ] = None
-    time: Annotated[
-        str, typer.Option(metavar="SCHEME", help="Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")
-    ] = "sdirk2"
+    dt: Annotated[float | None, option("S", "Time step (s).", show_default="0.05, or the file's")] = None
+    time: Annotated[str, option("SCHEME", "Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")] = (
+        "sdirk2"
+    )
     space: Space = "lobatto2"
     initial: Annotated[
         str,
-        typer.Option(
-            metavar="STATE",
-            help="State before the first step: equilibrium (at rest without controls), or unstressed (the "
+        option(
+            "STATE",
+            "State before the first step: equilibrium (at rest without controls), or unstressed (the "
             "shape that the rod was made in, as in the paper's studies).",
         ),
     ] = "equilibrium"
@@ -163,14 +162,12 @@ def simulate(
 class _Held(NamedTuple):
     """Constant control of an equilibrium: from tensions, from numbers in order, or by name."""
 
-    tension: Annotated[
-        str | None, typer.Option(metavar="N,N,…", help="Tensions of all tendons (N), such as 7,5,5,7.")
-    ] = None
+    tension: Annotated[str | None, option("N,N,…", "Tensions of all tendons (N), such as 7,5,5,7.")] = None
     control: Annotated[
         str | None,
-        typer.Option(
-            metavar="CONTROL",
-            help="All controls in order, such as 7,5,5,7; or some by name, such as base_z=0.1,base_ry=0.2, "
+        option(
+            "CONTROL",
+            "All controls in order, such as 7,5,5,7; or some by name, such as base_z=0.1,base_ry=0.2, "
             "and the others zero. `knode-cosserat info ROBOT` lists names and units.",
         ),
     ] = None

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import Annotated, NamedTuple
 
 import typer
 
@@ -19,15 +19,12 @@ from knode_cosserat.cli.arguments import (
     is_recording,
     is_trajectory,
     load_system,
-    load_trajectory_file,
     option,
     require_writable,
+    trajectories_by_name,
 )
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
-
-if TYPE_CHECKING:
-    from knode_cosserat.trajectory import Trajectory
 
 #: robot of `view --live` without a name
 EXAMPLE = "delrin-tendon-robot"
@@ -117,24 +114,13 @@ def view(
     if live != _Live():
         raise ValueError("--set, --nodes, --dt and --space change a simulation; use them with --live")
     require_writable(export)
-    trajectories = _by_name(names)
+    for file in names:
+        if Path(file).is_file() and not is_trajectory(file) and not is_recording(file):
+            typed = command_line("view", "--live", file)
+            raise ValueError(f"{file}: not a trajectory. To show a robot or model, type: {typed}")
+    trajectories = trajectories_by_name(names)
     if export:
         viewer.export_scene(trajectories, export)
         write_output(as_json, {"trajectories": list(trajectories)}, [], export=export)
     else:
         viewer.view(trajectories, port=page.port, open_browser=announce)
-
-
-def _by_name(files: list[str]) -> dict[str, Trajectory]:
-    """Return the trajectories by the stems of their files, or by paths if stems are equal."""
-    short = [Path(file).stem for file in files]
-    trajectories: dict[str, Trajectory] = {}
-    for file, stem in zip(files, short, strict=True):
-        if Path(file).is_file() and not is_trajectory(file) and not is_recording(file):
-            typed = command_line("view", "--live", file)
-            raise ValueError(f"{file}: not a trajectory. To show a robot or model, type: {typed}")
-        name = stem if short.count(stem) == 1 else file
-        while name in trajectories:
-            name += " (again)"
-        trajectories[name] = load_trajectory_file(Path(file))
-    return trajectories

@@ -149,9 +149,7 @@ def one_of(trajectory: Trajectory) -> Trajectory:
 def by_label(given: Trajectory | Tips | Mapping[str, Any], what: str = "trajectories") -> dict[str, Any]:
     """Return trajectories by label; a single trajectory gets an empty label.
 
-    Raises:
-        ValueError: there is none.
-        TypeError: a value has no tip positions.
+    Raises `ValueError` if there is none, and `TypeError` if a value has no tip positions.
     """
     found = dict(given) if isinstance(given, Mapping) else {"": given}
     if not found:

@@ -34,7 +34,7 @@ class OrientedHistory(PoseHistory, Protocol):
 
 
 def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
-    """Return the exact dynamic-time-warping distance between two paths, with the L1 ground distance.
+    """Return the exact dynamic-time-warping distance (m) between two paths, with the L1 ground distance.
 
     The distance is the smallest sum of |Δx| + |Δy| + |Δz| over all monotone alignments that match both first
     points and both last points; planar paths have no Δz. There is no window and no normalisation by the
@@ -43,9 +43,6 @@ def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
     Args:
         a: (T, 3) m, or (T, 2).
         b: (S, 3) m, or (S, 2).
-
-    Returns:
-        The distance, m.
 
     Raises:
         ValueError: a path is not (T, 3) or (T, 2), is empty, or has NaN or inf; or one is planar only.
@@ -85,12 +82,9 @@ def dtw_distance(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def tip_dtw(prediction: PoseHistory, reference: PoseHistory) -> float:
-    """Return `dtw_distance` between the paths of the two tips, the last nodes.
+    """Return `dtw_distance` (m) between the paths of the two tips, the last nodes; it grows with the rows.
 
     The trajectories may differ in rows and in nodes.
-
-    Returns:
-        The distance, m; it grows with the number of rows.
 
     Raises:
         ValueError: a shape is wrong or a state is invalid.
@@ -107,9 +101,6 @@ def pose_mse(prediction: OrientedHistory, reference: OrientedHistory) -> float:
     The mean runs over rows, nodes and six numbers: x, y, z in metres and three Euler angles in radians,
     extrinsic in the order z, y, x. It adds m² to rad², and angles on opposite sides of ±π differ by almost
     2π; both are part of the published definition.
-
-    Returns:
-        1000 times the mean, no unit.
 
     Raises:
         ValueError: a shape is wrong, rows or nodes differ, a state is invalid, or there are no orientations,
@@ -130,12 +121,9 @@ def pose_mse(prediction: OrientedHistory, reference: OrientedHistory) -> float:
 
 
 def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
-    """Return the root mean square over rows of the Euclidean distance between the two tips, the last nodes.
+    """Return the root mean square over rows of the distance (m) between the two tips, the last nodes.
 
     The trajectories may differ in nodes.
-
-    Returns:
-        The error, m.
 
     Raises:
         ValueError: a shape is wrong, rows differ, or a state is invalid.
@@ -145,13 +133,9 @@ def tip_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
 
 
 def rotation_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
-    """Return the root mean square over rows and nodes of the angle between the orientations.
+    """Return the root mean square over rows and nodes of the angle (rad) between the orientations, 0 to π.
 
-    The angle is that of the one rotation which turns the reference's orientation to the prediction's, from 0
-    to π. Unlike the Euler angles of `pose_mse` it does not depend on the axes of the global frame.
-
-    Returns:
-        The error, rad.
+    Unlike the Euler angles of `pose_mse` it does not depend on the axes of the global frame.
 
     Raises:
         ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.
@@ -162,10 +146,7 @@ def rotation_rmse(prediction: PoseHistory, reference: PoseHistory) -> float:
 
 
 def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
-    """Return the root mean square over rows of the Euclidean distance between positions, for each node.
-
-    Returns:
-        (N,) m, base first.
+    """Return the root mean square over rows of the distance (m) between positions, for each node, (N,).
 
     Raises:
         ValueError: a shape is wrong, rows or nodes differ, or a state is invalid.

@@ -21,8 +21,8 @@ from knode_cosserat.recordings.config import (
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
-from knode_cosserat.recordings.recording import Body, bridge
-from knode_cosserat.recordings.streams import SLOW, Tensions, period
+from knode_cosserat.recordings.recording import bridge
+from knode_cosserat.recordings.streams import SLOW, Body, Tensions, period
 
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
@@ -44,14 +44,7 @@ _UNITS = {**TENSION_UNITS, **MOTOR_UNITS}
 
 @dataclasses.dataclass
 class _Rows:
-    """Rows of a topic from which errors are removed.
-
-    Attributes:
-        topic: name of the topic.
-        time: times (s).
-        values: numbers of each row.
-        findings: findings on what was removed.
-    """
+    """Rows of a topic, times (s) and numbers, from which errors are removed; and findings on these."""
 
     topic: str
     time: Float[np.ndarray, " n"]
@@ -96,12 +89,8 @@ def cleaned_body(
 ) -> tuple[Body, list[Finding]]:
     """Return a body without errors, in the recording's own frame and units, and the findings.
 
-    Args:
-        config: configuration of the recording.
-        source: name, topic and fraction of the body.
-        time: times (s).
-        pose: positions and, if known, quaternions.
-        path: the file's name in error messages.
+    `source` is its name, topic and fraction; `pose` has positions and, if known, quaternions; `path` is named
+    in errors.
 
     Raises:
         RecordingError: the body has fewer than two usable frames.
@@ -150,7 +139,7 @@ def cleaned_body(
     rows.drop(wrong, ("pose jumps", "poses jump", "out of the motion and back"), "note")
     rows.add_pauses(config.longest_gap)
     orientation = rows.values[:, 3:] if is_oriented else None
-    return Body(name, topic, fraction, rows.time, rows.values[:, :3], orientation), rows.findings
+    return Body(rows.time, rows.values[:, :3], orientation, name, topic, fraction), rows.findings
 
 
 # tensions
@@ -161,11 +150,7 @@ def cleaned_tensions(
 ) -> tuple[Tensions | None, Tensions | None, list[Finding]]:
     """Return measured and commanded tensions (N, tendon 1 first; None if absent), and the findings.
 
-    Args:
-        config: configuration of the recording.
-        seconds: times (s) by topic.
-        values: numbers by topic.
-        path: the file's name in error messages.
+    `seconds` (s) and `values` are by topic; `path` is named in errors.
 
     Raises:
         RecordingError: messages have another number of tendons, or required tensions have no usable row.
@@ -286,14 +271,9 @@ def swaps_undone(
     """Return orientations without swapped axes, the swaps, and the rows of other large rotations.
 
     A swap is its row (it applies to all later rows, too), its angle (degrees), and its axis among the body's.
-
-    Between two frames a swap rotates a body by one of the 23 rotations of a cube, plus its motion. The
-    neighbouring rotations bound that motion. A large rotation is left unchanged if it is not a multiple of
-    90 degrees, or if the motion is too fast to decide.
-
-    Args:
-        time: times of the rows (s), increasing.
-        quaternion: orientation of the body, scalar first.
+    Between two frames it rotates a body by one of the 23 rotations of a cube, plus its motion, which the
+    neighbouring rotations bound. A large rotation is left unchanged if it is not a multiple of 90 degrees, or
+    if the motion is too fast to decide.
     """
     rotation = Rotation.from_quat(quaternion, scalar_first=True)
     turn = rotation[:-1].inv() * rotation[1:] if len(time) > 1 else rotation[:0]
@@ -337,11 +317,8 @@ def implausible_sizes(
 ) -> list[Finding]:
     """Return findings on implausible times and units, with the likely error.
 
-    Args:
-        bodies: bodies in the robot's frame.
-        tensions: measured and commanded tensions.
-        at_rest: positions of the bodies at rest (m), if known.
-        is_static: True if rows are equilibria, whose times are arbitrary.
+    `tensions` are measured and commanded ones, `at_rest` the positions of the bodies at rest (m), if known.
+    Times of equilibria (`is_static`) are arbitrary.
     """
     findings, sizes = [], []
     for stream, is_measured in zip(tensions, (True, False), strict=True):

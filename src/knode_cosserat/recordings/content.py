@@ -100,13 +100,9 @@ class Decompression:
     def records(self, data: bytes | memoryview, compression: str, size: int = 0) -> bytes:
         """Return the decompressed bytes of a part, as far as they are readable and allowed.
 
-        Args:
-            data: compressed bytes; other bytes may follow them.
-            compression: bz2, lz4 or zstd; of any other one nothing is readable.
-            size: decompressed size (bytes); zero if unknown.
-
-        Raises:
-            ImportError: the library for this compression is not installed.
+        `data` may be followed by other bytes. `compression` is bz2, lz4 or zstd; of any other one nothing is
+        readable. `size` is the decompressed size (bytes), zero if unknown. Raises `ImportError` without the
+        library.
         """
         limit = min(allowed(LARGEST_CHUNK), self._remaining)
         most = min(size or limit, limit)

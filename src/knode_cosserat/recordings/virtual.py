@@ -16,8 +16,8 @@ from jaxtyping import Float
 from knode_cosserat import controls
 from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.streams import Tensions
-from knode_cosserat.recordings.write import MocapPoses, write_recording, writer_of
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.rods.tendon_rod import TendonRod
 from knode_cosserat.rods.virtual_robot import VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -196,7 +196,7 @@ def driven(sent: Tensions, lag: float, robot: TendonRod) -> Trajectory:
 
 def simulated_sensors(
     truth: Trajectory, sent: Tensions, seed: int, sensors: Sensors
-) -> tuple[dict[str, MocapPoses], Tensions]:
+) -> tuple[dict[str, Body], Tensions]:
     """Return simulated motion capture (poses by the paper's marker names) and load cells of a motion."""
     from scipy.spatial.transform import Rotation
 
@@ -207,7 +207,7 @@ def simulated_sensors(
     clamped_end = random.uniform([-0.5, -0.5, 0.8], [0.5, 0.5, 1.2])
     kept = random.uniform(size=len(time)) >= sensors.lost
 
-    def seen(place: np.ndarray, turn: np.ndarray, swap: float | None) -> MocapPoses:
+    def seen(place: np.ndarray, turn: np.ndarray, swap: float | None) -> Body:
         """Return noisy poses of a body with randomly rotated axes, without its lost frames."""
         axes: Rotation = Rotation.from_quat(random.normal(size=4))
         # some frames are lost for one body only
@@ -219,7 +219,7 @@ def simulated_sensors(
             quarter = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
             turned = Rotation.concatenate([turned[~late], turned[late] * quarter])
         position = place + random.normal(0.0, sensors.position_noise, place.shape)
-        return MocapPoses(time[shown], position[shown], turned.as_quat(scalar_first=True)[shown])
+        return Body(time[shown], position[shown], turned.as_quat(scalar_first=True)[shown])
 
     poses = {}
     for k, marker in enumerate(config.markers):

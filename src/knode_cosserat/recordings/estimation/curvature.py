@@ -55,14 +55,9 @@ _PROBES = 4
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CapturedPoses:
-    """Poses of all bodies at F times; masked values are arbitrary but finite.
+    """Poses of all bodies at F times (s), quaternions scalar first; unseen values are arbitrary but finite.
 
-    Attributes:
-        time: times (s), increasing.
-        position: positions (m).
-        quaternion: orientations, scalar first.
-        placed: True where a position was seen.
-        turned: True where an orientation was seen.
+    `placed` and `turned` are True where a position or an orientation was seen.
     """
 
     time: Float[np.ndarray, " F"]
@@ -74,13 +69,10 @@ class CapturedPoses:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _CurvatureFit:
-    """Fitted curvature.
+    """Fitted curvature: splines in time and their coefficients.
 
-    Attributes:
-        splines: splines in time.
-        curves: coefficients of the splines.
-        stretch: ratio of the rod's length to its model's length.
-        noise: standard deviations of a coordinate (m) and of an angle (rad).
+    `stretch` is the ratio of the rod's length to its model's; `noise` are standard deviations of a coordinate
+    (m) and of an angle (rad).
     """
 
     splines: _Splines

@@ -15,7 +15,8 @@ from knode_cosserat.recordings.estimation.balance import KnownRows, packed_field
 from knode_cosserat.recordings.estimation.curvature import CapturedPoses
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.recording import Body, Recording
+from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.recordings.streams import Body
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import Euler
@@ -244,12 +245,9 @@ def _along(
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Part:
-    """An unbroken part of a recording.
+    """Unbroken part of a recording: the rows to estimate, and the bodies away from the clamped end.
 
-    Attributes:
-        rows: measurements at the times to estimate.
-        poses: poses of the bodies away from the clamped end, at the full rate.
-        fractions: places of these bodies, as fractions of the rod's length.
+    `poses` are at motion capture's own rate, `fractions` the places of the bodies.
     """
 
     rows: Measurements
