@@ -11,10 +11,10 @@ import scipy.ndimage
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.config import (
     MOTOR_UNITS,
     POSITION_UNITS,
-    TENSION_UNITS,
     MotorSource,
     RecordingConfig,
     TensionSource,

@@ -215,7 +215,7 @@ class _Settings:
 
     def __post_init__(self) -> None:
         defaults = {field.name: field.default for field in dataclasses.fields(self)}  # type: ignore[arg-type]
-        for name, check in _checks(type(self)).items():
+        for name, check in _checks(type(self)).items():  # type: ignore[arg-type]
             value = getattr(self, name)
             if value is not None or defaults[name] is not None:
                 self._set(name, check(value, name))

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.write import write_recording, writer_of
@@ -26,7 +26,7 @@ from knode_cosserat.solvers.time import LIGHTLY_DAMPED
 from knode_cosserat.trajectory import Trajectory
 
 #: one gram-force (N)
-GRAM = TENSION_UNITS["gf"]
+GRAM = controls.TENSION_UNITS["gf"]
 #: the paper's signals: rest tension, amplitude of sines, range of random ones (gf); rest durations (s)
 REST, SWING, HIGHEST, RESTING, BEFORE_STEP = 500.0, 300.0, 700.0, 1.0, 2.0
 #: period of commands, and hold time of random ones (s)

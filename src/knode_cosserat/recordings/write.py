@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.config import (
     POSITION_UNITS,
-    TENSION_UNITS,
     CommandSource,
     RecordingConfig,
     TensionSource,
