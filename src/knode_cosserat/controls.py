@@ -15,7 +15,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -26,8 +26,10 @@ from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import System
+
+if TYPE_CHECKING:
+    from knode_cosserat.rods.layout import Layout
+    from knode_cosserat.rods.system import System
 
 __all__ = [
     "Controls", "ControlsError", "constant", "load", "parse", "ramp", "random", "save", "sine", "step",
@@ -449,6 +451,9 @@ def parse(
         ControlsError: the specification is not understood, the file is invalid or too short, or the signal
             has no effect during the run, such as a step after its end.
     """
+    # its import takes long, and readers of recordings use the units of this module
+    from knode_cosserat.rods.layout import Layout
+
     if isinstance(robot, int):
         robot = Layout(("tension", robot, "N", "tendon tension"))
     layout = robot if isinstance(robot, Layout) else robot.control_layout
