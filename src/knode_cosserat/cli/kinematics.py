@@ -172,7 +172,7 @@ class _Samples(NamedTuple):
 
     out: Annotated[Path, option("FILE", "Write controls and tip poses to this .nc, .csv or .npz file.")]
     picture: Annotated[Path | None, Picture] = None
-    count: Annotated[int, option("N", "Number of equilibria to compute.")] = 10_000
+    number: Annotated[int, option("N", "Number of equilibria to compute.", "--count")] = 10_000
     seed: Annotated[int, option("N", "Random seed of the samples.", min=0)] = 0
 
 
