@@ -14,7 +14,7 @@ from knode_cosserat.recordings.formats import parquet
 from studies.beam_recordings import read_beam
 from studies.cables import pickles
 from studies.cables import recordings as cables
-from tests.limits import assert_limited
+from tests.limits import assert_limited, limited
 
 ROWS = "".join(f"{k / 20},5,0.1,0,{0.4 + k / 1e3}\n" for k in range(20))
 TABLE = f"time [s],tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n{ROWS}".encode()
@@ -104,10 +104,4 @@ def archive(folder):
 def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(
     tmp_path, monkeypatch, file, module, limits
 ):
-    def reader(folder, patch):
-        path, read = file(folder)
-        for name, value in limits.items():
-            patch.setattr(module, name, path.stat().st_size - 1 if value is None else value)
-        return read
-
-    assert_limited(reader, tmp_path, monkeypatch)
+    assert_limited(limited(file, module, limits), tmp_path, monkeypatch)

@@ -62,11 +62,16 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     axes.tick_params(axis="z", pad=3.0)
 
 
-def draw_tips(axes: Any, paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64]]]) -> None:
+def draw_tips(
+    axes: Any,
+    paths: Mapping[str, tuple[ArrayLike, NDArray[np.float64]]],
+    looks: Mapping[str, Mapping[str, Any]] | None = None,
+) -> None:
     """Draw x, y and z of paths over time, one below the other; a path is times and positions."""
     for i, (label, (time, tip)) in enumerate(paths.items()):
+        look = looks[label] if looks else line(i, np.size(time))
         for axis, each in enumerate(axes):
-            each.plot(time, tip[:, axis], label=label, **line(i, np.size(time)))
+            each.plot(time, tip[:, axis], label=label, **look)
     farthest = max((np.nanmax(np.abs(tip), initial=0.0) for _, tip in paths.values()), default=0.0)
     for name, each in zip(AXES, axes, strict=False):
         each.set_ylabel(f"tip {name} [m]")
