@@ -14,7 +14,7 @@ import numpy as np
 import knode_cosserat as kc
 from knode_cosserat import figures
 from knode_cosserat.evaluation import recording_figures
-from knode_cosserat.evaluation.metrics import rms_distance
+from knode_cosserat.metrics import rms_distance
 from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.virtual import lagged
 from knode_cosserat.recordings.write import write_recording

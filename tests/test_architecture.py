@@ -19,7 +19,7 @@ LAYERS = (
     ("rods", "robots"),
     ("controls",),
     ("solvers", "engine", "trajectory"),
-    ("metrics", "evaluation.metrics", "evaluation.state_errors"),
+    ("metrics",),
     ("recordings", "statics", "estimation"),
     ("control",),
     ("learning",),

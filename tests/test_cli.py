@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.metrics import dtw_distance
+from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
 # help

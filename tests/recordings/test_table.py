@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.metrics import dtw_distance
+from knode_cosserat.metrics import dtw_distance
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_example, load_recording
 from knode_cosserat.recordings.config import MarkerSource, TensionSource
 

@@ -15,8 +15,8 @@ from knode_cosserat.evaluation.drawing import (
     new_figure,
     tips_of,
 )
-from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.metrics import dtw_distance, rms_distance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
