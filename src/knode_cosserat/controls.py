@@ -119,9 +119,9 @@ def step(
     tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
-    _require_numbers(at=at)
+    _require_numbers(height=height, base=base, at=at)
     t = step_times(steps, dt, sampled)
-    return _raised("step", height, step_values(t, 1.0, 0.0, at, dt), base, tendons, count)
+    return _in_tendons("step", step_values(t, height, base, at, dt), base, tendons, count)
 
 
 def ramp(
@@ -141,10 +141,10 @@ def ramp(
                 f"ramp: start is {start!r} s; allowed is a time before the last step, {end:g} s; "
                 f"use {_steps_until(start, dt, sampled, after=True)} steps or more, or an earlier start"
             )
-    _require_numbers(start=start, end=end)
+    _require_numbers(height=height, base=base, start=start, end=end)
     if end <= start:
         raise ControlsError(f"ramp: end is {end!r} s; allowed is a time after its start, {start!r} s")
-    return _raised("ramp", height, ramp_values(t, 1.0, 0.0, start, end), base, tendons, count)
+    return _in_tendons("ramp", ramp_values(t, height, base, start, end), base, tendons, count)
 
 
 def random(
@@ -178,15 +178,12 @@ def ramp_values(t: Any, height: Any, base: Any, start: Any, end: Any) -> Any:
     return base + height * np.clip((t - start) / (end - start), 0.0, 1.0)
 
 
-def _raised(
-    signal: str, height: float, part: np.ndarray, base: float, tendons: Sequence[int], count: int
-) -> Tensions:
+def _in_tendons(signal: str, values: np.ndarray, base: float, tendons: Sequence[int], count: int) -> Tensions:
     _require_counts(count=count)
-    _require_numbers(height=height, base=base)
     if not set(tendons) <= set(range(count)):
         raise ControlsError(f"{signal}: tendons is {tendons!r}; allowed is numbers from 0 to {count - 1}")
-    tensions = np.full((len(part), count), float(base))
-    tensions[:, [int(k) for k in tendons]] += height * part[:, None]
+    tensions = np.full((len(values), count), float(base))
+    tensions[:, [int(k) for k in tendons]] = values[:, None]
     return _checked_tensions(tensions, signal)
 
 

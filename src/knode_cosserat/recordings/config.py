@@ -294,7 +294,8 @@ def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
             marker = _part(MarkerSource)(named | marker, where)
         markers.append(marker)
     if not markers:
-        raise _refused(tuple(markers), name, "a list of one marker or more")
+        refused = tuple(value) if isinstance(value, list) else value
+        raise _refused(refused, name, "a list of one marker or more")
     places, names = [marker.fraction for marker in markers], [marker.name for marker in markers]
     if any(b <= a for a, b in itertools.pairwise(places)):
         raise RecordingError(f"markers have the fractions {shown(places)}; allowed is each above the last")
