@@ -518,9 +518,9 @@ def _constant_control(specification: str, size: int) -> np.ndarray | None:
 def _from_file(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
     """Return a file's columns, each row held until the next row's time; other controls are zero."""
     if layout.names == ("tension",):
-        found = load(path, dt).tensions
-        if found.shape[1] != layout.size:
-            raise ControlsError(f"{path}: there are {found.shape[1]} tendons; the robot has {layout.size}")
+        rows = load(path, dt).tensions
+        if rows.shape[1] != layout.size:
+            raise ControlsError(f"{path}: there are {rows.shape[1]} tendons; the robot has {layout.size}")
     else:
         known = ["time [s]", *titles(layout)]
 
@@ -534,17 +534,17 @@ def _from_file(path: str, layout: Layout, steps: int | None, dt: float) -> Array
 
         try:
             time, values, places = read_rows(Path(path), f"a header `{','.join(known)}`", columns_of)
-            rows = held_rows(path, time, dt)
+            held = held_rows(path, time, dt)
         except CSVTextError as error:
             raise ControlsError(str(error)) from None
-        found = np.zeros((len(rows), layout.size))
-        found[:, [place - 1 for place in places]] = values[rows]
-    if steps is not None and steps > len(found):
+        rows = np.zeros((len(held), layout.size))
+        rows[:, [place - 1 for place in places]] = values[held]
+    if steps is not None and steps > len(rows):
         raise ControlsError(
-            f"{path}: there are {len(found)} steps of {dt:g} s; {steps} are requested; "
-            f"allowed is up to {len(found)}"
+            f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are requested; "
+            f"allowed is up to {len(rows)}"
         )
-    return found[:steps]
+    return rows[:steps]
 
 
 def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
@@ -603,7 +603,7 @@ def parse_signals(
     "end". Controls without a word are zero.
     """
     known = labels(layout)
-    found = np.zeros((len(times["middle"]), layout.size))
+    controls = np.zeros((len(times["middle"]), layout.size))
     sources: dict[int, str] = {}
     for word in words:
         entry = word.strip()
@@ -643,8 +643,8 @@ def parse_signals(
                     f"{sources[column]!r}; allowed is each control once"
                 )
             sources[column] = entry
-        found[:, columns] = values[:, None]
-    return found
+        controls[:, columns] = values[:, None]
+    return controls
 
 
 def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:

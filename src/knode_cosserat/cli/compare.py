@@ -147,16 +147,16 @@ def evaluate(
     if sampling.config is not None or not any(is_trajectory(str(path)) for path in references):
         system = load_system(prediction, changes)
         return evaluate_on_recordings(system, references, sampling, report.as_json)
-    predicting = predictor.load()
+    source = predictor.load()
     compared: list[dict[str, Any]] = []
     measures = (kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse)
     for path in references:
         reference = load_trajectory_file(path)
         try:
             predicted = (
-                predicting[:rows]
-                if isinstance(predicting, kc.Trajectory)
-                else _simulated(predicting, reference, rows, report.shows_progress)
+                source[:rows]
+                if isinstance(source, kc.Trajectory)
+                else _simulated(source, reference, rows, report.shows_progress)
             )
             errors = {measure.__name__: measure(predicted, reference[:rows]) for measure in measures}
         except ValueError as error:
@@ -192,7 +192,7 @@ def plot(
     """
     require_writable(figure=out)
     drawing = figures()
-    states = _each_once(trajectories)
+    states = _distinct_trajectories(trajectories)
     first, *others = states.values()
     if others and kind is _Kind.overview:
         kind = _Kind.compare
@@ -236,13 +236,13 @@ def animate(
     """
     require_writable(out)
     drawing = figures()
-    states = _each_once(trajectories)
+    states = _distinct_trajectories(trajectories)
     view = look.of(next(iter(states.values())))
     drawing.animate(states, out, fps=pace.fps, speed=pace.speed, view=view, columns=look.columns)
     write_output(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
 
 
-def _each_once(paths: list[Path]) -> dict[str, Trajectory]:
+def _distinct_trajectories(paths: list[Path]) -> dict[str, Trajectory]:
     """Return the trajectories by name. Raises `ValueError` if one is there twice."""
     if len(set(paths)) < len(paths):
         raise ValueError(f"{paths[0]}: given twice; allowed is each file once")

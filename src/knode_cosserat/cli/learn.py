@@ -168,9 +168,9 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
 
         residual(next(iter(result)) if several else result, training[0]).savefig(figure)
     count = sum(len(one.time) for one in training)
-    data_text = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
+    subject = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
-        f"learned a residual model of {robot} from {data_text} ({count} rows): "
+        f"learned a residual model of {robot} from {subject} ({count} rows): "
         f"preset {method.preset.value}, {seconds:.2f} s"
     ]
     models = []

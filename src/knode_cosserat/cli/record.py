@@ -97,7 +97,7 @@ def record_virtual(
         )
     began = perf_counter()
     drawn = None if imperfections is None else drawn_robot(imperfections)
-    true = virtual.record_virtual(
+    trajectory = virtual.record_virtual(
         out, signal, seconds, seed, virtual.Sensors(swap=swap), robot=None if drawn is None else drawn.robot
     )
     elapsed = perf_counter() - began
@@ -107,7 +107,7 @@ def record_virtual(
     lines = [f"recorded {seconds:g} s of {signal} (simulated) in {elapsed:.1f} s"]
     written = {"out": out} | ({"states": states} if states or as_json else {})
     if states:
-        true.save(states)
+        trajectory.save(states)
     if drawn is not None:
         facts["imperfections"] = dict(drawn.values)
         lines.append(f"effects of the robot: {', '.join(drawn.effects)}")

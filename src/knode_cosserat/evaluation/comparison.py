@@ -83,7 +83,7 @@ def show_all(axes: Any, trajectories: Sequence[Trajectory], zoom: float) -> None
 def draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Trajectory]) -> None:
     """Draw the tip's x, y and z over time, one below the other."""
     looks = {label: look_of(label, place) for place, label in enumerate(predictions)}
-    paths = {label: (each.time, tips_of(each)) for label, each in predictions.items()}
+    paths = {label: (motion.time, tips_of(motion)) for label, motion in predictions.items()}
     true = {"reference": (reference.time, tips_of(reference))}
     drawing.draw_tips(column, true | paths, {"reference": REFERENCE, **looks})
 
