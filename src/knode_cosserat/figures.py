@@ -124,10 +124,10 @@ def path(
 
     Paths may also be arrays (points, 3) in m. A path whose label begins with "wanted" is drawn wide and pale.
     """
-    given = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
-    if not given:
+    motions = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
+    if not motions:
         raise ValueError("there are no trajectories to draw; at least one is needed")
-    paths = {label: path_of(one) for label, one in given.items()}
+    paths = {label: path_of(one) for label, one in motions.items()}
     points = np.concatenate(list(paths.values()))
     view, width = checked_view(view, points.shape[1]), width_of(columns)
     with style():
@@ -147,8 +147,8 @@ def path(
 
 def tips(trajectories: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
     """Return a figure of x, y and z of the tips over time, of trajectories or recordings."""
-    given = by_label(trajectories)
-    paths = {label: (one.time, tips_of(one)) for label, one in given.items()}
+    motions = by_label(trajectories)
+    paths = {label: (one.time, tips_of(one)) for label, one in motions.items()}
     size = min(tip.shape[1] for _, tip in paths.values())
     with style():
         figure = new_figure(width_of(columns), 0.4 + 1.15 * size)
@@ -176,8 +176,8 @@ def states(
         KeyError: a field does not exist.
         ValueError: the node does not exist.
     """
-    given = by_label(trajectories)
-    first = one_of(next(iter(given.values())))
+    motions = by_label(trajectories)
+    first = one_of(next(iter(motions.values())))
     layouts = (first.system.y_layout, first.system.z_layout, first.system.control_layout)
     known = {field.name: field for layout in layouts for field in layout.fields}
     names = [name for name in FIELDS if name in known] if fields is None else list(fields)
@@ -193,7 +193,7 @@ def states(
         figure = new_figure(width_of(columns), 0.5 + 1.5 * rows)
         grid = figure.subplots(rows, across, sharex=True, squeeze=False).ravel()
         for axes, name in zip(grid, names, strict=False):
-            for i, (label, one) in enumerate(given.items()):
+            for i, (label, one) in enumerate(motions.items()):
                 values = np.asarray(one_of(one).part(name))
                 values = values[:, node] if values.ndim == 3 else values
                 for k in range(values.shape[1]):
@@ -201,7 +201,7 @@ def states(
                     component = AXES[k] if values.shape[1] == 3 else f"{k + 1}"
                     said = f"{component}, {label}" if label else component
                     axes.plot(one.time, values[:, k], **{**line(i), "color": colour}, label=said)
-            sizes = [np.nanmax(np.abs(np.asarray(one.part(name))), initial=0.0) for one in given.values()]
+            sizes = [np.nanmax(np.abs(np.asarray(one.part(name))), initial=0.0) for one in motions.values()]
             require_span(axes, 0.01 * max(sizes))
             unit = f" [{known[name].unit}]" if known[name].unit else ""
             axes.set(ylabel=f"{name}{unit}", title=known[name].meaning)
@@ -222,11 +222,11 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
     Raises:
         ValueError: a prediction's rows differ from the truth's.
     """
-    given, true = by_label(predictions, "predictions"), tips_of(truth)
+    motions, true = by_label(predictions, "predictions"), tips_of(truth)
     with style():
         figure = new_figure(width_of(columns), 2.4)
         axes = figure.subplots()
-        for i, (label, one) in enumerate(given.items()):
+        for i, (label, one) in enumerate(motions.items()):
             tip = tips_of(one)
             if tip.shape != true.shape or not np.allclose(one.time, truth.time, rtol=0.0, atol=1e-9):
                 raise ValueError(
@@ -238,7 +238,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
             axes.plot(truth.time, np.where(distance > 0.0, distance, np.nan), label=label or None, **line(i))
         axes.set(xlabel="time [s]", ylabel="distance of the tips [m]", yscale="log")
         axes.margins(x=0.02)
-        if any(given):
+        if any(motions):
             legend_above(axes)
     return figure
 
@@ -338,27 +338,27 @@ def curves(
     return figure
 
 
-def workspace(found: Workspace) -> Figure:
+def workspace(samples: Workspace) -> Figure:
     """Return a figure of a workspace from the side and from above, coloured by the sum of the controls.
 
     Raises:
         ValueError: no sample is solved, or positions do not have three coordinates.
     """
     require_matplotlib()
-    if not (hasattr(found, "position") and hasattr(found, "valid")):
-        raise TypeError(f"found is a {type(found).__name__}; allowed is a Workspace")
-    if found.position.shape[1] != 3 or not found.valid.any():
+    if not (hasattr(samples, "position") and hasattr(samples, "valid")):
+        raise TypeError(f"samples is a {type(samples).__name__}; allowed is a Workspace")
+    if samples.position.shape[1] != 3 or not samples.valid.any():
         raise ValueError("there is no solved sample with three coordinates to draw")
-    shown = np.flatnonzero(found.valid)[:MOST_POINTS]
-    x, y, z = found.position[shown].T
-    total = found.controls[shown].sum(axis=1)
+    shown = np.flatnonzero(samples.valid)[:MOST_POINTS]
+    x, y, z = samples.position[shown].T
+    total = samples.controls[shown].sum(axis=1)
     with style():
         figure = new_figure(TWO_COLUMNS, 3.2)
         for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
             axes = figure.add_subplot(1, 2, k + 1)
             points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
             axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
-        units = {field.unit for field in found.system.control_layout.fields}
+        units = {field.unit for field in samples.system.control_layout.fields}
         unit = f" [{units.pop()}]" if len(units) == 1 else ""
         figure.colorbar(points, ax=figure.axes, label=f"sum of the controls{unit}")
     return figure

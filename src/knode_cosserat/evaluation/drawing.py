@@ -151,20 +151,22 @@ def one_of(trajectory: Trajectory) -> Trajectory:
 # views
 
 
-def by_label(given: Trajectory | Tips | Mapping[str, Any], what: str = "trajectories") -> dict[str, Any]:
+def by_label(
+    trajectories: Trajectory | Tips | Mapping[str, Any], what: str = "trajectories"
+) -> dict[str, Any]:
     """Return trajectories by label; a single trajectory gets an empty label.
 
     Raises `ValueError` if there is none, and `TypeError` if a value has no tip positions.
     """
-    found = dict(given) if isinstance(given, Mapping) else {"": given}
-    if not found:
+    labelled = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
+    if not labelled:
         raise ValueError(f"there are no {what} to draw; at least one is needed")
-    for label, one in found.items():
+    for label, one in labelled.items():
         if not hasattr(one, "tip_position"):
             allowed = "a trajectory, or a dict of trajectories by their labels"
             named = f" {label!r}" if label else ""
             raise TypeError(f"{what}{named}: {type(one).__name__} given; allowed is {allowed}")
-    return found
+    return labelled
 
 
 def path_of(one: Tips | ArrayLike) -> NDArray[np.float64]:
