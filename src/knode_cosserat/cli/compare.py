@@ -27,7 +27,7 @@ from knode_cosserat.cli.arguments import (
     require_writable,
     trajectories_by_name,
 )
-from knode_cosserat.cli.identify import evaluate_on_recordings
+from knode_cosserat.cli.learn import evaluate_on_recordings
 from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 
