@@ -74,8 +74,8 @@ def reel() -> dict[str, Any]:
         bending_damping=5e-4, drag=1e-4, gravity=(9.81, 0.0, 0.0), tendon_offset=0.01506,
         tendon_angles=(np.pi / 2,), tendon_compliance=1e-4, drive="reel", nodes=200,
     )  # fmt: skip
-    pulled = kc.named_controls.parse(robot, "reel=ramp:0.01619,start=1,end=1.3", 500, DT)
-    released = kc.named_controls.parse(robot, "reel=ramp:0.01619,start=13,end=13.3", 500, DT)
+    pulled = kc.controls.parse("reel=ramp:0.01619,start=1,end=1.3", 500, DT, robot)
+    released = kc.controls.parse("reel=ramp:0.01619,start=13,end=13.3", 500, DT, robot)
     hanging = kc.equilibrium(robot, np.zeros(1))
     moved = kc.simulate(robot, pulled - released, DT, initial=hanging, **PAPER)
     times = [

@@ -361,7 +361,7 @@ PUBLISHED = {
 def print_table(controls: dict[str, np.ndarray], retry: bool) -> None:
     """Print each imperfect model's distance from the true robot beside the published one."""
     # Imported here so that the transcription itself needs nothing but NumPy and SciPy.
-    from knode_cosserat.evaluation.metrics import pose_mse, tip_dtw
+    from knode_cosserat.metrics import pose_mse, tip_dtw
 
     print("Every step solved" if retry else "As published: one fsolve a step, unchecked")
     print(f"{'imperfection':<20}{'control':<9}{'DTW':>7}{'paper':>8}{'MSE':>8}{'paper':>8}  notes")

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.metrics import rms_distance
+from knode_cosserat.metrics import rms_distance
 from knode_cosserat.recordings import load_example
 
 #: the paper's simulation study (studies/simulation.py): time step (s), rows of training and of evaluation,

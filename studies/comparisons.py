@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.metrics import PoseHistory, pose_mse, tip_dtw
+from knode_cosserat.metrics import PoseHistory, pose_mse, tip_dtw
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory

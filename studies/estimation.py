@@ -12,8 +12,8 @@ import numpy as np
 from knode_cosserat.evaluation.comparison import METHODS as LINES
 from knode_cosserat.evaluation.comparison import REFERENCE, legend_below
 from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.state_errors import state_errors
 from knode_cosserat.evaluation.style import TWO_COLUMNS, style
+from knode_cosserat.metrics import state_errors
 from knode_cosserat.recordings.estimation.estimate import Method, estimate_states
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.virtual import Sensors, record_virtual, virtual_robot

@@ -23,6 +23,22 @@ def limit_size(patch, module, path):
     patch.setattr(module, "LARGEST_FILE", path.stat().st_size - 1)
 
 
+def limited(file, module, limits):
+    """Return a reader for `assert_limited`: of a file, with limits of a module.
+
+    `file` takes a folder, and returns the path and a function that reads it. A limit of None is one byte
+    less than the file has.
+    """
+
+    def reader(folder, patch):
+        path, read = file(folder)
+        for name, value in limits.items():
+            patch.setattr(module, name, path.stat().st_size - 1 if value is None else value)
+        return read
+
+    return reader
+
+
 def assert_limited(reader, folder, monkeypatch):
     """Assert that a file is refused, and read with ten times the limits."""
     monkeypatch.delenv(VARIABLE, raising=False)

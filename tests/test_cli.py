@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.metrics import dtw_distance
+from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
 # help
@@ -271,7 +271,7 @@ def test_info_tells_controls_as_they_are_given():
     for robot in (ROBOT, "six-legged-robot", "soft-slender-robot"):
         facts, words = told("info", robot), succeeded("info", robot)
         layout = kc.load_robot(robot).control_layout
-        assert list(facts["controls"]) == kc.named_controls.labels(layout)
+        assert list(facts["controls"]) == kc.controls.labels(layout)
         for field in layout.fields:
             names = [name for name in facts["controls"] if name.startswith(field.name)]
             assert facts["controls"][names[0]] == {"unit": field.unit, "meaning": field.meaning}

@@ -266,7 +266,7 @@ def test_files_figures_and_the_viewer_take_every_robot(kind, tmp_path):
     kc.viewer.export_scene(trajectory, tmp_path / "a.html")
     assert drawing.drawing(robot, np.arange(robot.nodes))["model"] is isinstance(robot, kc.KNODE)
     assert len(drawing.sliders(robot)) == robot.control_layout.size
-    assert kc.named_controls.parse(robot, "constant:1.0", 3, DT).shape == (3, robot.control_layout.size)
+    assert kc.controls.parse("constant:1.0", 3, DT, robot).shape == (3, robot.control_layout.size)
 
 
 def same(found: kc.System, expected: kc.System) -> None:

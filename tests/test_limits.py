@@ -12,9 +12,7 @@ from knode_cosserat._files import csv_rows, limits, yaml_text
 from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
 from knode_cosserat.envs import policy
-from tests.limits import Readers, assert_limited, limit_size
-
-READERS = Readers()
+from tests.limits import assert_limited, limited
 
 
 @pytest.fixture(autouse=True)
@@ -22,103 +20,73 @@ def unset(monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
 
 
-@READERS
-def yaml_characters(folder, patch):
-    patch.setattr(yaml_text, "MOST_CHARACTERS", 10)
-    return lambda: yaml_text.mapping_of("a: 12345678", "a")
+# files, and functions that read them
 
 
-@READERS
-def yaml_bytes(folder, patch):
-    patch.setattr(yaml_text, "MOST_CHARACTERS", 3)
+def text(folder, words="a: 1234567890"):
     path = folder / "it.yaml"
-    path.write_text("a: 1234567890")
-    return lambda: yaml_text.read_yaml(path)
+    path.write_text(words)
+    return path, lambda: yaml_text.read_yaml(path)
 
 
-@READERS
-def yaml_aliases(folder, patch):
-    patch.setattr(yaml_text, "MOST_VALUES", 5)
-    return lambda: yaml_text.mapping_of("a: &a [1, 2]\nb: *a", "a")
+def mapping(folder):
+    return None, lambda: yaml_text.mapping_of("a: &a [1, 2]\nb: *a", "a")
 
 
-def tensions(folder):
+def tensions(folder, dt=None):
     path = folder / "tensions.csv"
     controls.save(path, np.full((30, 4), 5.0), 0.05)
-    return path
+    return path, lambda: controls.load(path, dt)
 
 
-@READERS
-def controls_size(folder, patch):
-    path = tensions(folder)
-    limit_size(patch, csv_rows, path)
-    return lambda: controls.load(path)
-
-
-@READERS
-def controls_lines(folder, patch):
-    patch.setattr(csv_rows, "MOST_LINES", 30)
-    return lambda: controls.load(tensions(folder))
-
-
-@READERS
-def controls_columns(folder, patch):
-    patch.setattr(csv_rows, "MOST_COLUMNS", 4)
-    return lambda: controls.load(tensions(folder))
-
-
-@READERS
-def controls_steps(folder, patch):
-    patch.setattr(csv_rows, "MOST_STEPS", 100)
-    return lambda: controls.load(tensions(folder), 0.005)
-
-
-@READERS
-def reference_size(folder, patch):
-    patch.setattr(csv_rows, "LARGEST_FILE", 20)
+def reference(folder):
     path = folder / "it.csv"
     path.write_text("t,x,y\n0,0.1,0.1\n1,0.1,0.2\n")
-    return lambda: parsed_reference(str(path))
+    return path, lambda: parsed_reference(str(path))
 
 
-def saved_policy(folder, compress=False):
+def saved_policy(folder):
     path = folder / "policy.npz"
     layers = ((np.zeros((3, 500)), np.ones(500)), (np.zeros((500, 1)), np.ones(1)))
     policy.Policy(layers, np.zeros(3), np.ones(3)).save(path)
-    if compress:
-        with zipfile.ZipFile(path) as packed:
-            content = {each: packed.read(each) for each in packed.namelist()}
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
-            for name, data in content.items():
-                packed.writestr(name, data)
-    return path
+    return path, lambda: policy.Policy.load(path)
 
 
-@READERS
-def policy_size(folder, patch):
-    path = saved_policy(folder)
-    limit_size(patch, policy, path)
-    return lambda: policy.Policy.load(path)
-
-
-@READERS
-def policy_size_when_unpacked(folder, patch):
-    path = saved_policy(folder, compress=True)
+def packed_policy(folder):
+    path, read = saved_policy(folder)
     with zipfile.ZipFile(path) as packed:
-        size = sum(entry.file_size for entry in packed.infolist())
-    patch.setattr(policy, "LARGEST_FILE", size - 1)
-    return lambda: policy.Policy.load(path)
+        content = {each: packed.read(each) for each in packed.namelist()}
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
+        for name, data in content.items():
+            packed.writestr(name, data)
+    return path, read
 
 
-@READERS
-def policy_layers(folder, patch):
-    patch.setattr(policy, "MOST_LAYERS", 1)
-    return lambda: policy.Policy.load(saved_policy(folder))
+#: size of the policy's arrays in an archive
+UNPACKED = 8 * (3 * 500 + 500 + 500 + 1 + 3 + 3)
 
 
-@pytest.mark.parametrize("name", READERS)
-def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(name, tmp_path, monkeypatch):
-    assert_limited(READERS[name], tmp_path, monkeypatch)
+@pytest.mark.parametrize(
+    ("file", "module", "limit", "value"),
+    [
+        # None: one byte less than the file has
+        (mapping, yaml_text, "MOST_CHARACTERS", 10),
+        (text, yaml_text, "MOST_CHARACTERS", 3),
+        (mapping, yaml_text, "MOST_VALUES", 5),
+        (tensions, csv_rows, "LARGEST_FILE", None),
+        (tensions, csv_rows, "MOST_LINES", 30),
+        (tensions, csv_rows, "MOST_COLUMNS", 4),
+        (lambda folder: tensions(folder, 0.005), csv_rows, "MOST_STEPS", 100),
+        (reference, csv_rows, "LARGEST_FILE", 20),
+        (saved_policy, policy, "LARGEST_FILE", None),
+        (packed_policy, policy, "LARGEST_FILE", UNPACKED),
+        (saved_policy, policy, "MOST_LAYERS", 1),
+    ],
+)
+def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(
+    tmp_path, monkeypatch, file, module, limit, value
+):
+    assert_limited(limited(file, module, {limit: value}), tmp_path, monkeypatch)
 
 
 # the setting

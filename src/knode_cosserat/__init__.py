@@ -2,9 +2,9 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `recordings`, `statics`,
-`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `named_controls`,
-`envs` and `sweeps`. Drivers of robots are a distribution of their own, `knode_cosserat_hardware`. Events are
-logged to the logger "knode_cosserat", which is quiet unless a handler is added.
+`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `envs` and `sweeps`.
+Drivers of robots are a distribution of their own, `knode_cosserat_hardware`. Events are logged to the logger
+"knode_cosserat", which is quiet unless a handler is added.
 """
 
 import logging
@@ -23,7 +23,6 @@ if TYPE_CHECKING:
         identification,
         learning,
         metrics,
-        named_controls,
         recordings,
         robots,
         solvers,
@@ -72,7 +71,6 @@ __all__ = [
     "load_robot",
     "load_trajectory",
     "metrics",
-    "named_controls",
     "recordings",
     "robots",
     "save_robot",

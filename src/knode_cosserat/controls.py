@@ -1,9 +1,9 @@
-"""Tendon tensions over time, as arrays (steps, tendons) in N: the studies' signals, and CSV files.
+"""Controls over time, as arrays (steps, c): signals, words of the command line, and CSV files.
 
 `simulate` applies row i (from 0) from time i dt to (i + 1) dt. Signals that are functions of time are
 evaluated at the middle of that step, so that what is held is the signal on average; with `sampled="end"` at
-its end, t = (i + 1) dt, as in the paper's studies. Tendons are numbered from 0 in
-arguments, from 1 in files.
+its end, t = (i + 1) dt, as in the paper's studies. The functions make tensions in N; tendons are numbered
+from 0 in arguments, from 1 in files. `parse` makes the controls of any robot.
 """
 
 from __future__ import annotations
@@ -13,40 +13,32 @@ import difflib
 import inspect
 import os
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files.writing import replacing
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
 from knode_cosserat.errors import KnodeCosseratError
 
+if TYPE_CHECKING:
+    from knode_cosserat.rods.layout import Layout
+    from knode_cosserat.rods.system import System
+
 __all__ = [
-    "SPECIFICATIONS",
-    "TENSION_UNITS",
-    "Controls",
-    "ControlsError",
-    "Tensions",
-    "constant",
-    "constant_control",
-    "load",
-    "parse",
-    "ramp",
-    "random",
-    "save",
-    "sine",
-    "step",
-]
+    "Controls", "ControlsError", "constant", "load", "parse", "ramp", "random", "save", "sine", "step",
+]  # fmt: skip
 
 #: factor from a unit that a file may use to newtons
 TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
 
-
+Array = Float[np.ndarray, "steps c"]
 Tensions = Float[np.ndarray, "steps tendons"]
 #: time in each step at which a signal is evaluated
 Sampled = Literal["middle", "end"]
@@ -70,6 +62,28 @@ class Controls(NamedTuple):
         return f"Controls: {rows} steps of {self.dt:g} s; {count_of(tendons, 'tendon')}, {span}"
 
 
+# names
+
+
+def labels(layout: Layout) -> list[str]:
+    """Return the name of every number of a control: its field's, numbered from 1 in a field of several."""
+    return [
+        field.name if field.size == 1 else f"{field.name}_{k + 1}"
+        for field in layout.fields
+        for k in range(field.size)
+    ]
+
+
+def units(layout: Layout) -> list[str]:
+    """Return the unit of every number of a control."""
+    return [field.unit for field in layout.fields for _ in range(field.size)]
+
+
+def titles(layout: Layout) -> list[str]:
+    """Return the names with their units, as the column titles of a file: `reel_1 [m]`."""
+    return [f"{name} [{unit}]" for name, unit in zip(labels(layout), units(layout), strict=True)]
+
+
 # signals
 
 
@@ -79,9 +93,9 @@ def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
     Raises:
         ControlsError: an argument is not possible; likewise in every function here.
     """
-    require_numbers(tension=tension)
-    require_counts(steps=steps, tendons=tendons)
-    return checked_tensions(np.full((steps, tendons), float(tension)), "constant")
+    _require_numbers(tension=tension)
+    _require_counts(steps=steps, tendons=tendons)
+    return _checked_tensions(np.full((steps, tendons), float(tension)), "constant")
 
 
 def sine(
@@ -89,12 +103,15 @@ def sine(
     sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
-    require_numbers(base=base, amplitude=amplitude)
-    require_counts(tendons=tendons)
+    _require_numbers(base=base, amplitude=amplitude)
+    _require_counts(tendons=tendons)
     phase = 2 * np.pi * np.arange(tendons) / tendons
     t = step_times(steps, dt, sampled)
-    _require_period(period, float(t[-1]))
-    return checked_tensions(sine_values(t[:, None], period, base, amplitude, phase), "sine")
+    _require_positive("period", period)
+    # 2πt/period has to be finite
+    if not period > (least := 8.0 * (float(t[-1]) / np.finfo(float).max)):
+        raise ControlsError(f"period is {period!r}; allowed is a number of seconds above {least:g}")
+    return _checked_tensions(sine_values(t[:, None], period, base, amplitude, phase), "sine")
 
 
 def step(
@@ -102,9 +119,9 @@ def step(
     tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
-    require_numbers(at=at)
+    _require_numbers(height=height, base=base, at=at)
     t = step_times(steps, dt, sampled)
-    return _raised("step", height, step_values(t, 1.0, 0.0, at, dt), base, tendons, count)
+    return _in_tendons("step", step_values(t, height, base, at, dt), base, tendons, count)
 
 
 def ramp(
@@ -118,29 +135,29 @@ def ramp(
     t = step_times(steps, dt, sampled)
     if end is None:
         end = float(t[-1])
-        require_numbers(start=start)
+        _require_numbers(start=start)
         if end <= start:
             raise ControlsError(
                 f"ramp: start is {start!r} s; allowed is a time before the last step, {end:g} s; "
-                f"use {steps_until(start, dt, sampled, after=True)} steps or more, or an earlier start"
+                f"use {_steps_until(start, dt, sampled, after=True)} steps or more, or an earlier start"
             )
-    require_numbers(start=start, end=end)
+    _require_numbers(height=height, base=base, start=start, end=end)
     if end <= start:
         raise ControlsError(f"ramp: end is {end!r} s; allowed is a time after its start, {start!r} s")
-    return _raised("ramp", height, ramp_values(t, 1.0, 0.0, start, end), base, tendons, count)
+    return _in_tendons("ramp", ramp_values(t, height, base, start, end), base, tendons, count)
 
 
 def random(
     steps: int, *, low: float = 5.0, high: float = 10.0, seed: int = 0, tendons: int = 4, hold: int = 1
 ) -> Tensions:
     """Return independent uniform samples between `low` and `high` (N), each held for `hold` steps."""
-    require_counts(steps=steps, tendons=tendons, hold=hold)
-    require_counts(least=0, seed=seed)
-    require_numbers(low=low, high=high)
+    _require_counts(steps=steps, tendons=tendons, hold=hold)
+    _require_counts(least=0, seed=seed)
+    _require_numbers(low=low, high=high)
     if high < low:
         raise ControlsError(f"random: high is {high!r} N; allowed is a tension from low, {low!r} N, on")
     draws = np.random.default_rng(seed).uniform(low, high, (-(-steps // hold), tendons))
-    return checked_tensions(np.repeat(draws, hold, axis=0)[:steps], "random")
+    return _checked_tensions(np.repeat(draws, hold, axis=0)[:steps], "random")
 
 
 # values of signals at times t (s), without checks; numbers may be arrays that broadcast
@@ -161,22 +178,19 @@ def ramp_values(t: Any, height: Any, base: Any, start: Any, end: Any) -> Any:
     return base + height * np.clip((t - start) / (end - start), 0.0, 1.0)
 
 
-def _raised(
-    signal: str, height: float, part: np.ndarray, base: float, tendons: Sequence[int], count: int
-) -> Tensions:
-    require_counts(count=count)
-    require_numbers(height=height, base=base)
+def _in_tendons(signal: str, values: np.ndarray, base: float, tendons: Sequence[int], count: int) -> Tensions:
+    _require_counts(count=count)
     if not set(tendons) <= set(range(count)):
         raise ControlsError(f"{signal}: tendons is {tendons!r}; allowed is numbers from 0 to {count - 1}")
-    tensions = np.full((len(part), count), float(base))
-    tensions[:, [int(k) for k in tendons]] += height * part[:, None]
-    return checked_tensions(tensions, signal)
+    tensions = np.full((len(values), count), float(base))
+    tensions[:, [int(k) for k in tendons]] = values[:, None]
+    return _checked_tensions(tensions, signal)
 
 
 def step_times(steps: int, dt: float, sampled: Sampled = "middle") -> np.ndarray:
     """Return the times (s) at which a signal is evaluated: the middles of steps of dt (s), or their ends."""
-    require_counts(steps=steps)
-    require_positive("dt", dt)
+    _require_counts(steps=steps)
+    _require_positive("dt", dt)
     if sampled not in get_args(Sampled):
         raise ControlsError(f'sampled is {sampled!r}; allowed is "middle" or "end"')
     return (np.arange(1, steps + 1) - _EARLIER[sampled]) * dt
@@ -186,7 +200,7 @@ def step_times(steps: int, dt: float, sampled: Sampled = "middle") -> np.ndarray
 _EARLIER = {"middle": 0.5, "end": 0.0}
 
 
-def steps_until(t: float, dt: float, sampled: Sampled, after: bool = False) -> int:
+def _steps_until(t: float, dt: float, sampled: Sampled, after: bool = False) -> int:
     """Return the number of steps of dt (s) of which the last is evaluated at time t (s), or later.
 
     With `after`, only later.
@@ -195,7 +209,7 @@ def steps_until(t: float, dt: float, sampled: Sampled, after: bool = False) -> i
     return int(np.floor(steps + SAME_TIME)) + 1 if after else int(np.ceil(steps - SAME_TIME))
 
 
-def checked_tensions(tensions: Tensions, signal: str) -> Tensions:
+def _checked_tensions(tensions: Tensions, signal: str) -> Tensions:
     """Return tensions that are finite and not negative. Raises `ControlsError` otherwise."""
     wrong = tensions[~(np.isfinite(tensions) & (tensions >= 0.0))]
     if wrong.size:
@@ -203,28 +217,20 @@ def checked_tensions(tensions: Tensions, signal: str) -> Tensions:
     return tensions
 
 
-def require_numbers(**values: Any) -> None:
+def _require_numbers(**values: Any) -> None:
     """Raise `ControlsError` unless all values are finite numbers."""
     for name, value in values.items():
         if not _is_number(value):
             raise ControlsError(f"{name} is {value!r}; allowed is a finite number")
 
 
-def require_positive(name: str, value: Any) -> None:
+def _require_positive(name: str, value: Any) -> None:
     """Raise `ControlsError` unless a time (s) is above 0."""
     if not (_is_number(value) and value > 0.0):
         raise ControlsError(f"{name} is {value!r}; allowed is a number of seconds above 0")
 
 
-def _require_period(period: Any, last: float) -> None:
-    """Raise `ControlsError` if 2πt/period is not finite at all times up to the last (s)."""
-    require_positive("period", period)
-    least = 8.0 * (last / np.finfo(float).max)
-    if not period > least:
-        raise ControlsError(f"period is {period!r}; allowed is a number of seconds above {least:g}")
-
-
-def require_counts(least: int = 1, **values: Any) -> None:
+def _require_counts(least: int = 1, **values: Any) -> None:
     """Raise `ControlsError` unless all values are whole numbers, at least `least`."""
     for name, value in values.items():
         if not isinstance(value, int | np.integer) or isinstance(value, bool) or value < least:
@@ -237,8 +243,8 @@ def _is_number(value: Any) -> bool:
     return bool(np.isfinite(value))
 
 
-def require_effect(
-    signal: str, arguments: dict[str, Any], values: Float[np.ndarray, "steps ..."], steps: int, dt: float,
+def _require_effect(
+    signal: str, arguments: Mapping[str, Any], values: Float[np.ndarray, "steps ..."], dt: float,
     sampled: Sampled = "middle",
 ) -> None:  # fmt: skip
     """Raise `ControlsError` if a signal does nothing during a run: a step or ramp after the end, for example.
@@ -247,7 +253,6 @@ def require_effect(
         signal: "sine", "step" or "ramp".
         arguments: its arguments by name. A height or amplitude of 0 is taken as intended.
         values: the signal in all steps.
-        steps: number of time steps.
         dt: time step (s).
         sampled: time in each step at which it was evaluated.
     """
@@ -261,16 +266,14 @@ def require_effect(
             f"{dt:g} s; use a longer period, or a time step of at most {period / 8:g} s"
         )
     option = "at" if signal == "step" else "start"
-    begin = arguments[option]
-    if (
-        begin <= (1.0 - _EARLIER[sampled]) * dt
-    ):  # a step that acts from the first time step on is constant, too
-        return
-    needed = steps_until(begin, dt, sampled, after=signal == "ramp")
-    raise ControlsError(
-        f"the {signal} starts at {begin:g} s, after the end of the run ({steps} steps of {dt:g} s: "
-        f"{steps * dt:g} s); use {needed} steps or more, or {option}=0"
-    )
+    begin, steps = arguments[option], len(values)
+    # a step that acts from the first time step on is constant, too
+    if begin > (1.0 - _EARLIER[sampled]) * dt:
+        raise ControlsError(
+            f"the {signal} starts at {begin:g} s, after the end of the run ({steps} steps of {dt:g} s: "
+            f"{steps * dt:g} s); use {_steps_until(begin, dt, sampled, after=signal == 'ramp')} steps or "
+            f"more, or {option}=0"
+        )
 
 
 # files
@@ -287,8 +290,8 @@ def save(path: str | Path, tensions: Any, dt: float) -> None:
         raise ControlsError(f"tensions are not numbers ({error}); allowed is (steps, tendons)") from None
     if tensions.ndim != 2 or 0 in tensions.shape:
         raise ControlsError(f"tensions have shape {tensions.shape}; allowed is (steps, tendons)")
-    checked_tensions(tensions, str(path))
-    require_positive("dt", dt)
+    _checked_tensions(tensions, str(path))
+    _require_positive("dt", dt)
     names = [f"tension_{k + 1} [N]" for k in range(tensions.shape[1])]
     try:
         with replacing(Path(path)) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
@@ -316,7 +319,7 @@ def load(path: str | Path, dt: float | None = None) -> Controls:
         ControlsError: the file cannot be read; the message names the line and the column.
     """
     if dt is not None:
-        require_positive("dt", dt)
+        _require_positive("dt", dt)
     time, tensions = _read(Path(path))
     if dt is None:
         return Controls(tensions, _own_step(path, time))
@@ -382,87 +385,119 @@ def _column(where: str, title: str) -> Column:
     return Column(title, int(tendon), units[unit], 0.0, "a finite number, 0 or more (a pull)")
 
 
-# the command line
+# words
 
 
 class _Signal(NamedTuple):
-    make: Callable[..., Tensions]
+    """Signal of a word: its function, the name of its first number, and parsers of its other arguments."""
+
+    make: Callable[..., Any]
     main: str
-    #: optional named arguments, each with its parser
-    options: dict[str, Callable[[str], Any]]
-    #: name of the function's argument for the number of tendons
-    tendon_count: str = "tendons"
+    options: Mapping[str, Callable[[str], Any]]
 
 
 def _tendons(text: str) -> tuple[int, ...]:
     return tuple(int(number) - 1 for number in text.split("+"))
 
 
-_SIGNALS = {
+#: signals of all tendons
+_TENSIONS = {
     "sine": _Signal(sine, "period", {"base": float, "amplitude": float}),
-    "step": _Signal(step, "height", {"base": float, "at": float, "tendons": _tendons}, "count"),
-    "ramp": _Signal(
-        ramp, "height", {"base": float, "start": float, "end": float, "tendons": _tendons}, "count"
-    ),
+    "step": _Signal(step, "height", {"base": float, "at": float, "tendons": _tendons}),
+    "ramp": _Signal(ramp, "height", {"base": float, "start": float, "end": float, "tendons": _tendons}),
     "random": _Signal(random, "seed", {"low": float, "high": float, "hold": int}),
     "constant": _Signal(constant, "tension", {}),
 }
 
-#: specifications that `parse` accepts, for help texts
-SPECIFICATIONS = (
-    ", ".join(f"{name}:{it.main.upper()}" for name, it in _SIGNALS.items())
+_SPECIFICATIONS = (
+    ", ".join(f"{name}:{signal.main.upper()}" for name, signal in _TENSIONS.items())
     + ", one number for each tendon, or a CSV file"
 )
 
 
 def parse(
-    specification: str, steps: int | None, dt: float, *, tendons: int = 4, sampled: Sampled = "middle"
-) -> Tensions:
-    """Return tensions from one word, as on the command line.
+    specification: str, steps: int | None, dt: float, robot: System | Layout | int = 4,
+    sampled: Sampled = "middle",
+) -> Array:  # fmt: skip
+    """Return controls (steps, c) from one word, as on the command line.
 
-    `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`: the signal and its first number (period in s,
-    height in N, height in N, seed, tension in N). Other arguments have names: `sine:1.5,base=8,amplitude=2`,
-    `step:1.5,at=2,tendons=1+4` (tendons numbered from 1). Numbers are constant tensions, one for each tendon:
-    `7,5,5,7` or `constant:7,5,5,7`. Anything else is a CSV file, sampled at dt.
+    Words of tensions are for all tendons: `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`, that
+    is, the signal and its first number (period in s, height in N, height in N, seed, tension in N). Other
+    arguments have names: `sine:1.5,base=8,amplitude=2`, `step:1.5,at=2,tendons=1+4` (tendons from 1).
+
+    For any controls of a robot, the word has signals by name: `tension_4=ramp:2`, or
+    `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
+    control is given at most once, and the others are zero; `none` stands for zeros. Signals are a number or
+    `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
+    `sine:PERIOD[,base=,amplitude=,phase=]`.
+
+    Numbers are a constant control, one for each: `7,5,5,7` or `constant:7,5,5,7`. Anything else is a CSV file
+    of tensions, as for `load`, or with the columns `time [s]` and any names of controls with their units; it
+    is sampled at dt.
 
     Args:
-        specification: signal or file, as above.
+        specification: signals, numbers or file, as above.
         steps: number of steps; None, for a file only: all steps of the file.
         dt: time step (s).
-        tendons: number of tendons of the robot.
-        sampled: time in each step at which a signal is evaluated, "middle" or "end".
+        robot: the robot, its control layout, or the number of tendons of a robot with tensions only.
+        sampled: time in each step at which a signal for all tendons is evaluated, "middle" or "end". Signals
+            by name are evaluated at the middle; displacements and rotations at the end, because `simulate`
+            changes these gradually until then.
 
     Raises:
         ControlsError: the specification is not understood, the file is invalid or too short, or the signal
             has no effect during the run, such as a step after its end.
     """
-    require_positive("dt", dt)
-    name, colon, rest = specification.partition(":")
-    held = constant_control(specification, tendons)
-    if held is not None:
-        count = _required_steps(specification, steps)
-        return checked_tensions(np.tile(held, (count, 1)), f"controls {specification!r}")
-    if os.path.exists(specification) and not (colon and name in _SIGNALS):
-        return _from_file(specification, steps, dt, tendons)
-    if name not in _SIGNALS:
-        close = difflib.get_close_matches(name, _SIGNALS, n=1)
-        hint = f"; did you mean {close[0]}:{_SIGNALS[close[0]].main.upper()}?" if close else ""
-        if "=" in name:
-            hint = "; NAME=SIGNAL is for named_controls.parse, and for --controls"
+    # its import takes long, and readers of recordings use the units of this module
+    from knode_cosserat.rods.layout import Layout
+
+    if isinstance(robot, int):
+        robot = Layout(("tension", robot, "N", "tendon tension"))
+    layout = robot if isinstance(robot, Layout) else robot.control_layout
+    _require_positive("dt", dt)
+    if steps is not None:
+        _require_counts(steps=steps)
+    name, _, rest = specification.partition(":")
+    is_tension = layout.names == ("tension",)
+    is_signal = is_tension and name in _TENSIONS
+    if os.path.exists(specification) and not (is_signal and rest):
+        return _from_file(specification, layout, steps, dt)
+    held = _constant_control(specification, layout.size)
+    is_named = not is_tension or _is_named(specification)
+    if held is None and not (is_named or is_signal):
+        close = difflib.get_close_matches(name, _TENSIONS, n=1)
+        hint = f"; did you mean {close[0]}:{_TENSIONS[close[0]].main.upper()}?" if close else ""
         raise ControlsError(
-            f"controls {specification!r}: no such signal or file; allowed is {SPECIFICATIONS}{hint}"
+            f"controls {specification!r}: no such signal or file; allowed is {_SPECIFICATIONS}{hint}"
         )
-    count = _required_steps(specification, steps)
-    try:
-        return _from_signal(name, rest, count, (dt, sampled), tendons)
-    except ControlsError as error:
-        raise ControlsError(f"controls {specification!r}: {error}") from None
+    if steps is None:
+        raise ControlsError(
+            f"controls {specification!r}: the number of steps is not given; only a file states its own"
+        )
+    if held is not None:
+        values = np.tile(held, (steps, 1))
+    elif is_named:
+        words = [] if specification.strip() == "none" else specification.split(";")
+        places: tuple[Sampled, ...] = ("middle", "end")
+        values = parse_signals(layout, words, {place: step_times(steps, dt, place) for place in places})
+    else:
+        try:
+            return _tension_signal(name, rest, steps, (dt, sampled), layout.size)
+        except ControlsError as error:
+            raise ControlsError(f"controls {specification!r}: {error}") from None
+    return _checked_tensions(values, f"controls {specification!r}") if is_tension else values
 
 
-def constant_control(specification: str, size: int) -> np.ndarray | None:
+def _is_named(specification: str) -> bool:
+    """True for `NAME=SIGNAL;…` and `none`; words such as `sine:2,base=5` are for all tendons."""
+    name, equals, _ = specification.partition("=")
+    return specification.strip() == "none" or bool(equals and not set(":,") & set(name))
+
+
+def _constant_control(specification: str, size: int) -> np.ndarray | None:
     """Return a constant control (size,) given by its numbers: `7,5,5,7`, or with `constant:` before them.
 
-    None if the specification is something else, such as a signal, a file, or `constant:` and one number.
+    None if the specification is something else, such as a signal, or `constant:` and one number.
 
     Raises:
         ControlsError: there are not as many numbers as controls.
@@ -470,8 +505,6 @@ def constant_control(specification: str, size: int) -> np.ndarray | None:
     text = specification.strip().removeprefix("constant:")
     numbers = numbers_in(text)
     if numbers is None or (text != specification.strip() and len(numbers) == 1):
-        return None
-    if os.path.exists(specification):
         return None
     if len(numbers) != size or not np.all(np.isfinite(numbers)):
         example = ",".join(["7", "5", "5", "7", *["5"] * size][:size]) or "none"
@@ -482,66 +515,187 @@ def constant_control(specification: str, size: int) -> np.ndarray | None:
     return np.array(numbers)
 
 
-def _required_steps(specification: str, steps: int | None) -> int:
-    if steps is None:
+def _from_file(path: str, layout: Layout, steps: int | None, dt: float) -> Array:
+    """Return a file's columns, each row held until the next row's time; other controls are zero."""
+    if layout.names == ("tension",):
+        rows = load(path, dt).tensions
+        if rows.shape[1] != layout.size:
+            raise ControlsError(f"{path}: there are {rows.shape[1]} tendons; the robot has {layout.size}")
+    else:
+        known = ["time [s]", *titles(layout)]
+
+        def columns_of(where: str, stated: list[str]) -> list[Column]:
+            if not {"time [s]"} <= set(stated) <= set(known) or len(set(stated)) < len(stated):
+                raise ControlsError(
+                    f"{where}: the columns are {', '.join(stated)}; "
+                    f"allowed is time [s], and any of {', '.join(known[1:]) or 'none'}, once each"
+                )
+            return [Column(title, known.index(title)) for title in stated]
+
+        try:
+            time, values, places = read_rows(Path(path), f"a header `{','.join(known)}`", columns_of)
+            held = held_rows(path, time, dt)
+        except CSVTextError as error:
+            raise ControlsError(str(error)) from None
+        rows = np.zeros((len(held), layout.size))
+        rows[:, [place - 1 for place in places]] = values[held]
+    if steps is not None and steps > len(rows):
         raise ControlsError(
-            f"controls {specification!r}: the number of steps is not given; only a file states its own"
+            f"{path}: there are {len(rows)} steps of {dt:g} s; {steps} are requested; "
+            f"allowed is up to {len(rows)}"
         )
-    require_counts(steps=steps)
-    return steps
+    return rows[:steps]
 
 
-def _from_file(path: str, steps: int | None, dt: float, tendons: int) -> Tensions:
-    tensions = load(path, dt).tensions
-    if tensions.shape[1] != tendons:
-        raise ControlsError(f"{path}: there are {tensions.shape[1]} tendons; the robot has {tendons}")
-    if steps is None:
-        return tensions
-    require_counts(steps=steps)
-    if len(tensions) < steps:
-        raise ControlsError(
-            f"{path}: there are {len(tensions)} steps of {dt:g} s; {steps} are requested; "
-            f"allowed is up to {len(tensions)}"
-        )
-    return tensions[:steps]
-
-
-def _from_signal(name: str, text: str, steps: int, times: tuple[float, Sampled], tendons: int) -> Tensions:
-    signal = _SIGNALS[name]
+def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
+    """Return the arguments of a signal from the text after its colon: `1.5,base=8`."""
     first, *others = text.split(",")
-    if not first.strip():
-        examples = {"period": "1.5", "height": "1.5", "seed": "0", "tension": "5"}
-        example = f"{name}:{examples[signal.main]}"
-        raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
-    arguments = {signal.main: _read_as(int if signal.main == "seed" else float, signal.main, first)}
+    kinds: dict[str, Any] = {signal.main: int if signal.main == "seed" else float, **signal.options}
+    texts = {signal.main: first}
     for other in others:
         key, _, value = (part.strip() for part in other.partition("="))
-        if key not in signal.options or key in arguments:
+        if key not in signal.options or key in texts:
             allowed = ", ".join(f"{option}=…" for option in signal.options) or "nothing"
             raise ControlsError(f"{other!r} is not understood; allowed after the {signal.main} is {allowed}")
-        arguments[key] = _read_as(signal.options[key], key, value)
-    if "dt" in inspect.signature(signal.make).parameters:
-        arguments |= {"dt": times[0], "sampled": times[1]}
-    if not set(arguments.get("tendons", ())) <= set(range(tendons)):
-        given = "+".join(str(k + 1) for k in arguments["tendons"])
+        texts[key] = value
+    arguments = {}
+    for key, word in texts.items():
+        try:
+            arguments[key] = kinds[key](word)
+        except ValueError:
+            allowed = {int: "a whole number", _tendons: "tendons like 1+4"}.get(kinds[key], "a number")
+            raise ControlsError(f"{key} is {word!r}; allowed is {allowed}") from None
+    return arguments
+
+
+def _tension_signal(name: str, text: str, steps: int, times: tuple[float, Sampled], tendons: int) -> Tensions:
+    """Return a signal of all tendons; `times` are the time step (s) and the time in it."""
+    signal = _TENSIONS[name]
+    if not text.partition(",")[0].strip():
+        example = f"{name}:{ {'seed': '0', 'tension': '5'}.get(signal.main, '1.5') }"
+        raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
+    arguments = _arguments(signal, text)
+    if not set(raised := arguments.get("tendons", ())) <= set(range(tendons)):
+        listed = "+".join(str(k + 1) for k in raised)
         raise ControlsError(
-            f"tendons is {given}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
+            f"tendons is {listed}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
         )
-    tensions = signal.make(steps=steps, **arguments, **{signal.tendon_count: tendons})
+    parameters = inspect.signature(signal.make).parameters
+    arguments |= {"steps": steps, "count" if "count" in parameters else "tendons": tendons}
+    if "dt" in parameters:
+        arguments |= {"dt": times[0], "sampled": times[1]}
+    tensions: Tensions = signal.make(**arguments)
     if name in ("sine", "step", "ramp") and steps > 1:
-        stated = {**_defaults(signal.make), **arguments}
-        require_effect(name, stated, tensions, steps, *times)
+        defaults = {key: parameter.default for key, parameter in parameters.items()}
+        _require_effect(name, defaults | arguments, tensions, *times)
     return tensions
 
 
-def _defaults(function: Callable[..., Any]) -> dict[str, Any]:
-    return {name: each.default for name, each in inspect.signature(function).parameters.items()}
+# signals by name
 
 
-def _read_as(kind: Callable[[str], Any], key: str, text: str) -> Any:
-    try:
-        return kind(text)
-    except ValueError:
-        kinds = {float: "a number", int: "a whole number"}
-        allowed = kinds.get(kind, "tendons like 1+4")  # type: ignore[call-overload]
-        raise ControlsError(f"{key} is {text!r}; allowed is {allowed}") from None
+def parse_signals(
+    layout: Layout, words: Sequence[str], times: Mapping[Sampled, Float[np.ndarray, " steps"]]
+) -> Array:
+    """Return controls (steps, c) from words `NAME=SIGNAL`; see `parse`.
+
+    Signals are evaluated at the times (s) in the "middle" of steps, and displacements and rotations at their
+    "end". Controls without a word are zero.
+    """
+    known = labels(layout)
+    controls = np.zeros((len(times["middle"]), layout.size))
+    sources: dict[int, str] = {}
+    for word in words:
+        entry = word.strip()
+        name, equals, text = (part.strip() for part in entry.partition("="))
+        if not equals:
+            meant = known and name.partition(":")[0] in _SIGNALS
+            raise ControlsError(
+                f"controls {entry!r}: allowed is NAME=SIGNAL;…, one number for each control, `none` "
+                f"or a CSV file; names are {', '.join(known) or 'none'}"
+                + (f"; did you mean {known[0]}={name}?" if meant else "")
+            )
+        if name in layout.names:
+            columns = list(range(*layout.slice(name).indices(layout.size)))
+        elif name in known:
+            columns = [known.index(name)]
+        else:
+            raise ControlsError(
+                f"the control {name!r} is unknown; there are {', '.join(known) or 'none'}"
+                f"{did_you_mean(name, known)}"
+            )
+        sampled: Sampled = "end" if layout.moving[columns[0]] else "middle"
+        # a very short period, for example, overflows: the check below refuses it without a NumPy warning
+        try:
+            with np.errstate(all="ignore"):
+                values = _signal(text, times[sampled], sampled)
+        except ControlsError as error:
+            raise ControlsError(f"controls {entry!r}: {error}") from None
+        if not np.all(np.isfinite(values)):
+            raise ControlsError(
+                f"controls {entry!r}: a value is {values[~np.isfinite(values)][0]}; "
+                "allowed is a signal of finite numbers"
+            )
+        for column in columns:
+            if column in sources:
+                raise ControlsError(
+                    f"controls {entry!r}: {known[column]} is given already, by "
+                    f"{sources[column]!r}; allowed is each control once"
+                )
+            sources[column] = entry
+        controls[:, columns] = values[:, None]
+    return controls
+
+
+def _ramp(t: Any, height: float, *, base: float = 0.0, start: float = 0.0, end: float | None = None) -> Any:
+    last = float(t[-1]) if end is None else end
+    if last <= start:
+        raise ControlsError(
+            f"ramp: start is {start!r} s; allowed is a time before the last step, {last:g} s"
+            if end is None
+            else f"ramp: end is {last!r} s; allowed is a time after its start, {start!r} s"
+        )
+    return ramp_values(t, height, base, start, last)
+
+
+def _step(t: Any, height: float, *, base: float = 0.0, at: float = 0.0) -> Any:
+    return step_values(t, height, base, at, t[0])
+
+
+def _sine(t: Any, period: float, *, base: float = 0.0, amplitude: float = 1.0, phase: float = 0.0) -> Any:
+    if period <= 0.0:
+        raise ControlsError(f"sine: the period is {period!r} s; allowed is a number above 0")
+    return sine_values(t, period, base, amplitude, phase)
+
+
+def _constant(t: Any, value: float) -> Any:
+    return np.full(len(t), value)
+
+
+def _finite(text: str) -> float:
+    if not np.isfinite(value := float(text)):
+        raise ValueError
+    return value
+
+
+_SIGNALS = {
+    "constant": _Signal(_constant, "value", {}),
+    "ramp": _Signal(_ramp, "height", dict.fromkeys(("base", "start", "end"), _finite)),
+    "step": _Signal(_step, "height", dict.fromkeys(("base", "at"), _finite)),
+    "sine": _Signal(_sine, "period", dict.fromkeys(("base", "amplitude", "phase"), _finite)),
+}
+
+
+def _signal(word: str, t: Float[np.ndarray, " steps"], sampled: Sampled) -> Float[np.ndarray, " steps"]:
+    name, _, text = word.partition(":") if numbers_in(word) is None else ("constant", "", word)
+    if name not in _SIGNALS:
+        raise ControlsError(
+            f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}{did_you_mean(name, _SIGNALS)}"
+        )
+    signal = _SIGNALS[name]
+    arguments = _arguments(signal, text)
+    values = np.asarray(signal.make(t, **arguments))
+    if len(t) > 1 and name != "constant" and np.all(np.isfinite(values)):
+        stated = {**(signal.make.__kwdefaults__ or {}), **arguments}
+        _require_effect(name, stated, values, float(t[1] - t[0]), sampled)
+    return values

@@ -1,40 +1,404 @@
 """Figures of trajectories in one style, for a screen or a paper; they need matplotlib, the extra `viz`.
 
 Every function returns a new `matplotlib.figure.Figure`. No window is opened and no global setting changes.
+`figure.savefig("it.pdf")` (or .svg, .png) embeds the fonts. The colours are Okabe and Ito's, and every axis
+has its unit. `columns` sets the width: one column of a paper (3.5 in) or two (7.16 in). `trajectories` is one
+trajectory, or a dict of several by label, which are overlaid. Each is of one robot; unsolved rows stay empty.
+
+Raises, from every function here:
+    ImportError: matplotlib is not installed.
+    ValueError: there is nothing to draw, or a batch is given where one robot is required.
 """
 
-from knode_cosserat.evaluation.control_figures import closed_loop
-from knode_cosserat.evaluation.figures import (
-    animate,
-    compare,
-    curves,
-    error,
-    overview,
-    path,
-    prediction_against_measurement,
-    require_matplotlib,
-    shape,
-    spread,
-    states,
-    tensions,
-    tips,
-    workspace,
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from knode_cosserat.evaluation.animation import animate
+from knode_cosserat.evaluation.comparison import REFERENCE
+from knode_cosserat.evaluation.comparison import comparison as compare
+from knode_cosserat.evaluation.drawing import (
+    AXES,
+    Tips,
+    View,
+    by_label,
+    checked_view,
+    curves_of,
+    draw_tensions,
+    draw_tips,
+    flat_height,
+    legend_above,
+    line,
+    new_figure,
+    one_of,
+    path_of,
+    require_span,
+    spread_rows,
+    tips_of,
+    valid_rows,
 )
+from knode_cosserat.evaluation.recording_figures import prediction_against_measurement
+from knode_cosserat.evaluation.style import (
+    PALETTE,
+    TIME_COLOURS,
+    TWO_COLUMNS,
+    require_matplotlib,
+    style,
+    width_of,
+)
+from knode_cosserat.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from knode_cosserat.control import LoopLog
+    from knode_cosserat.statics.workspace import Workspace
 
 __all__ = [
-    "animate",
-    "closed_loop",
-    "compare",
-    "curves",
-    "error",
-    "overview",
-    "path",
-    "prediction_against_measurement",
-    "require_matplotlib",
-    "shape",
-    "spread",
-    "states",
-    "tensions",
-    "tips",
+    "animate", "closed_loop", "compare", "curves", "error", "overview", "path",
+    "prediction_against_measurement", "require_matplotlib", "shape", "spread", "states", "tensions", "tips",
     "workspace",
-]
+]  # fmt: skip
+
+#: default fields of `states`, if the system has them
+FIELDS = ("q", "w", "n", "m", "v", "u")
+#: largest number of drawn points of a workspace: more only make the file larger
+MOST_POINTS = 100_000
+
+
+def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, columns: int = 1) -> Figure:
+    """Return a figure of the robot at `count` evenly spaced times, coloured by time, and its tip path.
+
+    The view is in space ("xyz"), or along an axis: "xy", "xz", "yz". Views along an axis show obstacles too.
+    """
+    curves = curves_of(one_of(trajectory))
+    view = checked_view(view, curves[0].shape[-1])
+    points = np.concatenate([curve.reshape(-1, curve.shape[-1]) for curve in curves])
+    width = width_of(columns)
+    several = len(trajectory.time) > 1
+    with style():
+        height = flat_height(points, view, width, 1.2 if several else 0.6)
+        figure = new_figure(width, height if len(view) == 2 else 0.85 * width)
+        _draw_shape(figure, trajectory, count, view)
+    return figure
+
+
+def _draw_shape(figure: Any, trajectory: Trajectory, count: int, view: str) -> None:
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    curves, time, path = curves_of(trajectory), np.asarray(trajectory.time), tips_of(trajectory)
+    valid = valid_rows(curves)
+    seen = View(figure, 111, view)
+    colours = ScalarMappable(Normalize(time[0], time[-1]), TIME_COLOURS)
+    shown = spread_rows(valid, count)
+    for row in shown:
+        for curve in curves:
+            seen.axes.plot(
+                *seen.of(curve[row]), color=colours.to_rgba(time[row]), linewidth=1.6, solid_capstyle="round"
+            )
+    label = "path of the tip" if len(time) > 1 else None
+    seen.axes.plot(*seen.of(path), color="#777777", linewidth=0.8, label=label)
+    bases = np.stack([curve[shown[0], 0] for curve in curves[: max(1, len(curves) - 1)]])
+    seen.axes.plot(*seen.of(bases), "s", color="#333333", markersize=3.5, linestyle="none", label="base")
+    points = np.concatenate([curve[valid].reshape(-1, curve.shape[-1]) for curve in curves])
+    seen.frame(points, zoom=0.82)
+    seen.obstacles(trajectory, points)
+    if seen.flat:
+        legend_above(seen.axes)
+    else:
+        seen.axes.legend(loc="upper left", borderaxespad=0.0)
+    if len(time) > 1:
+        looks = {"pad": 0.02} if seen.flat else {"shrink": 0.55, "pad": 0.1}
+        figure.colorbar(colours, ax=seen.axes, label="time [s]", **looks)
+
+
+def path(
+    trajectories: Tips | Mapping[str, Tips | ArrayLike], *, view: str | None = None, columns: int = 1
+) -> Figure:
+    """Return a figure of tip paths in space ("xyz") or along an axis ("xy", "xz", "yz").
+
+    Paths may also be arrays (points, 3) in m. A path whose label begins with "wanted" is drawn wide and pale.
+    """
+    motions = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
+    if not motions:
+        raise ValueError("there are no trajectories to draw; at least one is needed")
+    paths = {label: path_of(one) for label, one in motions.items()}
+    points = np.concatenate(list(paths.values()))
+    view, width = checked_view(view, points.shape[1]), width_of(columns)
+    with style():
+        height = flat_height(points, view, width, 0.8)
+        figure = new_figure(width, height + 0.25 if len(view) == 2 else 0.9 * width)
+        seen = View(figure, 111, view)
+        for i, (label, tip) in enumerate(paths.items()):
+            look = {**line(i), "label": label or None}
+            if label.startswith("wanted"):
+                look |= {"color": "#AAAAAA", "linewidth": 4.0, "linestyle": "-"}
+            seen.axes.plot(*seen.of(tip), **look)
+        seen.frame(points, zoom=0.8)
+        if any(paths):
+            legend_above(seen.axes)
+    return figure
+
+
+def tips(trajectories: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
+    """Return a figure of x, y and z of the tips over time, of trajectories or recordings."""
+    motions = by_label(trajectories)
+    paths = {label: (one.time, tips_of(one)) for label, one in motions.items()}
+    size = min(tip.shape[1] for _, tip in paths.values())
+    with style():
+        figure = new_figure(width_of(columns), 0.4 + 1.15 * size)
+        axes = figure.subplots(size, 1, sharex=True, squeeze=False)[:, 0]
+        draw_tips(axes, paths)
+        figure.align_ylabels()
+        if any(paths):
+            legend_above(axes[0])
+    return figure
+
+
+def states(
+    trajectories: Trajectory | Mapping[str, Trajectory],
+    fields: Sequence[str] | None = None,
+    *,
+    node: int = -1,
+    columns: int = 2,
+) -> Figure:
+    """Return a figure of the state's fields at one node over time: a panel per field, a colour per component.
+
+    `fields` are names of y, z or the controls (`Trajectory.part`); by default velocities, loads and strains.
+    Several trajectories differ by their dashes.
+
+    Raises:
+        KeyError: a field does not exist.
+        ValueError: the node does not exist.
+    """
+    motions = by_label(trajectories)
+    first = one_of(next(iter(motions.values())))
+    layouts = (first.system.y_layout, first.system.z_layout, first.system.control_layout)
+    known = {field.name: field for layout in layouts for field in layout.fields}
+    names = [name for name in FIELDS if name in known] if fields is None else list(fields)
+    names = names or list(known)
+    # `part` also accepts fields of several rods together, which one panel cannot show
+    for name in set(names) - set(known):
+        raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
+    if not -first.y.shape[1] <= node < first.y.shape[1]:
+        raise ValueError(f"node is {node}; the trajectory has {first.y.shape[1]} nodes")
+    across = min(columns, 2, len(names))
+    rows = -(-len(names) // across)
+    with style():
+        figure = new_figure(width_of(columns), 0.5 + 1.5 * rows)
+        grid = figure.subplots(rows, across, sharex=True, squeeze=False).ravel()
+        for axes, name in zip(grid, names, strict=False):
+            for i, (label, one) in enumerate(motions.items()):
+                values = np.asarray(one_of(one).part(name))
+                values = values[:, node] if values.ndim == 3 else values
+                for k in range(values.shape[1]):
+                    colour = PALETTE[k % len(PALETTE)]
+                    component = AXES[k] if values.shape[1] == 3 else f"{k + 1}"
+                    said = f"{component}, {label}" if label else component
+                    axes.plot(one.time, values[:, k], **{**line(i), "color": colour}, label=said)
+            sizes = [np.nanmax(np.abs(np.asarray(one.part(name))), initial=0.0) for one in motions.values()]
+            require_span(axes, 0.01 * max(sizes))
+            unit = f" [{known[name].unit}]" if known[name].unit else ""
+            axes.set(ylabel=f"{name}{unit}", title=known[name].meaning)
+        for axes in grid[len(names) :]:
+            axes.remove()
+        for axes in grid[max(0, len(names) - across) : len(names)]:
+            axes.set_xlabel("time [s]")
+            axes.tick_params(labelbottom=True)
+        figure.align_ylabels()
+        handles, labels = grid[0].get_legend_handles_labels()
+        figure.legend(handles, labels, loc="outside lower center", ncols=6 if columns == 2 else 3)
+    return figure
+
+
+def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
+    """Return a figure of the distance of predicted tips from the true tip over time, on a log scale.
+
+    Raises:
+        ValueError: a prediction's rows differ from the truth's.
+    """
+    motions, true = by_label(predictions, "predictions"), tips_of(truth)
+    with style():
+        figure = new_figure(width_of(columns), 2.4)
+        axes = figure.subplots()
+        for i, (label, one) in enumerate(motions.items()):
+            tip = tips_of(one)
+            if tip.shape != true.shape or not np.allclose(one.time, truth.time, rtol=0.0, atol=1e-9):
+                raise ValueError(
+                    f"the prediction{f' {label!r}' if label else ''} has {len(tip)} rows and the truth "
+                    f"{len(true)}; both must have the same times"
+                )
+            distance = np.linalg.norm(tip - true, axis=1)
+            # the initial distance may be zero, which a logarithmic axis cannot show
+            axes.plot(truth.time, np.where(distance > 0.0, distance, np.nan), label=label or None, **line(i))
+        axes.set(xlabel="time [s]", ylabel="distance of the tips [m]", yscale="log")
+        axes.margins(x=0.02)
+        if any(motions):
+            legend_above(axes)
+    return figure
+
+
+def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
+    """Return a figure of every tendon's tension over time, held from row to row; or of the controls."""
+    one_of(trajectory)
+    with style():
+        figure = new_figure(width_of(columns), 2.4)
+        draw_tensions(figure.subplots(), trajectory)
+    return figure
+
+
+def overview(trajectory: Trajectory, count: int = 12) -> Figure:
+    """Return one figure of shapes, tip path and tensions of a trajectory, two columns wide."""
+    curves = curves_of(one_of(trajectory))
+    with style():
+        figure = new_figure(TWO_COLUMNS, 4.2)
+        left, right = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
+        _draw_shape(left, trajectory, count, checked_view(None, curves[0].shape[-1]))
+        size = curves[0].shape[-1]
+        axes = right.subplots(size + 1, 1, sharex=True, height_ratios=(*[1.0] * size, 1.5))
+        draw_tips(axes[:size], {"": (trajectory.time, tips_of(trajectory))})
+        axes[size - 1].set_xlabel("")
+        draw_tensions(axes[size], trajectory)
+        right.align_ylabels()
+    return figure
+
+
+def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
+    """Return a figure of a batch's tips over time: the median, the band of 90 % and the full range.
+
+    Raises:
+        ValueError: the trajectory is not a batch.
+    """
+    if not isinstance(batch, Trajectory):
+        raise TypeError(f"batch is a {type(batch).__name__}; allowed is a Trajectory of several robots")
+    if np.ndim(batch.y) != 4:
+        raise ValueError("the trajectory is of one robot; allowed is a batch")
+    tip = np.asarray(batch.tip_position)
+    with style():
+        figure = new_figure(width_of(columns), 0.4 + 1.15 * tip.shape[2])
+        rows = figure.subplots(tip.shape[2], 1, sharex=True, squeeze=False)[:, 0]
+        for k, axes in enumerate(rows):
+            for (low, high), strength, label in (((0, 100), 0.18, "all"), ((5, 95), 0.4, "nine tenths")):
+                edges = np.nanpercentile(tip[:, :, k], [low, high], axis=0)
+                axes.fill_between(
+                    batch.time, *edges, color=PALETTE[0], alpha=strength, linewidth=0, label=label
+                )
+            axes.plot(batch.time, np.nanmedian(tip[:, :, k], axis=0), color=PALETTE[-1], label="median")
+            axes.set_ylabel(f"tip {AXES[k]} [m]")
+            require_span(axes, 0.01 * float(np.nanmax(np.abs(tip))))
+        rows[-1].set_xlabel("time [s]")
+        figure.align_ylabels()
+        legend_above(rows[0])
+    return figure
+
+
+def curves(
+    x: ArrayLike,
+    lines: Mapping[str, ArrayLike],
+    xlabel: str,
+    ylabel: str,
+    *,
+    log: str = "",
+    marker: str = "",
+    columns: int = 1,
+) -> Figure:
+    """Return a figure of curves over x by label; `log` names the logarithmic axes ("", "x", "y" or "xy").
+
+    Raises:
+        ValueError: a curve's number of values differs from x's, or `log` is not allowed.
+    """
+    if log not in ("", "x", "y", "xy"):
+        raise ValueError(f"log is {log!r}; allowed is '', 'x', 'y' or 'xy'")
+    at = np.asarray(x, dtype=float)
+    if not lines:
+        raise ValueError("there are no curves to draw; at least one is needed")
+    for label, values in lines.items():
+        if np.shape(values) != at.shape:
+            raise ValueError(f"the curve {label!r} has shape {np.shape(values)}; x has {len(at)} values")
+    with style():
+        figure = new_figure(width_of(columns), 2.4)
+        axes = figure.subplots()
+        for i, (label, values) in enumerate(lines.items()):
+            axes.plot(
+                at,
+                np.asarray(values, dtype=float),
+                **{**line(i), "marker": marker or None, "label": label or None},
+            )
+        axes.set(xlabel=xlabel, ylabel=ylabel, **{f"{name}scale": "log" for name in log})
+        if "x" in log and len(at) <= 8:
+            axes.set_xticks(at, [f"{each:g}" for each in at])
+            axes.set_xticks([], minor=True)
+        if any(lines):
+            legend_above(axes)
+    return figure
+
+
+def workspace(samples: Workspace) -> Figure:
+    """Return a figure of a workspace from the side and from above, coloured by the sum of the controls.
+
+    Raises:
+        ValueError: no sample is solved, or positions do not have three coordinates.
+    """
+    require_matplotlib()
+    if not (hasattr(samples, "position") and hasattr(samples, "valid")):
+        raise TypeError(f"samples is a {type(samples).__name__}; allowed is a Workspace")
+    if samples.position.shape[1] != 3 or not samples.valid.any():
+        raise ValueError("there is no solved sample with three coordinates to draw")
+    shown = np.flatnonzero(samples.valid)[:MOST_POINTS]
+    x, y, z = samples.position[shown].T
+    total = samples.controls[shown].sum(axis=1)
+    with style():
+        figure = new_figure(TWO_COLUMNS, 3.2)
+        for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
+            axes = figure.add_subplot(1, 2, k + 1)
+            points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
+            axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
+        units = {field.unit for field in samples.system.control_layout.fields}
+        unit = f" [{units.pop()}]" if len(units) == 1 else ""
+        figure.colorbar(points, ax=figure.axes, label=f"sum of the controls{unit}")
+    return figure
+
+
+def closed_loop(log: LoopLog) -> Figure:
+    """Return a figure of a closed loop: path of the tip from above, error, controls, adapted parameters.
+
+    Periods without a solution are marked. Without adapted parameters the last panel has the times of the
+    computation.
+    """
+    wanted, tip = log.reference[:, :2], log.tip[:, :2]
+    fallback = np.array([status != "optimal" for status in log.status])
+    with style():
+        figure = new_figure(TWO_COLUMNS, 4.2)
+        path, error, control, last = figure.subplots(2, 2).ravel()
+        path.plot(*wanted.T, label="reference", **REFERENCE)
+        path.plot(*tip.T, color=PALETTE[0], label="tip")
+        path.set(xlabel="x [m]", ylabel="y [m]", title="path of the tip, from above", aspect="equal")
+        path.legend(loc="upper left", bbox_to_anchor=(1.02, 1.0))
+        error.semilogy(log.time, 1e3 * np.maximum(log.tip_distance, 1e-6), color=PALETTE[0])
+        for each in log.time[fallback]:
+            error.axvspan(each, each + log.time[1] - log.time[0], color=PALETTE[1], alpha=0.3, lw=0)
+        error.set(xlabel="time [s]", ylabel="distance [mm]", title="distance from the reference")
+        for k, column in enumerate(log.control.T):
+            control.step(log.time, column, where="post", color=PALETTE[k % len(PALETTE)], label=f"{k + 1}")
+        low, high = float(log.control.min()), float(log.control.max())
+        # room for the legend
+        control.set(xlabel="time [s]", title="controls", ylim=(low, high + 0.25 * (high - low or 1.0)))
+        control.legend(ncols=4, loc="upper left")
+        if log.parameters:
+            for k, (name, values) in enumerate(log.parameters.items()):
+                unit = np.max(np.abs(values)) or 1.0
+                last.plot(log.time, values / unit, color=PALETTE[k], label=f"{name} / {unit:.3g}")
+            last.set(xlabel="time [s]", title="adapted parameters, relative to their largest values")
+        else:
+            for k, (name, seconds) in enumerate(
+                (("feedback", log.feedback), ("preparation", log.preparation))
+            ):
+                last.semilogy(log.time, 1e3 * seconds, color=PALETTE[k], label=name)
+            last.set(xlabel="time [s]", ylabel="time [ms]", title="computation")
+        last.legend()
+    return figure

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation import figures
-from knode_cosserat.evaluation.metrics import dtw_distance
+from knode_cosserat import figures
 from knode_cosserat.evaluation.style import PALETTE
+from knode_cosserat.metrics import dtw_distance
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw
 pytestmark = pytest.mark.filterwarnings("error")

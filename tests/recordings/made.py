@@ -1,10 +1,14 @@
 """Small recordings whose truth is known, for the tests of reading."""
 
 import numpy as np
+from rosbags import rosbag1
+from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings import CommandSource, MarkerSource, RecordingConfig, TensionSource
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings import RecordingConfig
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import write_recording
 
 LENGTH = 0.635
 PAPER = RecordingConfig.paper_robot()
@@ -37,22 +41,20 @@ def made(seconds=3.0, noise=1e-4, seed=0, config=PAPER):
         position, rotation = moved(time, marker.fraction)
         shaken = rotation * Rotation.from_rotvec(rng.normal(0.0, 10 * noise, (len(time), 3)))
         quaternion = (shaken * TURNED[k % 4]).as_quat(scalar_first=True)
-        poses[marker.name] = MocapPoses(
-            time, position + CLAMP + rng.normal(0.0, noise, position.shape), quaternion
-        )
+        poses[marker.name] = Body(time, position + CLAMP + rng.normal(0.0, noise, position.shape), quaternion)
     if config.base is not None:
         above = np.array([0.0, 0.0, config.base.height])
         still = np.tile(CLAMP + above, (len(time), 1))
         turned = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
-        poses["base"] = MocapPoses(time, still + rng.normal(0.0, noise, still.shape), turned)
+        poses["base"] = Body(time, still + rng.normal(0.0, noise, still.shape), turned)
     sent = np.round(np.arange(0.0, seconds, 0.05), 6)
     phase = 2 * np.pi * (sent[:, None] - np.arange(config.tendons) / config.tendons)
     grams = np.round(500.0 + np.where(sent[:, None] < 1.0, 0.0, 200.0 * np.cos(phase)))
-    command = Pulls(sent, grams * 9.81e-3)
+    command = Tensions(sent, grams * 9.81e-3)
     seen = np.round(np.arange(0.0, seconds, 0.02), 6)
     return (
         poses,
-        Pulls(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.tendons))),
+        Tensions(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.tendons))),
         command,
     )
 
@@ -81,4 +83,25 @@ def changed(streams, name, rows=None, **parts):
     new = {"time": pose.time, "position": pose.position, "quaternion": pose.quaternion} | parts
     if rows is not None:
         new = {key: value[rows] for key, value in new.items()}
-    return {**poses, name: MocapPoses(**new)}, tension, command
+    return {**poses, name: Body(**new)}, tension, command
+
+
+def repacked(source, writer):
+    """Write the messages of a bag once more, by a writer of rosbags."""
+    with AnyReader([source]) as reader, writer:
+        there = {
+            each.topic: writer.add_connection(each.topic, each.msgtype, typestore=reader.typestore)
+            for each in reader.connections
+        }
+        for connection, received, raw in reader.messages():
+            writer.write(there[connection.topic], received, raw)
+
+
+def compressed(source, path, compression, chunk):
+    """Write a bag of ROS 1 once more, in chunks of so many bytes that are compressed by BZ2, LZ4 or not."""
+    writer = rosbag1.Writer(path)
+    if compression:
+        writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
+    writer.chunk_threshold = chunk
+    repacked(source, writer)
+    return path

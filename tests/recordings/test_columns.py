@@ -7,15 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knode_cosserat.recordings import (
-    ColumnMap,
-    MarkerSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    load_recording,
-    proposed_config,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording, proposed_config
+from knode_cosserat.recordings.config import ColumnMap, MarkerSource, TensionSource
 from tests.commands import run, succeeded
 from tests.recordings.formats import exported
 

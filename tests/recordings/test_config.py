@@ -5,14 +5,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import (
-    BaseSource,
-    CommandSource,
-    MarkerSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError
+from knode_cosserat.recordings.config import BaseSource, CommandSource, MarkerSource, TensionSource
 
 FULL = RecordingConfig(
     markers=(

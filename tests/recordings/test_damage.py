@@ -4,13 +4,11 @@ import time
 
 import numpy as np
 import pytest
-from rosbags import rosbag1
-from rosbags.highlevel import AnyReader
 
 import knode_cosserat as kc
 import knode_cosserat.recordings.health  # its import is not timed
 from knode_cosserat.recordings import RecordingConfig, RecordingError
-from tests.recordings.made import PAPER, made, write
+from tests.recordings.made import PAPER, compressed, made, write
 
 #: two seconds to end up in chunks of their own
 CHUNK = 60_000
@@ -30,20 +28,7 @@ def whole(tmp_path_factory, streams):
     def bag(compression=None):
         path = folder / f"{compression}.bag"
         if not path.exists():
-            with AnyReader([plain]) as reader:
-                writer = rosbag1.Writer(path)
-                if compression:
-                    writer.set_compression(rosbag1.Writer.CompressionFormat[compression])
-                writer.chunk_threshold = CHUNK
-                with writer:
-                    made_of = {
-                        each.topic: writer.add_connection(
-                            each.topic, each.msgtype, typestore=reader.typestore
-                        )
-                        for each in reader.connections
-                    }
-                    for connection, received, raw in reader.messages():
-                        writer.write(made_of[connection.topic], received, raw)
+            compressed(plain, path, compression, CHUNK)
         return path.read_bytes()
 
     return bag

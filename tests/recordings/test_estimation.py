@@ -7,8 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import Body, Recording, RecordingConfig, Tensions
+from knode_cosserat.recordings import Recording, RecordingConfig
 from knode_cosserat.recordings.estimation import kinematics
+from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.virtual import virtual_robot
 
 LENGTH, FRACTIONS = 0.635, np.array([3, 5, 7, 9]) / 9
@@ -47,12 +48,9 @@ def recorded(of=arc, seconds=3.0, noise=(0.0, 0.0), seed=0, lost=(), tendons=4, 
         position = round_z.apply(position + random.normal(0.0, 1.0, position.shape) * noise[0])
         shaken = Rotation.from_rotvec(random.normal(0.0, 1.0, position.shape) * noise[1]) * turn
         quaternion = (round_z * shaken * round_z.inv()).as_quat(scalar_first=True)
-        bodies.append(Body(f"rib {k}", f"/rib{k}", fraction, time, position, quaternion if turned else None))
-    pulls = Tensions(
-        "/tension",
-        np.arange(0.0, seconds + 0.01, 0.02),
-        np.full((len(np.arange(0.0, seconds + 0.01, 0.02)), tendons), 5.0),
-    )
+        bodies.append(Body(time, position, quaternion if turned else None, f"rib {k}", f"/rib{k}", fraction))
+    stamps = np.arange(0.0, seconds + 0.01, 0.02)
+    pulls = Tensions(stamps, np.full((len(stamps), tendons), 5.0), "/tension")
     config = RecordingConfig.paper_robot()
     return Recording("made", config, tuple(bodies), None, pulls, None, None, True, (), {})
 

@@ -6,7 +6,8 @@ import pytest
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.identification.evaluate import evaluate
-from knode_cosserat.recordings import RecordingConfig, RecordingError, TensionSource
+from knode_cosserat.recordings import RecordingConfig, RecordingError
+from knode_cosserat.recordings.config import TensionSource
 
 DT, BEFORE = 0.05, np.full(4, 5.0)
 FRACTIONS = (0.25, 0.6, 1.0)

@@ -5,15 +5,8 @@ import gzip
 import numpy as np
 import pytest
 
-from knode_cosserat.recordings import (
-    MarkerSource,
-    MotorSource,
-    RecordingConfig,
-    RecordingError,
-    TableSource,
-    TensionSource,
-    load_recording,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
+from knode_cosserat.recordings.config import MarkerSource, MotorSource, TableSource, TensionSource
 
 ROWS = 60
 CONFIG = RecordingConfig(

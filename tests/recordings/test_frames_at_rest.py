@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings.frame import _frames_at_rest
-from knode_cosserat.recordings.recording import Body
+from knode_cosserat.recordings.streams import Body
 
 LENGTH = 0.6
 TIME = np.linspace(0.0, 1.0, 50)
@@ -15,7 +15,7 @@ def bodies_on(curve, fractions, noise=0.0):
     """Resting bodies on a curve of the fraction of the length (m)."""
     rng = np.random.default_rng(0)
     return [
-        Body(str(k), str(k), fraction, TIME, curve(fraction) + noise * rng.normal(size=(len(TIME), 3)), None)
+        Body(TIME, curve(fraction) + noise * rng.normal(size=(len(TIME), 3)), None, str(k), str(k), fraction)
         for k, fraction in enumerate(fractions)
     ]
 

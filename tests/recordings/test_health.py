@@ -11,8 +11,7 @@ import knode_cosserat as kc
 from knode_cosserat.cli import app
 from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.recordings.frame import leans_of, rod_lengths
-from knode_cosserat.recordings.recording import Body
-from knode_cosserat.recordings.write import MocapPoses, Pulls
+from knode_cosserat.recordings.streams import Body, Tensions
 from tests.recordings.made import LAG, PAPER, changed, made, write
 
 NOISE = 2e-4
@@ -84,7 +83,9 @@ def test_a_pure_delay_is_found_and_said_if_it_is_not_the_stated_one(tmp_path):
     poses, _, command = made(seconds=8.0)
     time = np.round(np.arange(0.0, 8.0, 0.01), 6)
     held = command.tension[np.maximum(np.searchsorted(command.time, time - 0.15 + 1e-9, side="right") - 1, 0)]
-    report = kc.load_recording(write(tmp_path / "it.bag", (poses, Pulls(time, held + 0.1), command))).health()
+    report = kc.load_recording(
+        write(tmp_path / "it.bag", (poses, Tensions(time, held + 0.1), command))
+    ).health()
     assert report.latency.shift == pytest.approx(0.15, abs=0.011)
     assert report.latency.delay == pytest.approx(0.15, abs=0.006)
     assert report.latency.lag < 0.006
@@ -112,9 +113,7 @@ def test_the_rod_and_its_rest_are_told(report):
 
 def test_a_recording_without_commands_or_rest_still_has_a_report(tmp_path):
     poses, tension, _ = made(seconds=4.0)
-    moving = {
-        name: MocapPoses(it.time[120:], it.position[120:], it.quaternion[120:]) for name, it in poses.items()
-    }
+    moving = {name: Body(it.time[120:], it.position[120:], it.quaternion[120:]) for name, it in poses.items()}
     recording = kc.load_recording(write(tmp_path / "it.bag", (moving, tension, None)))
     report = recording.health()
     assert report.rest is None
@@ -213,7 +212,7 @@ def test_a_length_is_told_within_half_a_percent_or_not_at_all(shape, angle):
     where = places(shape, angle, 0.3, fractions)
     time = np.arange(30) * 0.01
     bodies = [
-        Body(name, name, fraction, time, np.tile(each, (30, 1)), None)
+        Body(time, np.tile(each, (30, 1)), None, name, name, fraction)
         for name, fraction, each in zip("abc", fractions, where, strict=True)
     ]
     lengths = rod_lengths(bodies, where)

@@ -5,16 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from knode_cosserat.recordings import (
-    Body,
-    CommandSource,
-    MarkerSource,
-    Recording,
-    RecordingConfig,
-    RecordingError,
-    Tensions,
-    TensionSource,
-)
+from knode_cosserat.recordings import Recording, RecordingConfig, RecordingError
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
+from knode_cosserat.recordings.streams import Body, Tensions
 
 LATENCY = 0.06
 CONFIG = RecordingConfig(
@@ -29,9 +22,9 @@ TIMES = np.round(0.02 * np.arange(201) + np.random.default_rng(0).uniform(0.0, 0
 def recorded(time, tension, command=None, until=4.0):
     """A recording whose tensions are known; its body stands still."""
     frames = np.round(np.arange(0.0, until + 1e-9, 0.01), 6)
-    body = Body("tip", "tip", 1.0, frames, np.tile([0.0, 0.0, 0.5], (len(frames), 1)), None)
+    body = Body(frames, np.tile([0.0, 0.0, 0.5], (len(frames), 1)), None, "tip", "tip", 1.0)
     return Recording(
-        source="it", config=CONFIG, bodies=(body,), base=None, tension=Tensions("tension", time, tension),
+        source="it", config=CONFIG, bodies=(body,), base=None, tension=Tensions(time, tension, "tension"),
         command=command, rest=None, simulated=True, findings=(), delays={},
     )  # fmt: skip
 
@@ -100,7 +93,7 @@ def test_before_the_first_message_and_after_the_last_its_tension_holds():
 
 def test_commands_are_steps_and_come_late():
     """Each is held until the next, from its latency on."""
-    sent = Tensions("command", np.array([0.0, 1.0, 1.42]), np.array([[2.0, 2.0], [6.0, 2.0], [3.0, 2.0]]))
+    sent = Tensions(np.array([0.0, 1.0, 1.42]), np.array([[2.0, 2.0], [6.0, 2.0], [3.0, 2.0]]), "command")
     recording = recorded(np.array([0.0, 4.0]), np.zeros((2, 2)), sent)
     given = recording.sampled(0.1, tensions="commanded", mean=True)
     rows = {round(float(t), 9): k for k, t in enumerate(given.time)}
@@ -119,7 +112,7 @@ def test_a_pause_stays_unknown(uneven):
     """Nothing is averaged over what was not measured."""
     known = uneven.tension
     kept = (known.time < 1.0) | (known.time > 2.0)
-    paused = dataclasses.replace(uneven, tension=Tensions("tension", known.time[kept], known.tension[kept]))
+    paused = dataclasses.replace(uneven, tension=Tensions(known.time[kept], known.tension[kept], "tension"))
     given = paused.sampled(0.05, start=0.2, mean=True)
     times = paused.tension.time
     last, following = times[times < 1.0][-1], times[times > 2.0][0]

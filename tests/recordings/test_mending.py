@@ -7,9 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import MarkerSource, RecordingConfig, TensionSource, checks
+from knode_cosserat.recordings import RecordingConfig, checks
+from knode_cosserat.recordings.config import MarkerSource, TensionSource
 from knode_cosserat.recordings.formats import bag
-from knode_cosserat.recordings.write import START, MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import START, write_recording
 from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
 TIP = "/vicon/continuum_3/pose"
@@ -64,7 +66,7 @@ def test_every_swap_of_axes_is_undone(streams):
     for by in CUBE:
         wrong = swapped(streams, 150, by)[0]["rib 4"].quaternion
         mended, swaps, unclear = checks.swaps_undone(time, wrong)
-        assert [swap.row for swap in swaps] == [150]
+        assert [row for row, _, _ in swaps] == [150]
         assert unclear == []
         np.testing.assert_allclose(np.abs(np.sum(mended * quaternion, axis=1)), 1.0, rtol=0, atol=1e-9)
 
@@ -170,7 +172,7 @@ def test_tensions_that_are_no_numbers_or_spikes_are_left_out(tmp_path, streams):
     poses, tension, command = streams
     wrong = tension.tension.copy()
     wrong[20, 1], wrong[100, 2] = np.nan, 40.0
-    recording = read(tmp_path, (poses, Pulls(tension.time, wrong), command))
+    recording = read(tmp_path, (poses, Tensions(tension.time, wrong), command))
     assert said(recording, "1 tension is not finite").times == pytest.approx((0.4,))
     assert said(recording, "1 tension jumps up or down and back").times == pytest.approx((2.0,))
     assert len(recording.tension.time) == len(tension.time) - 2
@@ -191,7 +193,7 @@ def test_messages_out_of_order_and_twice_are_sorted(tmp_path, streams):
     poses = {name: pose for name, pose in streams[0].items() if name != "base"}
     order = np.r_[0:100, 101, 100, 102:200, 199, 200:300]
     tip = poses["rib 4"]
-    poses["rib 4"] = MocapPoses(tip.time[order], tip.position[order], tip.quaternion[order])
+    poses["rib 4"] = Body(tip.time[order], tip.position[order], tip.quaternion[order])
     recording = read(tmp_path, (poses, *streams[1:]), config)
     assert said(recording, "a stamp is before the one in front of it; the messages were sorted").topic == TIP
     assert said(recording, "1 stamp is there twice").times == pytest.approx((1.99,))
@@ -375,8 +377,8 @@ def test_two_tendons_and_a_rod_that_hardly_moves(tmp_path):
     )
     time = np.round(np.arange(0.0, 2.0, 0.01), 6)
     turned = np.tile(TURNED[1].as_quat(scalar_first=True), (len(time), 1))
-    tip = MocapPoses(time, np.tile([0.0, 0.0, 0.4], (len(time), 1)), turned)
-    write_recording(tmp_path / "it.db3", config, {"tip": tip}, Pulls(time, np.full((len(time), 2), 4.0)))
+    tip = Body(time, np.tile([0.0, 0.0, 0.4], (len(time), 1)), turned)
+    write_recording(tmp_path / "it.db3", config, {"tip": tip}, Tensions(time, np.full((len(time), 2), 4.0)))
     recording = kc.load_recording(tmp_path / "it.db3", config)
     assert recording.rest == pytest.approx((0.0, 1.99))
     np.testing.assert_allclose(

@@ -5,16 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from knode_cosserat.recordings import (
-    CommandSource,
-    MarkerSource,
-    MotorSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    load_recording,
-    proposed_config,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording, proposed_config
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, MotorSource, TensionSource
 from knode_cosserat.recordings.messages import typestore
 from tests.commands import succeeded
 from tests.recordings.formats.exported import bent, times
@@ -106,10 +98,18 @@ def write(path, entries, ros=2, mode=None, plugin="MCAP"):
     return path
 
 
-def poses(ros=2):
+def series(topic, kind, make, time=TIME):
+    """Return entries of a bag: the message of each row, from its time and its number."""
+    return [(topic, kind, at, make(at, row)) for row, at in enumerate(time)]
+
+
+def poses(ros=2, topic="/tip", position=POSITION, quaternion=QUATERNION):
     it = Messages(ros)
-    for at, place, wxyz in zip(TIME, POSITION, QUATERNION, strict=True):
-        yield "/tip", "geometry_msgs/msg/PoseStamped", at, it.pose_stamped(at, place, wxyz)
+    return series(
+        topic,
+        "geometry_msgs/msg/PoseStamped",
+        lambda at, row: it.pose_stamped(at, position[row], quaternion[row]),
+    )
 
 
 def joint_states(order=(0, 1, 2, 3), names=NAMES, ros=2, change=None):
@@ -191,17 +191,12 @@ def test_names_that_contradict_the_order_are_refused(tmp_path):
 
 def test_joint_states_of_others_are_left_out_and_messages_without_names_are_in_order(tmp_path):
     it = Messages(2)
-    arm = [
-        ("/joint_states", "sensor_msgs/msg/JointState", at, it.joints(at, ["elbow", "wrist"], [70.0, 80.0]))
-        for at in TIME + 0.004
-    ]
+    joints = "/joint_states", "sensor_msgs/msg/JointState"
+    arm = series(*joints, lambda at, _: it.joints(at, ["elbow", "wrist"], [70.0, 80.0]), TIME + 0.004)
     entries = sorted([*joint_states((3, 2, 1, 0)), *arm], key=lambda entry: entry[2])
     path = write(tmp_path / "it", [*poses(), *entries])
     np.testing.assert_allclose(measured(load_recording(path, config())), PULLS, atol=1e-12)
-    nameless = [
-        ("/joint_states", "sensor_msgs/msg/JointState", at, it.joints(at, [], pull))
-        for at, pull in zip(TIME, PULLS, strict=True)
-    ]
+    nameless = series(*joints, lambda at, row: it.joints(at, [], PULLS[row]))
     path = write(tmp_path / "other", [*poses(), *nameless])
     reversed_order = config(TensionSource("/joint_states", (4, 3, 2, 1)))
     np.testing.assert_allclose(measured(load_recording(path, reversed_order)), PULLS[:, ::-1], atol=1e-12)
@@ -210,15 +205,11 @@ def test_joint_states_of_others_are_left_out_and_messages_without_names_are_in_o
 def test_motors_are_positions_of_joints(tmp_path):
     it = Messages(2)
     names = ["motor_2", "motor_1"]
-    entries = [
-        (
-            "/motors",
-            "sensor_msgs/msg/JointState",
-            at,
-            it.joints(at, names, [9.0, 9.0], [20.0 + at, 10.0 - at]),
-        )
-        for at in TIME
-    ]
+    entries = series(
+        "/motors",
+        "sensor_msgs/msg/JointState",
+        lambda at, _: it.joints(at, names, [9.0, 9.0], [20.0 + at, 10.0 - at]),
+    )
     path = write(tmp_path / "it", [*poses(), *entries])
     motors = RecordingConfig(markers=TIP, motors=MotorSource("/motors", (1, 2)))
     expected = np.stack([10.0 - TIME, 20.0 + TIME], axis=1)
@@ -241,16 +232,11 @@ def test_each_tendon_has_its_topic(tmp_path, kind):
         return it.make("geometry_msgs/msg/WrenchStamped", header=it.header(at), wrench=wrench)
 
     package = "geometry_msgs" if kind == "WrenchStamped" else "std_msgs"
-    entries = [
-        (
-            f"/cells/{name}/force",
-            f"{package}/msg/{kind}",
-            at + 0.001 * k,
-            message(at + 0.001 * k, 10.0 * (k + 1) + at, k),
-        )
-        for at in TIME
-        for k, name in enumerate(("a", "b", "c"))
-    ]
+    entries = []
+    for k, name in enumerate(("a", "b", "c")):
+        pulls = [message(at + 0.001 * k, 10.0 * (k + 1) + at, k) for at in TIME]
+        topic = f"/cells/{name}/force", f"{package}/msg/{kind}"
+        entries += series(*topic, lambda _, row, pulls=pulls: pulls[row], TIME + 0.001 * k)
     path = write(tmp_path / "it", [*poses(), *entries])
     source = TensionSource("/cells/{}/force", names=("c", "a", "b"))
     recording = load_recording(path, config(source))
@@ -296,10 +282,7 @@ def test_poses_with_covariance(tmp_path, ros, kind):
         twist = it.make("geometry_msgs/msg/TwistWithCovariance", twist=still, covariance=np.zeros(36))
         return it.make(kind, header=it.header(at), child_frame_id="tip", pose=pose, twist=twist)
 
-    entries = [
-        ("/tip", kind, at, message(at, place, wxyz))
-        for at, place, wxyz in zip(TIME, POSITION, QUATERNION, strict=True)
-    ]
+    entries = series("/tip", kind, lambda at, row: message(at, POSITION[row], QUATERNION[row]))
     same(load_recording(write(tmp_path / "it", [*entries, *joint_states(ros=ros)], ros), config()))
 
 
@@ -378,14 +361,14 @@ def test_the_bridges_own_poses_are_read(tmp_path):
     same(load_recording(tmp_path / "it", of("/poses")))
 
 
-TF = {1: "tf2_msgs/msg/TFMessage", 2: "tf2_msgs/msg/TFMessage"}
+TF = "tf2_msgs/msg/TFMessage"
 
 
 def transforms(ros=2, kind=None, moving=False, static=False):
     """The tip in the frame of a base, which stands or moves in the world."""
     from scipy.spatial.transform import Rotation
 
-    it, kind = Messages(ros), kind or TF[ros]
+    it, kind = Messages(ros), kind or TF
     base = Rotation.from_rotvec(np.outer(0.2 * TIME if moving else 0.5 + 0.0 * TIME, [0.0, 0.0, 1.0]))
     place = np.array([0.3, 0.0, 0.2]) + np.outer(0.1 * TIME if moving else 0.0 * TIME, [1.0, 0.0, 0.0])
     inside = base.inv().apply(POSITION - place)
@@ -423,23 +406,22 @@ def test_a_frame_of_tf_is_given_in_the_root_of_its_tree(tmp_path, ros, kind, mov
         load_recording(path, of("/tf[tipp]"))
 
 
-def test_a_frame_with_two_parents_or_a_circle_is_refused(tmp_path):
+@pytest.mark.parametrize(
+    ("edges", "words"),
+    [
+        (
+            [("world", "tip"), ("base", "tip")],
+            "the frame tip has two parents, world and base; allowed is one",
+        ),
+        ([("base", "tip"), ("tip", "base")], "are in a circle"),
+    ],
+)
+def test_a_frame_with_two_parents_or_a_circle_is_refused(tmp_path, edges, words):
     it = Messages(2)
-    one = [1, 0, 0, 0]
-    rows = [
-        it.transform(0.0, "world", "tip", [0, 0, 0], one),
-        it.transform(1.0, "base", "tip", [0, 0, 0], one),
-    ]
-    entries = [("/tf", TF[2], 0.0, it.make(TF[2], transforms=rows))]
-    with pytest.raises(RecordingError, match="the frame tip has two parents, world and base; allowed is one"):
-        load_recording(write(tmp_path / "two", [*entries, *joint_states()]), of("/tf[tip]"))
-    rows = [
-        it.transform(0.0, "base", "tip", [0, 0, 0], one),
-        it.transform(0.0, "tip", "base", [0, 0, 0], one),
-    ]
-    entries = [("/tf", TF[2], 0.0, it.make(TF[2], transforms=rows))]
-    with pytest.raises(RecordingError, match="are in a circle"):
-        load_recording(write(tmp_path / "circle", [*entries, *joint_states()]), of("/tf[tip]"))
+    rows = [it.transform(0.0, parent, child, [0, 0, 0], [1, 0, 0, 0]) for parent, child in edges]
+    entries = [("/tf", TF, 0.0, it.make(TF, transforms=rows)), *joint_states()]
+    with pytest.raises(RecordingError, match=words):
+        load_recording(write(tmp_path / "it", entries), of("/tf[tip]"))
 
 
 def test_the_types_of_tf_are_those_of_ros_1():
@@ -502,14 +484,15 @@ def test_compressed_messages_stay_within_the_limits(tmp_path, monkeypatch):
 
 
 def test_parts_of_messages_are_not_written(tmp_path):
-    from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+    from knode_cosserat.recordings.streams import Body, Tensions
+    from knode_cosserat.recordings.write import write_recording
 
     config = of("/poses[1]")
-    poses = {"tip": MocapPoses(TIME, POSITION, QUATERNION)}
+    poses = {"tip": Body(TIME, POSITION, QUATERNION)}
     with pytest.raises(
         RecordingError, match=r"topic /poses\[1\] cannot be written; allowed is one topic for each"
     ):
-        write_recording(tmp_path / "it.bag", config, poses, Pulls(TIME, PULLS))
+        write_recording(tmp_path / "it.bag", config, poses, Tensions(TIME, PULLS))
     assert not list(tmp_path.iterdir())
 
 
@@ -518,20 +501,10 @@ def test_parts_of_messages_are_not_written(tmp_path):
 
 def test_a_bag_with_other_topics_gets_a_proposal(tmp_path):
     it = Messages(2)
-    base = [
-        (
-            "/mocap/base_plate/pose",
-            "geometry_msgs/msg/PoseStamped",
-            at,
-            it.pose_stamped(at, [0, 0, 0], [1, 0, 0, 0]),
-        )
-        for at in TIME
-    ]
-    middle = bent(TIME, 0.5)
-    rib = [
-        ("/mocap/rib/pose", "geometry_msgs/msg/PoseStamped", at, it.pose_stamped(at, place, wxyz))
-        for at, place, wxyz in zip(TIME, middle[0], middle[1].as_quat(scalar_first=True), strict=True)
-    ]
+    still = np.zeros((len(TIME), 3)), np.tile([1.0, 0.0, 0.0, 0.0], (len(TIME), 1))
+    base = poses(2, "/mocap/base_plate/pose", *still)
+    position, rotation = bent(TIME, 0.5)
+    rib = poses(2, "/mocap/rib/pose", position, rotation.as_quat(scalar_first=True))
     noise = [("/chatter", "std_msgs/msg/String", 0.0, it.make("std_msgs/msg/String", data="hello"))]
     path = write(tmp_path / "it", [*poses(), *base, *rib, *joint_states((1, 0, 3, 2)), *noise])
     found, remarks = proposed_config(path)

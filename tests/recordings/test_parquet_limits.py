@@ -45,18 +45,6 @@ def test_files_of_all_kinds_are_read(tmp_path, options):
         np.testing.assert_array_equal(numbers[name], values)
 
 
-def test_page_sizes_are_those_that_pyarrow_states(tmp_path):
-    path = written(tmp_path / "it.parquet", good(5000), row_group_size=900, compression="zstd")
-    metadata = pyarrow_parquet.read_metadata(path)
-    data = path.read_bytes()
-    for group in range(metadata.num_row_groups):
-        for k in range(metadata.num_columns):
-            chunk = metadata.row_group(group).column(k)
-            pages = [page.expanded for page in parquet_file._pages(data, chunk)]
-            # its total counts the headers too
-            assert 0 < sum(pages) <= chunk.total_uncompressed_size <= sum(pages) + 200 * len(pages)
-
-
 def test_runs_of_one_value_are_refused_before_they_are_written_out(tmp_path):
     """Fifteen million rows in 340 kB: 600 MB of numbers."""
     path = tmp_path / "it.parquet"
@@ -161,4 +149,4 @@ def test_a_page_whose_size_is_a_lie_is_not_allocated(tmp_path):
     path.write_bytes(data)
 
     done = subprocess.run([sys.executable, "-c", BOUNDED, path], capture_output=True, text=True, timeout=120)
-    assert done.returncode == 0 and "allowed are 100 times the file" in done.stdout, done.stdout + done.stderr
+    assert done.returncode == 0 and "not a Parquet table" in done.stdout, done.stdout + done.stderr

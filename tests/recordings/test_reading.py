@@ -4,22 +4,17 @@ import dataclasses
 
 import numpy as np
 import pytest
-from rosbags import rosbag1, rosbag2
+from rosbags import rosbag2
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import (
-    CommandSource,
-    MarkerSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    messages,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, messages
+from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
 from knode_cosserat.recordings.formats import written_suffixes
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
-from tests.recordings.made import LAG, PAPER, SMALL, changed, moved, write
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import write_recording
+from tests.recordings.made import LAG, PAPER, SMALL, changed, compressed, moved, repacked, write
 
 
 def turned_by(quaternion, rotation):
@@ -52,8 +47,8 @@ def test_the_papers_robot_comes_back(tmp_path, exact, ending):
 def test_another_robot_of_three_tendons_and_one_body_that_has_no_orientation_comes_back(tmp_path, ending):
     time = np.round(np.arange(0.0, 2.0, 0.02), 6)
     position, _ = moved(time, 1.0)
-    pulls = Pulls(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
-    write_recording(tmp_path / f"it{ending}", SMALL, {"tip": MocapPoses(time, position)}, pulls, pulls)
+    pulls = Tensions(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
+    write_recording(tmp_path / f"it{ending}", SMALL, {"tip": Body(time, position)}, pulls, pulls)
     recording = kc.load_recording(tmp_path / f"it{ending}", SMALL)
     (tip,) = recording.bodies
     np.testing.assert_allclose(tip.position, position, rtol=0, atol=1e-12)
@@ -95,8 +90,8 @@ def test_a_table_explains_itself(tmp_path, exact):
 def test_arrays_have_no_stamps_and_are_taken_when_they_were_recorded(tmp_path):
     config = dataclasses.replace(SMALL, tension=TensionSource("/pull", (2, 1)), command=None)
     time = np.round(np.arange(0.0, 1.0, 0.01), 6)
-    tip = {"tip": MocapPoses(time, moved(time, 1.0)[0])}
-    pulls = Pulls(time, np.stack([5.0 + time, 6.0 - time], axis=1))
+    tip = {"tip": Body(time, moved(time, 1.0)[0])}
+    pulls = Tensions(time, np.stack([5.0 + time, 6.0 - time], axis=1))
     write_recording(tmp_path / "it.mcap", config, tip, pulls)
     recording = kc.load_recording(tmp_path / "it.mcap", config)
     np.testing.assert_allclose(recording.tension.tension, pulls.tension, rtol=0, atol=1e-12)
@@ -115,17 +110,7 @@ def test_what_the_file_holds_decides_and_not_its_name(tmp_path, exact):
 def test_bags_are_read_as_rosbags_reads_them(tmp_path, exact, compression):
     path = write(tmp_path / "it.bag", exact)
     if compression:
-        path = tmp_path / f"{compression}.bag"
-        packing = rosbag1.Writer(path)
-        packing.set_compression(rosbag1.Writer.CompressionFormat[compression])
-        packing.chunk_threshold = 50_000
-        with AnyReader([tmp_path / "it.bag"]) as reader, packing as writer:
-            made_of = {
-                each.topic: writer.add_connection(each.topic, each.msgtype, typestore=reader.typestore)
-                for each in reader.connections
-            }
-            for connection, received, raw in reader.messages():
-                writer.write(made_of[connection.topic], received, raw)
+        path = compressed(path, tmp_path / f"{compression}.bag", compression, 50_000)
     topic = "/vicon/continuum_3/pose"
     with AnyReader([path]) as reader:
         chosen = [each for each in reader.connections if each.topic == topic]
@@ -147,16 +132,7 @@ def test_a_bag_that_is_a_folder_is_read_with_and_without_its_description(tmp_pat
     ending = ".mcap" if plugin == "MCAP" else ".db3"
     file = write(tmp_path / f"it{ending}", exact)
     folder = tmp_path / "bag"
-    with (
-        rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin]) as writer,
-        AnyReader([file]) as reader,
-    ):
-        made_of = {
-            each.topic: writer.add_connection(each.topic, each.msgtype, typestore=reader.typestore)
-            for each in reader.connections
-        }
-        for connection, received, raw in reader.messages():
-            writer.write(made_of[connection.topic], received, raw)
+    repacked(file, rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin]))
     if not finished:
         (folder / "metadata.yaml").unlink()
     recording, direct = kc.load_recording(folder), kc.load_recording(file)
@@ -171,8 +147,8 @@ def test_a_bag_in_several_files_is_one(tmp_path, exact):
     def part(first, last):
         def cut(it):
             chosen = (it.time >= first) & (it.time < last)
-            fields = dataclasses.fields(it)
-            return type(it)(*(getattr(it, field.name)[chosen] for field in fields))
+            arrays = {name: values for name, values in vars(it).items() if isinstance(values, np.ndarray)}
+            return dataclasses.replace(it, **{name: values[chosen] for name, values in arrays.items()})
 
         return {name: cut(pose) for name, pose in poses.items()}, cut(tension), cut(command)
 
@@ -231,7 +207,7 @@ def test_another_frame_and_other_units(tmp_path, exact):
     )
     poses, tension, command = exact
     seen = {
-        name: MocapPoses(
+        name: Body(
             it.time,
             up.inv().apply(it.position),
             (up.inv() * Rotation.from_quat(it.quaternion, scalar_first=True)).as_quat(scalar_first=True),
@@ -272,8 +248,7 @@ def test_a_base_that_is_not_there_can_be_stated(tmp_path, exact):
 
 def test_a_rotation_that_is_stated_needs_no_rest(tmp_path, exact):
     moving = {
-        name: MocapPoses(it.time[120:], it.position[120:], it.quaternion[120:])
-        for name, it in exact[0].items()
+        name: Body(it.time[120:], it.position[120:], it.quaternion[120:]) for name, it in exact[0].items()
     }
     streams = moving, *exact[1:]
     path = write(tmp_path / "it.bag", streams)
@@ -352,7 +327,7 @@ def test_short_gaps_are_bridged_and_long_ones_split(tmp_path, exact):
 def test_a_gap_in_the_measured_tensions_splits_too(tmp_path, exact):
     poses, tension, command = exact
     known = (tension.time < 1.5) | (tension.time > 2.0)
-    streams = poses, Pulls(tension.time[known], tension.tension[known]), command
+    streams = poses, Tensions(tension.time[known], tension.tension[known]), command
     measured = kc.load_recording(write(tmp_path / "it.bag", streams)).sampled(0.05)
     assert [round(part.time[0], 2) for part in measured.parts()] == [0.0, 2.05]
 

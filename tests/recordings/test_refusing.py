@@ -6,15 +6,11 @@ import sys
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.recordings import (
-    BaseSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    messages,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, messages
+from knode_cosserat.recordings.config import BaseSource, TensionSource
 from knode_cosserat.recordings.formats import written_suffixes
-from knode_cosserat.recordings.write import Pulls, write_recording
+from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.write import write_recording
 from tests.recordings.made import PAPER, changed, write
 
 
@@ -125,7 +121,7 @@ def test_what_cannot_be_written_is_said(tmp_path, exact):
     with pytest.raises(RecordingError, match="poses are given of"):
         write_recording(tmp_path / "it.bag", PAPER, {"tip": poses["rib 4"]}, tension, command)
     with pytest.raises(RecordingError, match=r"tension of shape \(150, 3\); the configuration has 4 tendons"):
-        write_recording(tmp_path / "it.bag", PAPER, poses, Pulls(tension.time, tension.tension[:, :3]))
+        write_recording(tmp_path / "it.bag", PAPER, poses, Tensions(tension.time, tension.tension[:, :3]))
     for ending in written_suffixes():
         with pytest.raises(RecordingError, match="cannot be written"):
             write_recording(tmp_path / "nowhere" / f"it{ending}", PAPER, poses, tension, command)

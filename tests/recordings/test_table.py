@@ -2,15 +2,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.metrics import dtw_distance
-from knode_cosserat.recordings import (
-    MarkerSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    load_example,
-    load_recording,
-)
+from knode_cosserat.metrics import dtw_distance
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_example, load_recording
+from knode_cosserat.recordings.config import MarkerSource, TensionSource
 
 HEADER = "time [s],tension_1 [N],tension_2 [N],tip_x [m],tip_y [m],tip_z [m]"
 ROW = "0,1,2,0.1,0.2,0.3"

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.recordings.streams import Tensions
 from knode_cosserat.recordings.virtual import (
     GRAM,
     Sensors,
@@ -12,7 +13,6 @@ from knode_cosserat.recordings.virtual import (
     record_virtual,
     simulated_sensors,
 )
-from knode_cosserat.recordings.write import Pulls
 
 
 def grams(signal, seconds=6.0):
@@ -98,7 +98,7 @@ def test_other_signals_come_after_a_rest(tmp_path):
 
 
 def test_the_lag_is_a_first_order_lag():
-    sent = Pulls(np.array([0.0, 1.0]), np.array([[1.0] * 4, [2.0] * 4]))
+    sent = Tensions(np.array([0.0, 1.0]), np.array([[1.0] * 4, [2.0] * 4]))
     time = np.arange(0.0, 2.0, 0.01)
     expected = np.where(time < 1.0, 1.0, 2.0 - np.exp(-(time - 1.0) / 0.06))
     np.testing.assert_allclose(lagged(sent, time, 0.06)[:, 0], expected, atol=1e-12)

@@ -10,7 +10,8 @@ from typer.testing import CliRunner
 import knode_cosserat as kc
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import TendonFriction
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -41,14 +42,14 @@ def recorded(path, tension, seed):
     poses = {}
     for name, node in nodes.items():
         turned = Rotation.from_quat(np.asarray(moved.quaternion)[:, node], scalar_first=True)
-        poses[name] = MocapPoses(
+        poses[name] = Body(
             time,
             np.asarray(moved.position)[:, node] + rng.normal(0.0, 2e-4, (len(time), 3)),
             (turned * Rotation.from_rotvec(rng.normal(0.0, 2e-3, (len(time), 3)))).as_quat(scalar_first=True),
         )
     still = np.tile([0.0, 0.0, PAPER.base.height], (len(time), 1))
-    poses["base"] = MocapPoses(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
-    pulled = Pulls(time[::2][: len(control[::2])], control[::2])
+    poses["base"] = Body(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
+    pulled = Tensions(time[::2][: len(control[::2])], control[::2])
     write_recording(path, PAPER, poses, pulled, pulled)
 
 

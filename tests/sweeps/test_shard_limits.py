@@ -82,17 +82,6 @@ def test_changed_metadata_are_found(tmp_path):
         read_shard(path, ["case"], verify=False)
 
 
-def test_the_number_of_values_of_each_page_is_read(tmp_path):
-    path = written(tmp_path, columns(5_000))
-    metadata = pyarrow_parquet.read_metadata(path)
-    data = path.read_bytes()
-    for k, values in enumerate((5_000, 60_000, 5_000)):
-        chunk = metadata.row_group(0).column(k)
-        pages = list(parquet_file._pages(data, chunk))
-        dictionary = 1 if chunk.has_dictionary_page else 0
-        assert sum(page.values for page in pages) == values + dictionary
-
-
 # the setting of the limits
 
 

@@ -1,4 +1,4 @@
-"""Controls of many cases at once are those of `named_controls.parse`, case by case."""
+"""Controls of many cases at once are those of `controls.parse`, case by case."""
 
 import numpy as np
 import pytest
@@ -30,7 +30,7 @@ NUMBERS = st.floats(-1.0, 6.0).map(lambda x: round(x, 3))
 def parsed(robot, text):
     """Controls of one case, or the reason why there are none."""
     try:
-        return kc.named_controls.parse(robot, text, 6, 0.05)
+        return kc.controls.parse(text, 6, 0.05, robot)
     except kc.controls.ControlsError as error:
         return str(error)
 

@@ -115,7 +115,7 @@ def test_a_platform_starts_from_its_equilibrium(tmp_path):
     data = run_sweep(sweep, tmp_path / "a")
     for k, radius in enumerate(radii):
         robot = kc.load_robot(six).replace(platform_radius=radius)
-        motion = kc.simulate(robot, kc.named_controls.parse(robot, "none", 2, 0.02), 0.02)
+        motion = kc.simulate(robot, kc.controls.parse("none", 2, 0.02, robot), 0.02)
         np.testing.assert_allclose(data["position"][k], motion.position, atol=1e-9)
 
 

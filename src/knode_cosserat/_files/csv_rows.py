@@ -53,10 +53,8 @@ def read_rows(
 ) -> tuple[Times, Rows, list[int]]:
     """Return increasing times, the other numbers of each row in the order of their places, and these places.
 
-    Args:
-        path: the file.
-        header: allowed header, for the errors.
-        columns_of: function from the header's location and titles to columns; raises its own error.
+    `columns_of` makes columns from the header's location and titles, and raises its own error; `header` is
+    the allowed one, for errors.
 
     Raises:
         CSVTextError: the file is invalid; the message names file, line and column.

@@ -10,7 +10,7 @@ import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -77,6 +77,69 @@ Progress = Annotated[
     bool | None,
     typer.Option("--progress/--no-progress", help="Show progress on stderr.", show_default="on a terminal"),
 ]
+
+
+# groups of options, which several commands have
+
+
+class Nominal(NamedTuple):
+    """Options that state a robot or a model, with its own nodes."""
+
+    robot: Robot
+    changes: Changes = None
+
+    def load(self) -> System:
+        """Return the robot or model."""
+        return load_system(self.robot, self.changes)
+
+
+class Model(NamedTuple):
+    """Options that state a robot or a model, and its nodes."""
+
+    robot: Robot
+    changes: Changes = None
+    nodes: Nodes = None
+
+    def load(self) -> System:
+        """Return the robot or model."""
+        return load_system(self.robot, self.changes, self.nodes)
+
+
+class Report(NamedTuple):
+    """Options of progress and output."""
+
+    progress: Progress = None
+    as_json: Json = False
+
+    @property
+    def shows_progress(self) -> bool:
+        """True if progress is shown: by option, or by default on a terminal."""
+        return shows_progress(self.progress)
+
+
+class Sampling(NamedTuple):
+    """Options of the rows of recordings, and of their simulation."""
+
+    config: Annotated[
+        Path | None,
+        option(
+            "YAML",
+            "Meaning of the recordings' topics or columns.",
+            show_default="the paper's robot for bags; titles and comments for tables",
+        ),
+    ] = None
+    start: Annotated[
+        float | None,
+        option("S", "Start time in the recording (s), at which the robot rests.", show_default="0"),
+    ] = None
+    seconds: Annotated[float | None, option("S", "Duration used (s).", show_default="to the end")] = None
+    dt: Annotated[float, option("S", "Time between rows of a recording (s).")] = 0.0125
+    space: Space = "lobatto2"
+
+    @property
+    def end(self) -> float | None:
+        """End of the rows (s); None: that of the recording."""
+        return None if self.seconds is None else (self.start or 0.0) + self.seconds
 
 
 # numbers
@@ -224,6 +287,18 @@ def load_trajectory_file(path: Path) -> Trajectory:
     return kc.load_trajectory(path)
 
 
+def trajectories_by_name(files: Sequence[str | Path]) -> dict[str, Trajectory]:
+    """Return the trajectories by the stems of their files, or by paths if stems are equal."""
+    stems = [Path(file).stem for file in files]
+    trajectories: dict[str, Trajectory] = {}
+    for file, stem in zip(files, stems, strict=True):
+        name = stem if stems.count(stem) == 1 else str(file)
+        while name in trajectories:
+            name += " (again)"
+        trajectories[name] = load_trajectory_file(Path(file))
+    return trajectories
+
+
 def require_writable(
     file: Path | None = None, figure: Path | None = None, folders: Sequence[Path | None] = ()
 ) -> None:
@@ -312,7 +387,7 @@ def shows_progress(progress: bool | None) -> bool:
 
 def figures() -> Any:
     """Return the module of figures. Raises `ImportError` without matplotlib."""
-    from knode_cosserat.evaluation import figures
+    from knode_cosserat import figures
 
     figures.require_matplotlib()
     return figures

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -13,8 +13,8 @@ from knode_cosserat.cli.arguments import (
     Changes,
     Json,
     Picture,
-    Progress,
-    Space,
+    Report,
+    Sampling,
     argument,
     command_line,
     figures,
@@ -25,9 +25,9 @@ from knode_cosserat.cli.arguments import (
     load_trajectory_file,
     option,
     require_writable,
-    shows_progress,
+    trajectories_by_name,
 )
-from knode_cosserat.cli.identify import Config, Seconds, Start, evaluate_on_recordings
+from knode_cosserat.cli.learn import evaluate_on_recordings
 from knode_cosserat.cli.output import table, write_output
 from knode_cosserat.cli.program import app, examples
 
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 UNSTRESSED = 1e-9
 
 
-class Kind(enum.StrEnum):
+class _Kind(enum.StrEnum):
     """Kinds of figures that `plot` draws."""
 
     overview = "overview"
@@ -53,7 +53,7 @@ class Kind(enum.StrEnum):
     compare = "compare"
 
 
-class Viewpoint(enum.StrEnum):
+class _Viewpoint(enum.StrEnum):
     """Projections of a robot: in space, or onto a coordinate plane."""
 
     xyz = "xyz"
@@ -63,8 +63,52 @@ class Viewpoint(enum.StrEnum):
 
 
 Trajectories = Annotated[list[Path], argument("TRAJECTORY…", "Trajectory files; the first is the reference.")]
-View = Annotated[Viewpoint, typer.Option(help="View in space (xyz), or projection onto a coordinate plane.")]
-Columns = Annotated[int, option("N", "Width of the figure: one or two columns of a paper.", min=1, max=2)]
+
+
+class _Look(NamedTuple):
+    """View and width of a figure."""
+
+    view: Annotated[
+        _Viewpoint, typer.Option(help="View in space (xyz), or projection onto a coordinate plane.")
+    ] = _Viewpoint.xyz
+    columns: Annotated[
+        int, option("N", "Width of the figure: one or two columns of a paper.", min=1, max=2)
+    ] = 1
+
+    def of(self, trajectory: Trajectory) -> str | None:
+        """Return the name of the view; None for the only view of a planar system."""
+        is_planar = np.shape(trajectory.position)[-1] == 2
+        return None if is_planar and self.view is _Viewpoint.xyz else self.view.value
+
+
+class _Pace(NamedTuple):
+    """Frame rate and speed of an animation."""
+
+    fps: Annotated[float, option("F", "Frames per second, 1 to 50.")] = 25.0
+    speed: Annotated[float, option("S", "Playback speed: 1 is real time, 0.5 is half speed.")] = 1.0
+
+
+class _Predictor(NamedTuple):
+    """Prediction, or what predicts."""
+
+    prediction: Annotated[
+        str,
+        argument(
+            "PREDICTION",
+            "Trajectory file; or a robot, model or ensemble (a folder; its mean is compared), "
+            "which is simulated under the controls of each reference.",
+        ),
+    ]
+    changes: Changes = None
+
+    def load(self) -> Trajectory | System | Ensemble:
+        """Return the trajectory, robot, model or ensemble."""
+        name, changes = self
+        if not is_trajectory(name):
+            return load_ensemble_folder(name, changes) or load_system(name, changes)
+        if changes:
+            raise ValueError(f"--set changes a robot; {name} is a trajectory")
+        return load_trajectory_file(Path(name))
 
 
 @app.command(
@@ -77,28 +121,15 @@ Columns = Annotated[int, option("N", "Width of the figure: one or two columns of
     )
 )
 def evaluate(
-    prediction: Annotated[
-        str,
-        argument(
-            "PREDICTION",
-            "Trajectory file; or a robot, model or ensemble (a folder; its mean is compared), "
-            "which is simulated under the controls of each reference.",
-        ),
-    ],
+    predictor: _Predictor,
     references: Annotated[
         list[Path], argument("REFERENCE", "Trajectory files (.nc); or recordings: bags or tables.")
     ],
-    changes: Changes = None,
+    sampling: Sampling,
+    report: Report,
     rows: Annotated[
         int | None, option("N", "Compare only the first N rows; the paper's tables use 100.", min=1)
     ] = None,
-    config: Config = None,
-    start: Start = None,
-    seconds: Seconds = None,
-    dt: Annotated[float, option("S", "Time between compared rows of a recording (s).")] = 0.0125,
-    space: Space = "lobatto2",
-    progress: Progress = None,
-    as_json: Json = False,
 ) -> None:
     """Compute the error of a prediction against references.
 
@@ -111,26 +142,21 @@ def evaluate(
     """
     import knode_cosserat as kc
 
-    _require_one_kind(prediction, references, config)
-    if config is not None or not any(is_trajectory(str(path)) for path in references):
+    prediction, changes = predictor
+    _require_one_kind(prediction, references, sampling.config)
+    if sampling.config is not None or not any(is_trajectory(str(path)) for path in references):
         system = load_system(prediction, changes)
-        return evaluate_on_recordings(system, references, config, start, seconds, dt, space, as_json)
-    predictor: Trajectory | System | Ensemble
-    if not is_trajectory(prediction):
-        predictor = load_ensemble_folder(prediction, changes) or load_system(prediction, changes)
-    elif changes:
-        raise ValueError(f"--set changes a robot; {prediction} is a trajectory")
-    else:
-        predictor = load_trajectory_file(Path(prediction))
+        return evaluate_on_recordings(system, references, sampling, report.as_json)
+    source = predictor.load()
     compared: list[dict[str, Any]] = []
     measures = (kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse)
     for path in references:
         reference = load_trajectory_file(path)
         try:
             predicted = (
-                predictor[:rows]
-                if isinstance(predictor, kc.Trajectory)
-                else _simulated(predictor, reference, rows, shows_progress(progress))
+                source[:rows]
+                if isinstance(source, kc.Trajectory)
+                else _simulated(source, reference, rows, report.shows_progress)
             )
             errors = {measure.__name__: measure(predicted, reference[:rows]) for measure in measures}
         except ValueError as error:
@@ -139,7 +165,7 @@ def evaluate(
     lines: list[list[str]] = [["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]"]]
     for name, count, *numbers in (one.values() for one in compared):
         lines.append([name, str(count), *(f"{number:.4g}" for number in numbers)])
-    write_output(as_json, {"prediction": prediction, "references": compared}, table(lines))
+    write_output(report.as_json, {"prediction": prediction, "references": compared}, table(lines))
 
 
 @app.command(
@@ -152,11 +178,10 @@ def evaluate(
 def plot(
     trajectories: Trajectories,
     out: Annotated[Path, Picture],
+    look: _Look,
     kind: Annotated[
-        Kind, typer.Option(help="Kind of figure.", show_default="overview; compare for several trajectories")
-    ] = Kind.overview,
-    view: View = Viewpoint.xyz,
-    columns: Columns = 1,
+        _Kind, typer.Option(help="Kind of figure.", show_default="overview; compare for several trajectories")
+    ] = _Kind.overview,
     as_json: Json = False,
 ) -> None:
     """Draw one trajectory, or overlay several.
@@ -167,24 +192,25 @@ def plot(
     """
     require_writable(figure=out)
     drawing = figures()
-    states = _by_stem(trajectories)
+    states = _distinct_trajectories(trajectories)
     first, *others = states.values()
-    if others and kind is Kind.overview:
-        kind = Kind.compare
-    if others and kind in (Kind.shape, Kind.tensions):
+    if others and kind is _Kind.overview:
+        kind = _Kind.compare
+    if others and kind in (_Kind.shape, _Kind.tensions):
         raise ValueError(f"--kind {kind} draws one trajectory; {len(states)} were given. Use --kind compare")
-    if not others and kind in (Kind.error, Kind.compare):
+    if not others and kind in (_Kind.error, _Kind.compare):
         raise ValueError(f"--kind {kind} needs a reference and at least one other trajectory; one was given")
     rest = dict(list(states.items())[1:])
+    looks: dict[str, Any] = {"columns": look.columns}
     draw = {
-        Kind.overview: lambda: drawing.overview(first),
-        Kind.shape: lambda: drawing.shape(first, view=_view(first, view), columns=columns),
-        Kind.path: lambda: drawing.path(states, view=_view(first, view), columns=columns),
-        Kind.tip: lambda: drawing.tips(states, columns=columns),
-        Kind.states: lambda: drawing.states(states, columns=columns),
-        Kind.tensions: lambda: drawing.tensions(first, columns=columns),
-        Kind.error: lambda: drawing.error(first, rest, columns=columns),
-        Kind.compare: lambda: drawing.compare(first, rest),
+        _Kind.overview: lambda: drawing.overview(first),
+        _Kind.shape: lambda: drawing.shape(first, view=look.of(first), **looks),
+        _Kind.path: lambda: drawing.path(states, view=look.of(first), **looks),
+        _Kind.tip: lambda: drawing.tips(states, **looks),
+        _Kind.states: lambda: drawing.states(states, **looks),
+        _Kind.tensions: lambda: drawing.tensions(first, **looks),
+        _Kind.error: lambda: drawing.error(first, rest, **looks),
+        _Kind.compare: lambda: drawing.compare(first, rest),
     }
     draw[kind]().savefig(out)
     write_output(
@@ -200,10 +226,8 @@ def plot(
 def animate(
     trajectories: Trajectories,
     out: Annotated[Path, option("FILE", "Write the animation to this GIF or MP4 file.")],
-    fps: Annotated[float, option("F", "Frames per second, 1 to 50.")] = 25.0,
-    speed: Annotated[float, option("S", "Playback speed: 1 is real time, 0.5 is half speed.")] = 1.0,
-    view: View = Viewpoint.xyz,
-    columns: Columns = 1,
+    pace: _Pace,
+    look: _Look,
     as_json: Json = False,
 ) -> None:
     """Animate one trajectory, or several overlaid.
@@ -212,24 +236,17 @@ def animate(
     """
     require_writable(out)
     drawing = figures()
-    states = _by_stem(trajectories)
-    projection = _view(next(iter(states.values())), view)
-    drawing.animate(states, out, fps=fps, speed=speed, view=projection, columns=columns)
+    states = _distinct_trajectories(trajectories)
+    view = look.of(next(iter(states.values())))
+    drawing.animate(states, out, fps=pace.fps, speed=pace.speed, view=view, columns=look.columns)
     write_output(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
 
 
-def _by_stem(paths: list[Path]) -> dict[str, Trajectory]:
-    """Return the trajectories by the stems of their files, or by their paths if stems are equal."""
-    stems = [path.stem for path in paths]
-    names = stems if len(set(stems)) == len(stems) else [str(path) for path in paths]
-    if len(set(names)) < len(names):
-        raise ValueError(f"{names[0]}: given twice; allowed is each file once")
-    return {name: load_trajectory_file(path) for name, path in zip(names, paths, strict=True)}
-
-
-def _view(trajectory: Trajectory, view: Viewpoint) -> str | None:
-    """Return the name of a view; None for the only view of a planar system."""
-    return None if np.shape(trajectory.position)[-1] == 2 and view is Viewpoint.xyz else view.value
+def _distinct_trajectories(paths: list[Path]) -> dict[str, Trajectory]:
+    """Return the trajectories by name. Raises `ValueError` if one is there twice."""
+    if len(set(paths)) < len(paths):
+        raise ValueError(f"{paths[0]}: given twice; allowed is each file once")
+    return trajectories_by_name(paths)
 
 
 def _require_one_kind(prediction: str, references: list[Path], config: Path | None) -> None:

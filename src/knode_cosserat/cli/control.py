@@ -5,16 +5,15 @@ from __future__ import annotations
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
 
 from knode_cosserat._files.csv_rows import size_excess
 from knode_cosserat.cli.arguments import (
-    Changes,
     Json,
-    Robot,
+    Nominal,
     load_system,
     option,
     parse_limits,
@@ -24,6 +23,10 @@ from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.recordings.formats import written_suffixes
 from knode_cosserat.rods.wrapped import nominal_model
+
+if TYPE_CHECKING:
+    from knode_cosserat.control import ControlLimits
+    from knode_cosserat.rods.system import System
 
 #: distance from the nearest tip at rest at which a warning is given, as part of the length
 OUT_OF_REACH = 2e-3
@@ -55,15 +58,9 @@ Method = Annotated[
 ]
 
 
-@app.command(
-    epilog=examples(
-        "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
-        "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
-        "control delrin-tendon-robot --live",
-    )
-)
-def control(
-    robot: Robot,
+class _Task(NamedTuple):
+    """Reference of the tip, and the controlled robot."""
+
     reference: Annotated[
         str | None,
         option(
@@ -71,29 +68,38 @@ def control(
             "Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
             "centre is at x=, y=, z= (m), in plane=xy, yz or xz.",
         ),
-    ] = None,
-    live: Annotated[
-        bool, typer.Option("--live", help="Open the viewer: the tip follows a target that you drag.")
-    ] = False,
+    ] = None
+    seconds: Annotated[float, option("S", "Duration (s).")] = 10.0
     plant: Annotated[
         str | None,
-        option(
-            "ROBOT",
-            "Robot that is controlled, simulated.",
-            show_default="the model itself",
-        ),
-    ] = None,
-    method: Method = "predictive",
-    seconds: Annotated[float, option("S", "Duration (s).")] = 10.0,
-    dt: Annotated[float, option("S", "Period of the control (s).")] = 0.05,
-    low: Annotated[str, option("NUMBERS", "Least control: one number, or one for each.")] = "0",
-    high: Annotated[str, option("NUMBERS", "Greatest control: one number, or one for each.")] = "10",
-    rate: Annotated[float, option("PER_S", "Greatest change of a control in 1 s.")] = 40.0,
-    lag: Annotated[float, option("S", "Time constant of the motors that the controller expects (s).")] = 0.0,
+        option("ROBOT", "Robot that is controlled, simulated.", show_default="the model itself"),
+    ] = None
+    noise: Annotated[float, option("FACTOR", "Noise of the tip sensor, in multiples of 0.2 mm.")] = 0.0
+
+    def plant_of(self, model: System, dt: float) -> Any:
+        """Return the controlled robot: another simulator's, another robot or the model itself."""
+        from knode_cosserat import control as kcc
+        from knode_cosserat.estimation import TipPosition
+
+        sensor = kcc.Sensor(TipPosition(), self.noise)
+        word, _, rest = (self.plant or "").partition(":")
+        if word in PLANTS:
+            return PLANTS[word](rest, dt, sensor)
+        return kcc.SimulatedPlant(model if self.plant is None else load_system(self.plant), dt, sensor)
+
+
+class _Method(NamedTuple):
+    """Controller and limits."""
+
+    method: Method = "predictive"
+    dt: Annotated[float, option("S", "Period of the control (s).")] = 0.05
+    low: Annotated[str, option("NUMBERS", "Least control: one number, or one for each.")] = "0"
+    high: Annotated[str, option("NUMBERS", "Greatest control: one number, or one for each.")] = "10"
+    rate: Annotated[float, option("PER_S", "Greatest change of a control in 1 s.")] = 40.0
+    lag: Annotated[float, option("S", "Time constant of the motors that the controller expects (s).")] = 0.0
     adapt: Annotated[
         list[str] | None, option("NAME", "Adapt this parameter of the model while running; may be repeated.")
-    ] = None,
-    noise: Annotated[float, option("FACTOR", "Noise of the tip sensor, in multiples of 0.2 mm.")] = 0.0,
+    ] = None
     deviation: Annotated[
         float,
         option(
@@ -101,58 +107,81 @@ def control(
             "Standard deviation of the measured tip for the observer (m): noise and error of the model.",
             "--tip-deviation",
         ),
-    ] = 2e-4,
-    out: Annotated[Path | None, option("FILE", "Write one row a period to this CSV file.")] = None,
+    ] = 2e-4
+
+    def limits(self, size: int) -> ControlLimits:
+        """Return the limits of `size` controls."""
+        from knode_cosserat.control import ControlLimits
+
+        low, high = parse_limits("--low", self.low, size), parse_limits("--high", self.high, size)
+        return ControlLimits(low, high, self.rate, lag=self.lag)
+
+
+class _Output(NamedTuple):
+    """Files and output of a closed loop."""
+
+    out: Annotated[Path | None, option("FILE", "Write one row a period to this CSV file.")] = None
     recording: Annotated[
         Path | None,
         option(
             "FILE",
             f"Write the measured tip and the controls as a recording: {', '.join(written_suffixes())}.",
         ),
-    ] = None,
+    ] = None
     states: Annotated[
         Path | None, option("FILE", "Write the estimated states as a trajectory (.nc), to view or plot.")
-    ] = None,
-    figure: Annotated[Path | None, option("FILE", "Draw path, error and controls into this file.")] = None,
+    ] = None
+    figure: Annotated[Path | None, option("FILE", "Draw path, error and controls into this file.")] = None
+    as_json: Json = False
+
+
+class _Viewer(NamedTuple):
+    """Viewer with a target."""
+
+    live: Annotated[
+        bool, typer.Option("--live", help="Open the viewer: the tip follows a target that you drag.")
+    ] = False
     export: Annotated[
         Path | None, option("FILE", "With --live: at the end, write the last run as one HTML file.")
-    ] = None,
+    ] = None
     port: Annotated[
         int, option("N", "With --live: port of the local web server.", show_default="any free port")
-    ] = 0,
-    no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False,
-    changes: Changes = None,
-    as_json: Json = False,
-) -> None:
+    ] = 0
+    no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False
+
+
+@app.command(
+    epilog=examples(
+        "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
+        "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
+        "control delrin-tendon-robot --live",
+    )
+)
+def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, viewer: _Viewer) -> None:
     """Control the tip of a robot in closed loop, and report the tracking error.
 
     ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so
     that the effect of a wrong model is seen. Controls stay within --low, --high and --rate in every period.
     With --live, the target is dragged in the browser, and the report is of the last run, until Ctrl-C.
     """
-    if live == (reference is not None):
+    if viewer.live == (task.reference is not None):
         raise ValueError("give either --reference, or --live to drag the target in the browser")
-    if not live and (export is not None or port or no_open):
+    if not viewer.live and viewer != _Viewer():
         raise ValueError("--export, --port and --no-open are of the viewer; use them with --live")
-    for path in (out, recording, states, figure, export):
+    for path in (output.out, output.recording, output.states, output.figure, viewer.export):
         require_writable(path)
     from knode_cosserat import control as kcc
     from knode_cosserat.estimation import TipPosition
 
-    model = load_system(str(robot), changes)
-    count, length = model.control_layout.size, float(nominal_model(model).length)
-    ends = parse_limits("--low", low, count), parse_limits("--high", high, count)
-    limits = kcc.ControlLimits(*ends, rate, lag=lag)
-    controller = kcc.controller_named(method, model, dt, limits, adapt or (), TipPosition(sigma=deviation))
-    sensor = kcc.Sensor(TipPosition(), noise)
-    word, _, rest = (plant or "").partition(":")
-    if word in PLANTS:
-        controlled = PLANTS[word](rest, dt, sensor)
-    else:
-        controlled = kcc.SimulatedPlant(model if plant is None else load_system(plant), dt, sensor)
+    model = nominal.load()
+    length, limits = float(nominal_model(model).length), method.limits(model.control_layout.size)
+    controller = kcc.controller_named(
+        method.method, model, method.dt, limits, method.adapt or (), TipPosition(sigma=method.deviation)
+    )
+    plant = task.plant_of(model, method.dt)
     beyond = None  # with --live, the target moves
-    if reference is not None:
-        wanted = parsed_reference(reference)
+    if task.reference is not None:
+        wanted, seconds = parsed_reference(task.reference), task.seconds
         beyond, time = kcc.distance_out_of_reach(model, limits, wanted, seconds)
         if beyond > OUT_OF_REACH * length:
             typer.echo(
@@ -162,36 +191,38 @@ def control(
             )
         else:
             beyond = 0.0
-        log = kcc.run_loop(controller, controlled, wanted, seconds)
+        log = kcc.run_loop(controller, plant, wanted, seconds)
     else:
-        from knode_cosserat import viewer
+        from knode_cosserat.viewer import control_live
 
         def announce(address: str) -> None:
-            write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
-            if not no_open:
+            lines = [f"the viewer is at {address} (Ctrl-C ends it)"]
+            write_output(output.as_json, {"address": address}, lines)
+            if not viewer.no_open:
                 webbrowser.open(address)
 
-        title = str(robot) if plant is None else f"{plant}, controlled by {robot}"
-        run = viewer.control_live(
-            controller, controlled, title=title, export=export, port=port, open_browser=announce
+        robot = nominal.robot
+        title = robot if task.plant is None else f"{task.plant}, controlled by {robot}"
+        run = control_live(
+            controller, plant, title=title, export=viewer.export, port=viewer.port, open_browser=announce
         )
         if run is None:
             return
         log = run
-    if out is not None:
-        log.to_csv(out)
-    if recording is not None:
-        log.measurements(simulated=True).save(recording)
-    if states is not None:
+    if output.out is not None:
+        log.to_csv(output.out)
+    if output.recording is not None:
+        log.measurements(simulated=True).save(output.recording)
+    if output.states is not None:
         if log.estimated is None:
             raise ValueError(
-                f"--states: the method {method} estimates no states; predictive, ilqr and mppi do"
+                f"--states: the method {method.method} estimates no states; predictive, ilqr and mppi do"
             )
-        log.estimated.save(states)
-    if figure is not None:
-        from knode_cosserat.evaluation.control_figures import closed_loop
+        log.estimated.save(output.states)
+    if output.figure is not None:
+        from knode_cosserat.figures import closed_loop
 
-        closed_loop(log).savefig(figure)
+        closed_loop(log).savefig(output.figure)
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
     lines = [
         f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "
@@ -199,10 +230,10 @@ def control(
         *([f"the reference is up to {1e3 * beyond:.3g} mm out of reach"] if beyond else []),
         f"{facts['periods']} periods, {facts['fallbacks']} without a solution; feedback "
         f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians); "
-        f"{facts['missed']} took longer than the period of {1e3 * dt:g} ms",
+        f"{facts['missed']} took longer than the period of {1e3 * method.dt:g} ms",
         *(f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()),
     ]
-    write_output(as_json, facts, lines, out=out, export=export)
+    write_output(output.as_json, facts, lines, out=output.out, export=viewer.export)
 
 
 def parsed_reference(text: str) -> Any:

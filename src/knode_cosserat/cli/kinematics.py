@@ -4,25 +4,21 @@ from __future__ import annotations
 
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
 from knode_cosserat.cli.arguments import (
-    Changes,
     Json,
-    Nodes,
+    Model,
     Picture,
-    Progress,
-    Robot,
+    Report,
     Space,
     figures,
-    load_system,
     option,
     parse_limits,
     parse_numbers,
     require_writable,
-    shows_progress,
 )
 from knode_cosserat.cli.output import vector_text, write_output
 from knode_cosserat.cli.program import app, examples
@@ -30,22 +26,68 @@ from knode_cosserat.cli.summaries import stability_summary
 from knode_cosserat.rods.parameters import in_other_unit
 
 if TYPE_CHECKING:
-    pass
+    from knode_cosserat.rods.system import System
 
-Low = Annotated[
-    str,
-    option(
-        "LIMITS", "Lower limits of the controls in their units (tensions: N): one number, or one per control."
-    ),
-]
-High = Annotated[
-    str,
-    option(
-        "LIMITS",
-        "Upper limits of the controls in their units (tensions: N): one number, or one per control, "
-        "such as 8,8,10,10.",
-    ),
-]
+
+class _Limits(NamedTuple):
+    """Limits of the controls."""
+
+    low: Annotated[
+        str,
+        option(
+            "LIMITS",
+            "Lower limits of the controls in their units (tensions: N): one number, or one per control.",
+        ),
+    ] = "0"
+    high: Annotated[
+        str,
+        option(
+            "LIMITS",
+            "Upper limits of the controls in their units (tensions: N): one number, or one per control, "
+            "such as 8,8,10,10.",
+        ),
+    ] = "10"
+
+    def of(self, system: System) -> tuple[float | list[float], float | list[float]]:
+        """Return the lower and the upper limits of a robot's controls."""
+        size = system.control_layout.size
+        return parse_limits("--low", self.low, size), parse_limits("--high", self.high, size)
+
+
+#: largest plausible distance of a target, in lengths of the robot
+FARTHEST = 10.0
+
+
+class _Target(NamedTuple):
+    """Target of the tip."""
+
+    position: Annotated[
+        str | None, option("X,Y,Z", "Target position of the tip (m), such as 0.1,0.05,0.58.")
+    ] = None
+    quaternion: Annotated[
+        str | None, option("W,X,Y,Z", "Target orientation of the tip: a quaternion, scalar first.")
+    ] = None
+    tolerance: Annotated[
+        float, option("X", "Tolerance: position error as a fraction of the length, angle error in rad.")
+    ] = 1e-4
+
+    def pose(self, length: float) -> tuple[list[float] | None, list[float] | None]:
+        """Return position (m) and quaternion. Raises `ValueError` for a position that seems to be in mm."""
+        orientation = None
+        if self.quaternion is not None:
+            orientation = parse_numbers("--quaternion", self.quaternion, 4, "0.98,-0.1,0.17,0")
+        if self.position is None:
+            return None, orientation
+        target = parse_numbers("--position", self.position, 3, "0.1,0.05,0.25")
+        if np.linalg.norm(target) > FARTHEST * length:
+            meant = in_other_unit(target, "m", -2.0 * length, 2.0 * length)
+            if meant is not None:
+                unit, values = meant
+                raise ValueError(
+                    f"--position must be in metres (got {self.position} for a robot of {length:g} m length). "
+                    f"Did you mean {' '.join(f'{x:g}' for x in values)} ({self.position} {unit})?"
+                )
+        return target, orientation
 
 
 @app.command(
@@ -55,21 +97,10 @@ High = Annotated[
     )
 )
 def reach(
-    robot: Robot,
-    position: Annotated[
-        str | None, option("X,Y,Z", "Target position of the tip (m), such as 0.1,0.05,0.58.")
-    ] = None,
-    quaternion: Annotated[
-        str | None, option("W,X,Y,Z", "Target orientation of the tip: a quaternion, scalar first.")
-    ] = None,
-    low: Low = "0",
-    high: High = "10",
-    tolerance: Annotated[
-        float, option("X", "Tolerance: position error as a fraction of the length, angle error in rad.")
-    ] = 1e-4,
+    model: Model,
+    target: _Target,
+    limits: _Limits,
     space: Space = "lobatto2",
-    changes: Changes = None,
-    nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
     """Compute controls that move the tip to a pose at rest.
@@ -78,18 +109,13 @@ def reach(
     cannot be reached, it returns the nearest pose and says so.
     """
     import knode_cosserat as kc
-    from knode_cosserat import named_controls
+    from knode_cosserat.controls import labels, units
 
-    system = load_system(robot, changes, nodes)
-    size = system.control_layout.size
-    target = None if position is None else _target(position, float(system.length))
-    orientation = (
-        None if quaternion is None else parse_numbers("--quaternion", quaternion, 4, "0.98,-0.1,0.17,0")
-    )
+    system = model.load()
+    low, high = limits.of(system)
     found = kc.inverse_kinematics(
-        system, target, orientation,
-        low=parse_limits("--low", low, size), high=parse_limits("--high", high, size),
-        tolerance=tolerance, space=space,
+        system, *target.pose(float(system.length)), low=low, high=high, tolerance=target.tolerance,
+        space=space,
     )  # fmt: skip
     try:
         decided = kc.statics.stability(found.equilibrium)
@@ -97,12 +123,12 @@ def reach(
     except ValueError:
         stability, warnings = stability_summary(None)
     facts: dict[str, Any] = {
-        "robot": robot,
+        "robot": model.robot,
         "result": found.result.name.lower(),
         "converged": bool(found.converged),
         "control": found.control.tolist(),
-        "names": named_controls.labels(system.control_layout),
-        "units": named_controls.units(system.control_layout),
+        "names": labels(system.control_layout),
+        "units": units(system.control_layout),
         "position": _plain(found.position),
         "quaternion": _plain(found.quaternion),
         "position_error": float(found.position_error) if np.isfinite(found.position_error) else None,
@@ -115,7 +141,7 @@ def reach(
     }
     tensions_only = system.control_layout.names == ("tension",)
     word = "tensions" if tensions_only else "controls"
-    names = [str(i + 1) for i in range(size)] if tensions_only else facts["names"]
+    names = [str(i + 1) for i in range(len(found.control))] if tensions_only else facts["names"]
     if tensions_only:
         text = f"{vector_text(facts['control'])} N"
     else:
@@ -127,9 +153,9 @@ def reach(
     lines = [f"{found.result.message}; {found.iterations} equilibria computed", f"{word}: {text}"]
     if facts["position"]:
         lines.append(f"tip: {vector_text(facts['position'])} m")
-    if position is not None:
+    if target.position is not None:
         lines.append(f"position error: {found.position_error:.3g} m")
-    if quaternion is not None:
+    if target.quaternion is not None:
         lines.append(f"angle error: {np.degrees(found.angle_error):.3g} degrees")
     for name, active in (("lower", found.at_low), ("upper", found.at_high)):
         if np.any(active):
@@ -141,6 +167,15 @@ def reach(
     write_output(as_json, facts, lines)
 
 
+class _Samples(NamedTuple):
+    """Sampled equilibria and their files."""
+
+    out: Annotated[Path, option("FILE", "Write controls and tip poses to this .nc, .csv or .npz file.")]
+    picture: Annotated[Path | None, Picture] = None
+    number: Annotated[int, option("N", "Number of equilibria to compute.", "--count")] = 10_000
+    seed: Annotated[int, option("N", "Random seed of the samples.", min=0)] = 0
+
+
 @app.command(
     epilog=examples(
         "workspace delrin-tendon-robot --count 100000 --out workspace.nc",
@@ -148,18 +183,7 @@ def reach(
     )
 )
 def workspace(
-    robot: Robot,
-    out: Annotated[Path, option("FILE", "Write controls and tip poses to this .nc, .csv or .npz file.")],
-    count: Annotated[int, option("N", "Number of equilibria to compute.")] = 10_000,
-    low: Low = "0",
-    high: High = "10",
-    seed: Annotated[int, option("N", "Random seed of the samples.", min=0)] = 0,
-    space: Space = "lobatto2",
-    changes: Changes = None,
-    nodes: Nodes = None,
-    picture: Annotated[Path | None, Picture] = None,
-    progress: Progress = None,
-    as_json: Json = False,
+    model: Model, samples: _Samples, limits: _Limits, report: Report, space: Space = "lobatto2"
 ) -> None:
     """Sample the tip poses that a robot reaches at rest.
 
@@ -167,54 +191,32 @@ def workspace(
     """
     from knode_cosserat.statics.workspace import FORMATS
 
+    out, picture, count, seed = samples
     require_writable(out, picture)
     if out.suffix not in FORMATS:
         raise ValueError(f"{out}: the name must end in {', '.join(FORMATS)}")
-    if picture:
-        figures()
+    drawing = figures() if picture else None
     import knode_cosserat as kc
 
-    system = load_system(robot, changes, nodes)
-    size = system.control_layout.size
+    system = model.load()
     began = perf_counter()
     found = kc.workspace(
-        system, parse_limits("--low", low, size), parse_limits("--high", high, size), count,
-        seed=seed, space=space, progress=shows_progress(progress),
-    )  # fmt: skip
+        system, *limits.of(system), count, seed=seed, space=space, progress=report.shows_progress
+    )
     seconds = perf_counter() - began
     found.save(out)
-    if picture:
-        from knode_cosserat.evaluation.workspace_figures import workspace_seen
-
-        workspace_seen(found).savefig(picture)
+    if drawing:
+        drawing.workspace(found).savefig(picture)
     inside = found.position[found.valid]
     box = [inside.min(axis=0).tolist(), inside.max(axis=0).tolist()] if len(inside) else None
     facts = {
-        "robot": robot, "count": count, "unsolved": found.unsolved, "seed": seed, "box": box,
+        "robot": model.robot, "count": count, "unsolved": found.unsolved, "seed": seed, "box": box,
         "computing_time": round(seconds, 3),
     }  # fmt: skip
     lines = [f"{count} equilibria computed in {seconds:.1f} s; not solved: {found.unsolved}"]
     if box:
         lines.append(f"tip positions between {vector_text(box[0])} and {vector_text(box[1])} m")
-    write_output(as_json, facts, lines, out=out, picture=picture)
-
-
-#: largest plausible distance of a target, in lengths of the robot
-FARTHEST = 10.0
-
-
-def _target(text: str, length: float) -> list[float]:
-    """Return a target position (m). Raises `ValueError` if it seems to be in another unit."""
-    target = parse_numbers("--position", text, 3, "0.1,0.05,0.25")
-    if np.linalg.norm(target) > FARTHEST * length:
-        meant = in_other_unit(target, "m", -2.0 * length, 2.0 * length)
-        if meant is not None:
-            unit, values = meant
-            raise ValueError(
-                f"--position must be in metres (got {text} for a robot of {length:g} m length). "
-                f"Did you mean {' '.join(f'{x:g}' for x in values)} ({text} {unit})?"
-            )
-    return target
+    write_output(report.as_json, facts, lines, out=out, picture=picture)
 
 
 def _plain(values: Any) -> list[float] | None:

@@ -1,46 +1,123 @@
-"""Command that learns a residual model from trajectories: fit."""
+"""Commands that learn: fit, from trajectories; identify, from recordings; evaluation on recordings."""
 
 from __future__ import annotations
 
+import dataclasses
 import enum
+import functools
+import math
 import re
+import sys
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
-    Changes,
-    Json,
+    Nominal,
     Picture,
-    Progress,
-    Robot,
+    Report,
+    Sampling,
     argument,
     command_line,
     figures,
     is_recording,
-    load_system,
+    load_recordings,
     load_trajectory_file,
     option,
     require_writable,
-    shows_progress,
 )
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.summaries import residual_summary
+from knode_cosserat.recordings.formats import read_suffixes
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.config import FitConfig
+    from knode_cosserat.rods.system import System
 
 
-class Preset(enum.StrEnum):
+class _Preset(enum.StrEnum):
     """Presets of the learning method."""
 
     best = "best"
     paper = "paper"
     network = "network"
+
+
+class _Data(NamedTuple):
+    """Training and validation data."""
+
+    trajectories: Annotated[
+        list[Path], argument("TRAJECTORY", "Training trajectories (.nc) with full states.")
+    ]
+    rows: Annotated[
+        int | None, option("N", "Use the first N rows of each trajectory only; the paper uses 30.", min=1)
+    ] = None
+    held_out: Annotated[
+        list[Path] | None, option("FILE", "Validation trajectory for early stopping; may be repeated.")
+    ] = None
+
+
+class _Method(NamedTuple):
+    """Method of learning."""
+
+    preset: Annotated[
+        _Preset,
+        typer.Option(
+            help="best: structured residual by sparse regression. paper: the paper's network and training. "
+            "network: a network without the paper's constraints."
+        ),
+    ] = _Preset.best
+    seed: Annotated[int | None, option("N", "Random seed.", show_default="0")] = None
+    seeds: Annotated[str | None, option("N,N,…", "Several random seeds: train one model for each.")] = None
+    epochs: Annotated[
+        int | None, option("N", "Training epochs of a network.", show_default="the preset's")
+    ] = None
+
+    def numbers(self) -> int | tuple[int, ...]:
+        """Return the seed of one model, or the seeds of several."""
+        if self.seeds is None:
+            return self.seed or 0
+        if self.seed is not None:
+            raise ValueError("--seed is for one model and --seeds for several; give one of them")
+        values = numbers_in(self.seeds)
+        if values is None or not all(value.is_integer() for value in values):
+            raise ValueError(f"--seeds must be whole numbers, such as 0,1,2 (got {self.seeds!r})")
+        return tuple(map(int, values))
+
+    def config(self) -> FitConfig:
+        """Return the settings of the fit."""
+        from knode_cosserat.learning.config import FitConfig, StructuredOptions
+
+        seed = self.numbers()
+        if self.preset is _Preset.best:
+            if self.epochs is not None:
+                raise ValueError(
+                    "--epochs is for networks; the preset best has none. Use --preset paper or --preset "
+                    "network"
+                )
+            return FitConfig(StructuredOptions(resample=isinstance(seed, tuple)), seed=seed)
+        config = FitConfig.paper(seed) if self.preset is _Preset.paper else FitConfig.network(seed)
+        if self.epochs is None or config.segments is None:
+            return config
+        segments = dataclasses.replace(config.segments, epochs=self.epochs)
+        return dataclasses.replace(config, segments=segments)
+
+
+class _Files(NamedTuple):
+    """Files of a fit."""
+
+    out: Annotated[
+        Path, option("PATH", "Write the model to this file; with --seeds, write an ensemble to this folder.")
+    ]
+    checkpoint: Annotated[
+        Path | None, option("DIR", "Save the training state in this folder, and resume from it.")
+    ] = None
+    log: Annotated[Path | None, option("DIR", "Write TensorBoard event files to this folder.")] = None
+    figure: Annotated[Path | None, Picture] = None
 
 
 @app.command(
@@ -49,48 +126,15 @@ class Preset(enum.StrEnum):
         "fit my-robot.yaml a.nc b.nc --preset paper --seeds 0,1,2 --checkpoint saved --out model",
     )
 )
-def fit(
-    robot: Robot,
-    trajectories: Annotated[
-        list[Path], argument("TRAJECTORY", "Training trajectories (.nc) with full states.")
-    ],
-    out: Annotated[
-        Path, option("PATH", "Write the model to this file; with --seeds, write an ensemble to this folder.")
-    ],
-    preset: Annotated[
-        Preset,
-        typer.Option(
-            help="best: structured residual by sparse regression. paper: the paper's network and training. "
-            "network: a network without the paper's constraints."
-        ),
-    ] = Preset.best,
-    seed: Annotated[int | None, option("N", "Random seed.", show_default="0")] = None,
-    seeds: Annotated[str | None, option("N,N,…", "Several random seeds: train one model for each.")] = None,
-    epochs: Annotated[
-        int | None, option("N", "Training epochs of a network.", show_default="the preset's")
-    ] = None,
-    rows: Annotated[
-        int | None, option("N", "Use the first N rows of each trajectory only; the paper uses 30.", min=1)
-    ] = None,
-    changes: Changes = None,
-    held_out: Annotated[
-        list[Path] | None, option("FILE", "Validation trajectory for early stopping; may be repeated.")
-    ] = None,
-    checkpoint: Annotated[
-        Path | None, option("DIR", "Save the training state in this folder, and resume from it.")
-    ] = None,
-    log: Annotated[Path | None, option("DIR", "Write TensorBoard event files to this folder.")] = None,
-    figure: Annotated[Path | None, Picture] = None,
-    progress: Progress = None,
-    as_json: Json = False,
-) -> None:
+def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: Report) -> None:
     """Learn a residual model from trajectories.
 
     The residual is the difference between the robot's physics and the trajectories. Trajectories have full
     states, from a simulation or from state estimation; use `identify` for recordings. The resulting model is
     accepted wherever a robot is.
     """
-    recordings = [path for path in trajectories if is_recording(str(path))]
+    robot, out, figure = nominal.robot, files.out, files.figure
+    recordings = [path for path in data.trajectories if is_recording(str(path))]
     if recordings:
         typed = command_line("identify", robot, *recordings, "--out", out.with_suffix(".yaml"))
         raise ValueError(
@@ -98,37 +142,30 @@ def fit(
             f"To identify the robot from recordings, type: {typed} (with --config recording.yaml if the "
             "file does not state the meaning of its columns)"
         )
-    numbers: int | tuple[int, ...] = seed or 0
-    if seeds is not None:
-        if seed is not None:
-            raise ValueError("--seed is for one model and --seeds for several; give one of them")
-        values = numbers_in(seeds)
-        if values is None or not all(value.is_integer() for value in values):
-            raise ValueError(f"--seeds must be whole numbers, such as 0,1,2 (got {seeds!r})")
-        numbers = tuple(map(int, values))
-    several = isinstance(numbers, tuple)
+    several = isinstance(method.numbers(), tuple)
     if several and out.exists() and not out.is_dir():
         raise ValueError(f"{out}: this is a file; with several seeds --out must be a folder")
-    require_writable(None if several else out, figure, (out if several else None, checkpoint, log))
+    require_writable(
+        None if several else out, figure, (out if several else None, files.checkpoint, files.log)
+    )
     if figure:
         figures()
     from knode_cosserat.learning.states import fit_states as learn
     from knode_cosserat.solvers.segments import DataError
 
-    nominal = load_system(robot, changes)
-    config = _config(preset, numbers, epochs)
-    training = [load_trajectory_file(path) for path in trajectories]
-    training = [states if states.y.ndim != 3 else states[:rows] for states in training]
-    validation = [load_trajectory_file(path) for path in held_out or ()]
+    system, config = nominal.load(), method.config()
+    training = [load_trajectory_file(path) for path in data.trajectories]
+    training = [states if states.y.ndim != 3 else states[: data.rows] for states in training]
+    validation = [load_trajectory_file(path) for path in data.held_out or ()]
     began = perf_counter()
     try:
         result = learn(
-            nominal, training, config, held_out=validation, checkpoint=checkpoint, log_dir=log,
-            progress=shows_progress(progress),
+            system, training, config, held_out=validation, checkpoint=files.checkpoint, log_dir=files.log,
+            progress=report.shows_progress,
         )  # fmt: skip
     except DataError as error:
         # files' names instead of the numbers of trajectories
-        names = dict(enumerate(map(str, trajectories)))
+        names = dict(enumerate(map(str, data.trajectories)))
         text = re.sub(r"\btrajectory (\d+)\b", lambda match: names.get(int(match[1]), match[0]), str(error))
         raise ValueError(text) from None
     seconds = perf_counter() - began
@@ -138,10 +175,10 @@ def fit(
 
         residual(next(iter(result)) if several else result, training[0]).savefig(figure)
     count = sum(len(one.time) for one in training)
-    files = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
+    subject = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
-        f"learned a residual model of {robot} from {files} ({count} rows): "
-        f"preset {preset.value}, {seconds:.2f} s"
+        f"learned a residual model of {robot} from {subject} ({count} rows): "
+        f"preset {method.preset.value}, {seconds:.2f} s"
     ]
     models = []
     for model in result if several else [result]:
@@ -149,10 +186,11 @@ def fit(
         models.append({"seed": model.about.facts["seed"], **facts})
         lines += [*([f"seed {models[-1]['seed']}:"] if several else []), *words]
     write_output(
-        as_json,
+        report.as_json,
         {
-            "robot": robot, "preset": preset.value, "trajectories": [str(path) for path in trajectories],
-            "rows": count, "computing_time": round(seconds, 4), "models": models,
+            "robot": robot, "preset": method.preset.value,
+            "trajectories": [str(path) for path in data.trajectories], "rows": count,
+            "computing_time": round(seconds, 4), "models": models,
         },
         lines,
         out=out,
@@ -160,18 +198,84 @@ def fit(
     )  # fmt: skip
 
 
-def _config(preset: Preset, seed: int | tuple[int, ...], epochs: int | None) -> FitConfig:
-    import dataclasses
+# recordings
 
-    from knode_cosserat.learning.config import FitConfig, StructuredOptions
+#: longest time between predicted rows (s)
+FINELY = 0.0125
 
-    if preset is Preset.best:
-        if epochs is not None:
-            raise ValueError(
-                "--epochs is for networks; the preset best has none. Use --preset paper or --preset network"
-            )
-        return FitConfig(StructuredOptions(resample=isinstance(seed, tuple)), seed=seed)
-    config = FitConfig.paper(seed) if preset is Preset.paper else FitConfig.network(seed)
-    if epochs is None or config.segments is None:
-        return config
-    return dataclasses.replace(config, segments=dataclasses.replace(config.segments, epochs=epochs))
+
+class _Search(NamedTuple):
+    """Search, and its files."""
+
+    out: Annotated[Path, option("FILE", "Write the identified robot to this YAML file.")]
+    effects: Annotated[
+        list[str] | None,
+        option(
+            "NAME",
+            "Physical effect to identify, such as friction; may be repeated.",
+            "--effect",
+            show_default="selected by recordings left out",
+        ),
+    ] = None
+    checkpoint: Annotated[
+        Path | None, option("DIR", "Keep finished searches here; an interrupted run resumes.")
+    ] = None
+
+
+@app.command(
+    epilog=examples(
+        "identify delrin-tendon-robot a.bag b.bag --out found.yaml",
+        "identify my-robot.yaml a.csv b.csv --config my-recording.yaml --out found.yaml",
+    )
+)
+def identify(
+    nominal: Nominal,
+    recordings: Annotated[list[Path], argument("RECORDING", f"Recordings ({', '.join(read_suffixes())}).")],
+    search: _Search,
+    sampling: Sampling,
+    report: Report,
+) -> None:
+    """Identify a tendon robot's parameters from recordings.
+
+    ROBOT is the nominal robot, from measured dimensions, masses and data sheets. An effect is kept if it
+    lowers the error on recordings left out of the search. The result must pass trial simulations with larger
+    and with random tensions.
+    """
+    require_writable(search.out)
+    import knode_cosserat as kc
+    from knode_cosserat.identification.identify import identify as find
+
+    system = nominal.load()
+    samples = [
+        recording.sampled(sampling.dt, sampling.start, sampling.end, mean=True)
+        for recording in load_recordings(recordings, sampling.config)
+    ]
+    began = perf_counter()
+    progress = functools.partial(print, file=sys.stderr, flush=True) if report.shows_progress else None
+    identified = find(
+        system, samples, search.effects or None, space=sampling.space, progress=progress,
+        checkpoint=search.checkpoint,
+    )  # fmt: skip
+    kc.save_robot(identified.robot, search.out)
+    facts = identified.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
+    write_output(report.as_json, facts, str(identified).splitlines(), out=search.out)
+
+
+def evaluate_on_recordings(system: System, recordings: list[Path], sampling: Sampling, as_json: bool) -> None:
+    """Predict recordings from their measured tensions; print tip RMSE and pose MSE of each.
+
+    A prediction starts at the equilibrium under the first tensions. Rotations are relative to the start,
+    because the mounting of the tracked bodies is unknown.
+    """
+    from knode_cosserat.identification.evaluate import evaluate as compare
+
+    facts: dict[str, Any] = {}
+    lines, dt = [], sampling.dt
+    for path, recording in zip(recordings, load_recordings(recordings, sampling.config), strict=True):
+        # coarse rows would lose the tensions between them: predict finely, and compare every few rows
+        count = math.ceil(dt / FINELY - 1e-6) if FINELY < dt < math.inf else 1
+        rows = recording.sampled(dt / count, sampling.start, sampling.end, mean=True)
+        evaluation = compare(system, rows, every=1 if rows.static else count, space=sampling.space)
+        facts[str(path)] = evaluation.to_dict()
+        lines.append(f"{path}: {evaluation}")
+    write_output(as_json, {"recordings": facts}, lines)

@@ -6,13 +6,15 @@ and its typer application. They are imported when they are called, or listed in 
 
 from __future__ import annotations
 
+import functools
+import inspect
 import io
 import logging
 import re
 import sys
 import warnings
 from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -22,7 +24,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.solvers.result import SimulationError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
 PROGRAM = "knode-cosserat"
 COMMANDS = "knode_cosserat.commands"
@@ -32,19 +34,9 @@ OPTIONAL_COMMANDS = {"robot": "knode-cosserat-hardware", "robot-parts": "knode-c
 _EXPECTED = (KnodeCosseratError, ValueError, OSError, ImportError, MemoryError, OverflowError)
 
 #: options that take several numbers
-VECTOR_OPTIONS = frozenset(
-    [
-        "--tension",
-        "--control",
-        "--low",
-        "--high",
-        "--masses",
-        "--position",
-        "--quaternion",
-        "--seeds",
-        "--set",
-    ]
-)
+VECTOR_OPTIONS = frozenset([
+    "--tension", "--control", "--low", "--high", "--masses", "--position", "--quaternion", "--seeds", "--set",
+])  # fmt: skip
 #: options that take NAME=VALUE pairs
 _NAMED_OPTIONS = frozenset(["--control"])
 
@@ -104,10 +96,41 @@ class _Command(TyperCommand):
 
 
 class _App(typer.Typer):
-    """Typer application with commands of class `_Command`."""
+    """Typer application with commands of class `_Command`, whose functions may have groups of options."""
 
     def command(self, *arguments: Any, **options: Any) -> Any:
-        return super().command(*arguments, **{"cls": _Command, **options})
+        register = super().command(*arguments, **{"cls": _Command, **options})
+        return lambda function: register(_ungrouped(function))
+
+
+def _ungrouped(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function that has the fields of its groups of options as parameters, as Typer needs them.
+
+    A group is a parameter whose type is a named tuple: its fields are options of the command.
+    """
+    parameters: list[inspect.Parameter] = []
+    groups: dict[str, Any] = {}
+    for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
+        group: Any = parameter.annotation
+        if not hasattr(group, "_fields"):
+            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY))
+            continue
+        groups[name] = group
+        for field, hint in get_type_hints(group, include_extras=True).items():
+            default = group._field_defaults.get(field, parameter.empty)
+            parameters.append(
+                inspect.Parameter(field, parameter.KEYWORD_ONLY, default=default, annotation=hint)
+            )
+
+    def command(**values: Any) -> Any:
+        grouped = {name: group(*map(values.pop, group._fields)) for name, group in groups.items()}
+        return function(**values, **grouped)
+
+    functools.update_wrapper(command, function, updated=())
+    command.__dict__.pop("__wrapped__", None)
+    command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    return command
 
 
 def joined_vectors(args: Sequence[str]) -> list[str]:

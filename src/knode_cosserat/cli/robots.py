@@ -6,7 +6,7 @@ import os
 import re
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
@@ -16,19 +16,19 @@ from knode_cosserat.cli.arguments import (
     ROBOT,
     Changes,
     Json,
+    Model,
     NetCDF,
     Nodes,
     Picture,
-    Progress,
-    Robot,
+    Report,
     Space,
     coarse_grid_in_output,
     figures,
     load_system,
+    option,
     parse_numbers,
     require_trajectory_name,
     require_writable,
-    shows_progress,
 )
 from knode_cosserat.cli.output import table, value_text, vector_text, write_output
 from knode_cosserat.cli.program import app, examples
@@ -56,6 +56,41 @@ COARSE = (
 INITIAL: dict[str, Any] = {"equilibrium": "equilibrium", "unstressed": None}
 
 
+class _Run(NamedTuple):
+    """Controls and numerical settings of a simulation."""
+
+    controls: Annotated[
+        str,
+        option(
+            "CONTROLS",
+            "Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or step:HEIGHT,at=S), ramp:HEIGHT "
+            "(N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any controls by name: "
+            "NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat info ROBOT` lists the "
+            "names), the others zero; or none.",
+        ),
+    ]
+    steps: Annotated[
+        int | None,
+        option("N", "Number of time steps; required unless a file gives the controls."),
+    ] = None
+    dt: Annotated[float | None, option("S", "Time step (s).", show_default="0.05, or the file's")] = None
+    time: Annotated[str, option("SCHEME", "Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")] = (
+        "sdirk2"
+    )
+    space: Space = "lobatto2"
+    initial: Annotated[
+        str,
+        option(
+            "STATE",
+            "State before the first step: equilibrium (at rest without controls), or unstressed (the "
+            "shape that the rod was made in, as in the paper's studies).",
+        ),
+    ] = "equilibrium"
+    allow_failure: Annotated[
+        bool, typer.Option("--allow-failure", help="Write the solved steps even if a later step fails.")
+    ] = False
+
+
 @app.command(
     epilog=examples(
         "simulate delrin-tendon-robot --controls sine:1.5 --steps 100 --out truth.nc",
@@ -67,64 +102,30 @@ INITIAL: dict[str, Any] = {"equilibrium": "equilibrium", "unstressed": None}
     )
 )
 def simulate(
-    robot: Robot,
-    controls: Annotated[
-        str,
-        typer.Option(
-            metavar="CONTROLS",
-            help="Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or step:HEIGHT,at=S), ramp:HEIGHT "
-            "(N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any controls by name: "
-            "NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat info ROBOT` lists the "
-            "names), the others zero; or none.",
-        ),
-    ],
+    model: Model,
+    run: _Run,
     out: Annotated[Path, NetCDF],
-    steps: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Number of time steps; required unless a file gives the controls."),
-    ] = None,
-    dt: Annotated[
-        float | None, typer.Option(metavar="S", help="Time step (s).", show_default="0.05, or the file's")
-    ] = None,
-    time: Annotated[
-        str, typer.Option(metavar="SCHEME", help="Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")
-    ] = "sdirk2",
-    space: Space = "lobatto2",
-    initial: Annotated[
-        str,
-        typer.Option(
-            metavar="STATE",
-            help="State before the first step: equilibrium (at rest without controls), or unstressed (the "
-            "shape that the rod was made in, as in the paper's studies).",
-        ),
-    ] = "equilibrium",
-    changes: Changes = None,
-    nodes: Nodes = None,
-    allow_failure: Annotated[
-        bool, typer.Option("--allow-failure", help="Write the solved steps even if a later step fails.")
-    ] = False,
+    report: Report,
     figure: Annotated[Path | None, Picture] = None,
-    progress: Progress = None,
-    as_json: Json = False,
 ) -> None:
     """Simulate a robot under tensions or other controls."""
     require_trajectory_name(out)
     require_writable(out, figure)
-    if initial not in INITIAL:
-        raise ValueError(f"--initial is {initial!r}; allowed is {', '.join(INITIAL)}")
+    if run.initial not in INITIAL:
+        raise ValueError(f"--initial is {run.initial!r}; allowed is {', '.join(INITIAL)}")
     drawing = figures() if figure else None
     import knode_cosserat as kc
 
-    system = load_system(robot, changes, nodes)
+    system, dt = model.load(), run.dt
     if dt is None:
         tensions_only = system.control_layout.names == ("tension",)
-        dt = kc.controls.load(controls).dt if os.path.isfile(controls) and tensions_only else 0.05
-    sequence = kc.named_controls.parse(system, controls, steps, dt)
+        dt = kc.controls.load(run.controls).dt if os.path.isfile(run.controls) and tensions_only else 0.05
+    sequence = kc.controls.parse(run.controls, run.steps, dt, system)
     began = perf_counter()
     with coarse_grid_in_output():
         trajectory = kc.simulate(
-            system, sequence, dt, time=time, space=space, initial=INITIAL[initial],
-            progress=shows_progress(progress), on_failure="return" if allow_failure else "raise",
+            system, sequence, dt, time=run.time, space=run.space, initial=INITIAL[run.initial],
+            progress=report.shows_progress, on_failure="return" if run.allow_failure else "raise",
         )  # fmt: skip
     seconds = perf_counter() - began
     trajectory.save(out)
@@ -134,10 +135,16 @@ def simulate(
     errors = [
         error_text(summary[f"largest_{name}_error"], float(system.length)) for name in ("position", "time")
     ]
-    facts = {"robot": robot, "steps": len(sequence), "dt": dt, "computing_time": round(seconds, 4), **summary}
+    facts = {
+        "robot": model.robot,
+        "steps": len(sequence),
+        "dt": dt,
+        "computing_time": round(seconds, 4),
+        **summary,
+    }
     results = ", ".join(f"{count} {result}" for result, count in summary["results"].items())
     lines = [
-        f"simulated {robot}: {len(sequence)} steps of {dt:g} s, computed in {seconds:.2f} s",
+        f"simulated {model.robot}: {len(sequence)} steps of {dt:g} s, computed in {seconds:.2f} s",
         f"steps: {results}; largest scaled residual {summary['largest_residual']:.1e}",
         f"largest estimated position error: along the rod {errors[0]}; in time {errors[1]}",
         f"final tip position: {vector_text(summary['tip_position'])} m",
@@ -149,7 +156,51 @@ def simulate(
     if summary["first_failure"]:
         step, at, message = summary["first_failure"].values()
         lines.append(f"NOT SOLVED from step {step} (t = {at:g} s) on: {message}")
-    write_output(as_json, facts, lines, out=out, figure=figure)
+    write_output(report.as_json, facts, lines, out=out, figure=figure)
+
+
+class _Held(NamedTuple):
+    """Constant control of an equilibrium: from tensions, from numbers in order, or by name."""
+
+    tension: Annotated[str | None, option("N,N,…", "Tensions of all tendons (N), such as 7,5,5,7.")] = None
+    control: Annotated[
+        str | None,
+        option(
+            "CONTROL",
+            "All controls in order, such as 7,5,5,7; or some by name, such as base_z=0.1,base_ry=0.2, "
+            "and the others zero. `knode-cosserat info ROBOT` lists names and units.",
+        ),
+    ] = None
+
+    def of(self, system: System) -> Any:
+        """Return the control of a robot."""
+        from knode_cosserat.controls import labels, parse_signals
+
+        layout = system.control_layout
+        names = labels(layout)
+        tensions = [field.size for field in layout.fields if field.name == "tension"]
+        if self.tension is None and self.control is None and names:
+            raise ValueError(
+                f"no control is given; give --tension N,N,… or --control NAME=VALUE,…; "
+                f"controls are {', '.join(names)}"
+            )
+        if self.tension is not None and not tensions:
+            raise ValueError(
+                f"--tension: this robot has no tensions; give --control NAME=VALUE,…; "
+                f"controls are {', '.join(names) or 'none'}"
+            )
+        words = [] if self.control is None else _control_words(self.control, names)
+        if self.tension is not None:
+            values = parse_numbers("--tension", self.tension, tensions[0])
+            if not all(0.0 <= value < np.inf for value in values):
+                raise ValueError(
+                    f"--tension must be {tensions[0]} numbers, 0 or more (N), such as 7,5,5,7 "
+                    f"(got {self.tension!r})"
+                )
+            named = zip(names[layout.slice("tension")], values, strict=True)
+            # first, so that a tension that --control repeats is refused
+            words = [f"{name}=constant:{value!r}" for name, value in named] + words
+        return parse_signals(layout, words, {"middle": np.ones(1), "end": np.ones(1)})[0]
 
 
 @app.command(
@@ -159,21 +210,9 @@ def simulate(
     )
 )
 def equilibrium(
-    robot: Robot,
-    tension: Annotated[
-        str | None, typer.Option(metavar="N,N,…", help="Tensions of all tendons (N), such as 7,5,5,7.")
-    ] = None,
-    control: Annotated[
-        str | None,
-        typer.Option(
-            metavar="CONTROL",
-            help="All controls in order, such as 7,5,5,7; or some by name, such as base_z=0.1,base_ry=0.2, "
-            "and the others zero. `knode-cosserat info ROBOT` lists names and units.",
-        ),
-    ] = None,
+    model: Model,
+    held: _Held,
     space: Space = "lobatto2",
-    changes: Changes = None,
-    nodes: Nodes = None,
     out: Annotated[Path | None, NetCDF] = None,
     as_json: Json = False,
 ) -> None:
@@ -182,13 +221,13 @@ def equilibrium(
     require_writable(out)
     import knode_cosserat as kc
 
-    system = load_system(robot, changes, nodes)
+    system = model.load()
     with coarse_grid_in_output():
-        rest = kc.equilibrium(system, _control(system, tension, control), space=space)
+        rest = kc.equilibrium(system, held.of(system), space=space)
         stability, warnings = _stability(rest, space)
     if out:
         rest.save(out)
-    facts = {"robot": robot, **equilibrium_summary(rest), **stability}
+    facts = {"robot": model.robot, **equilibrium_summary(rest), **stability}
     lines = [
         f"tip: {vector_text(facts['tip_position'])} m",
         f"inclination of the tip from the z axis: {np.degrees(facts['tip_inclination']):.2f} degrees",
@@ -287,31 +326,6 @@ def _stability(rest: Any, space: str) -> tuple[dict[str, Any], list[str]]:
         return stability_summary("divergence" if unstable else "stable")
 
 
-def _control(system: System, tension: str | None, control: str | None) -> Any:
-    """Return the constant control: from tensions, from numbers in order, or by name."""
-    from knode_cosserat import named_controls
-
-    layout = system.control_layout
-    names = named_controls.labels(layout)
-    tensions = [field.size for field in layout.fields if field.name == "tension"]
-    if tension is None and control is None and names:
-        raise ValueError(
-            f"no control is given; give --tension N,N,… or --control NAME=VALUE,…; "
-            f"controls are {', '.join(names)}"
-        )
-    if tension is not None and not tensions:
-        raise ValueError(
-            f"--tension: this robot has no tensions; give --control NAME=VALUE,…; "
-            f"controls are {', '.join(names) or 'none'}"
-        )
-    words = [] if control is None else _control_words(control, names)
-    if tension is not None:
-        values = zip(names[layout.slice("tension")], _tensions(tension, tensions[0]), strict=True)
-        # first, so that a tension that --control repeats is refused
-        words = [f"{name}=constant:{value!r}" for name, value in values] + words
-    return named_controls.parse_signals(layout, words, {"middle": np.ones(1), "end": np.ones(1)})[0]
-
-
 def _control_words(control: str, names: list[str]) -> list[str]:
     """Return the signals `NAME=constant:VALUE` of a control given by numbers in order, or by names."""
     if "=" not in control:
@@ -333,10 +347,3 @@ def _control_words(control: str, names: list[str]) -> list[str]:
             )
         words.append(f"{name}=constant:{value}")
     return words
-
-
-def _tensions(text: str, count: int) -> list[float]:
-    values = parse_numbers("--tension", text, count)
-    if not all(0.0 <= value < np.inf for value in values):
-        raise ValueError(f"--tension must be {count} numbers, 0 or more (N), such as 7,5,5,7 (got {text!r})")
-    return values

@@ -127,11 +127,11 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
 
 def control_summary(system: System) -> dict[str, dict[str, str]]:
     """Return the controls by the names that `--controls` and `--control` accept, with unit and meaning."""
-    from knode_cosserat import named_controls
+    from knode_cosserat.controls import labels, units
 
     layout = system.control_layout
     meanings = [field.meaning for field in layout.fields for _ in range(field.size)]
-    rows = zip(named_controls.labels(layout), named_controls.units(layout), meanings, strict=True)
+    rows = zip(labels(layout), units(layout), meanings, strict=True)
     return {name: {"unit": unit, "meaning": meaning} for name, unit, meaning in rows}
 
 

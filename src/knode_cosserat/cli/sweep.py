@@ -5,17 +5,119 @@ from __future__ import annotations
 import os
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat.cli.arguments import Json, Progress, argument, option, require_writable, shows_progress
+from knode_cosserat.cli.arguments import Report, argument, option, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
 if TYPE_CHECKING:
     from knode_cosserat.sweeps import Sweep
+
+
+class _Cases(NamedTuple):
+    """Cases of a sweep."""
+
+    description: Annotated[str, argument("DESCRIPTION", "Description of the sweep (YAML), or a robot.")]
+    controls: Annotated[
+        list[str] | None,
+        option(
+            "CONTROLS",
+            "Controls as for `simulate`; a name in braces is a varied number: sine:{period}, "
+            "random:{seed}. May be repeated.",
+        ),
+    ] = None
+    vary: Annotated[
+        list[str] | None,
+        option(
+            "NAME=VALUES",
+            "Vary a parameter, or a name in braces: LOW:HIGH, LOW:HIGH:log, LOW:HIGH:COUNT on a grid, "
+            "or values A,B,C. May be repeated.",
+        ),
+    ] = None
+    sampler: Annotated[
+        str | None, option("NAME", "grid, sobol, halton, latin-hypercube or random.", show_default="grid")
+    ] = None
+    samples: Annotated[int | None, option("N", "Samples, except on a grid.")] = None
+    seed: Annotated[int | None, option("N", "Seed.", show_default="0")] = None
+    steps: Annotated[int | None, option("N", "Number of time steps.")] = None
+    dt: Annotated[float | None, option("S", "Time step (s).")] = None
+    store: Annotated[
+        str | None,
+        option(
+            "A,B,…",
+            "Stored quantities: tip_position, tip_quaternion, position, y, z, controls.",
+            show_default="tip_position",
+        ),
+    ] = None
+
+    def sweep(self) -> Sweep:
+        """Return the sweep of a description, or of a robot, with the options' values."""
+        from knode_cosserat.sweeps import Sweep
+        from knode_cosserat.sweeps._description import read_mapping
+
+        name, options = self.description, self._asdict()
+        vary = options.pop("vary") or []
+        del options["description"]
+        if self.store is not None:
+            options["store"] = [word.strip() for word in self.store.split(",")]
+        mapping: dict[Any, Any] = {"robots": name}
+        if os.path.isfile(name) and name.endswith((".yaml", ".yml")):
+            content = read_mapping(name)
+            mapping = mapping if "kind" in content else content
+        varied = dict(map(_variation, vary))
+        if len(varied) < len(vary):
+            raise ValueError("--vary: a name is given twice; allowed is each name once")
+        options = {key: value for key, value in options.items() if value not in (None, [])}
+        if varied:
+            options["vary"] = {**(mapping.get("vary") or {}), **varied}
+        return Sweep.of({**mapping, **options}, name)
+
+
+class _Machines(NamedTuple):
+    """Machines that run a sweep."""
+
+    workers: Annotated[
+        int | None,
+        option(
+            "N", "Processes of this machine, or jobs of --cluster.", min=1, show_default="one per core; 1 job"
+        ),
+    ] = None
+    dask: Annotated[str | None, option("ADDRESS", "Run on the Dask cluster of this scheduler.")] = None
+    cluster: Annotated[
+        str | None, option("KIND", "Run as jobs: slurm; local or debug to try it on this machine.")
+    ] = None
+    slurm: Annotated[
+        list[str] | None,
+        option(
+            "NAME=VALUE",
+            "Parameter of the jobs: timeout_min, cpus_per_task, mem_gb, slurm_partition, … of submitit. "
+            "May be repeated.",
+        ),
+    ] = None
+
+    def executor(self) -> Any:
+        """Return the executor of the sweep."""
+        from knode_cosserat.sweeps import Dask, Local, Slurm
+
+        if self.dask and (self.workers or self.cluster):
+            raise ValueError(
+                "--dask is for a running cluster; allowed is --dask without --workers and --cluster"
+            )
+        if self.slurm and not self.cluster:
+            raise ValueError("--slurm has parameters of jobs; required is --cluster slurm")
+        parameters: dict[str, Any] = {}
+        for text in self.slurm or ():
+            name, _, value = (part.strip() for part in text.partition("="))
+            if not (name and value):
+                raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {text!r})")
+            parameters[name] = int(value) if value.isdecimal() else value
+        if self.dask:
+            return Dask(self.dask)
+        return Slurm(self.workers or 1, self.cluster, parameters) if self.cluster else Local(self.workers)
 
 
 @app.command(
@@ -31,62 +133,13 @@ if TYPE_CHECKING:
     )
 )
 def sweep(
-    description: Annotated[str, argument("DESCRIPTION", "Description of the sweep (YAML), or a robot.")],
+    cases: _Cases,
+    machines: _Machines,
     out: Annotated[Path, option("DIR", "Output folder; created if it does not exist.")],
-    controls: Annotated[
-        list[str] | None,
-        option(
-            "CONTROLS",
-            "Controls as for `simulate`; a name in braces is a varied number: sine:{period}, "
-            "random:{seed}. May be repeated.",
-        ),
-    ] = None,
-    vary: Annotated[
-        list[str] | None,
-        option(
-            "NAME=VALUES",
-            "Vary a parameter, or a name in braces: LOW:HIGH, LOW:HIGH:log, LOW:HIGH:COUNT on a grid, "
-            "or values A,B,C. May be repeated.",
-        ),
-    ] = None,
-    sampler: Annotated[
-        str | None, option("NAME", "grid, sobol, halton, latin-hypercube or random.", show_default="grid")
-    ] = None,
-    samples: Annotated[int | None, option("N", "Samples, except on a grid.")] = None,
-    seed: Annotated[int | None, option("N", "Seed.", show_default="0")] = None,
-    steps: Annotated[int | None, option("N", "Number of time steps.")] = None,
-    dt: Annotated[float | None, option("S", "Time step (s).")] = None,
-    store: Annotated[
-        str | None,
-        option(
-            "A,B,…",
-            "Stored quantities: tip_position, tip_quaternion, position, y, z, controls.",
-            show_default="tip_position",
-        ),
-    ] = None,
-    workers: Annotated[
-        int | None,
-        option(
-            "N", "Processes of this machine, or jobs of --cluster.", min=1, show_default="one per core; 1 job"
-        ),
-    ] = None,
-    dask: Annotated[str | None, option("ADDRESS", "Run on the Dask cluster of this scheduler.")] = None,
-    cluster: Annotated[
-        str | None, option("KIND", "Run as jobs: slurm; local or debug to try it on this machine.")
-    ] = None,
-    slurm: Annotated[
-        list[str] | None,
-        option(
-            "NAME=VALUE",
-            "Parameter of the jobs: timeout_min, cpus_per_task, mem_gb, slurm_partition, … of submitit. "
-            "May be repeated.",
-        ),
-    ] = None,
+    report: Report,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check the sweep, and print its size; solve nothing.")
     ] = False,
-    progress: Progress = None,
-    as_json: Json = False,
 ) -> None:
     """Simulate many cases: a grid or a sampler over robots, parameters, controls and seeds.
 
@@ -94,23 +147,9 @@ def sweep(
     versions of all packages. The same command continues a sweep that was stopped or killed. Needs the extra
     `sweep`.
     """
-    from knode_cosserat.sweeps import Dask, Local, Plan, Slurm, run_sweep
+    from knode_cosserat.sweeps import Plan, run_sweep
 
-    if dask and (workers or cluster):
-        raise ValueError("--dask is for a running cluster; allowed is --dask without --workers and --cluster")
-    if slurm and not cluster:
-        raise ValueError("--slurm has parameters of jobs; required is --cluster slurm")
-    parameters: dict[str, Any] = {}
-    for text in slurm or ():
-        name, _, value = (part.strip() for part in text.partition("="))
-        if not (name and value):
-            raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {text!r})")
-        parameters[name] = int(value) if value.isdecimal() else value
-    options = {
-        "controls": controls, "steps": steps, "dt": dt, "sampler": sampler, "samples": samples, "seed": seed,
-        "store": None if store is None else [name.strip() for name in store.split(",")],
-    }  # fmt: skip
-    described = _described(description, options, vary or [])
+    executor, described = machines.executor(), cases.sweep()
     require_writable(folders=[] if dry_run else [out])
     plan = Plan.of(described)
     facts = {
@@ -122,34 +161,13 @@ def sweep(
             f"{plan.shard_count} files of up to {plan.shard_cases} cases; "
             f"{plan.total_bytes / 1e6:.3g} MB of numbers before compression"
         )
-        write_output(as_json, facts, [*str(described).splitlines(), size])
+        write_output(report.as_json, facts, [*str(described).splitlines(), size])
         return
-    local = Slurm(workers or 1, cluster, parameters) if cluster else Local(workers)
     began = perf_counter()
-    data = run_sweep(
-        described, out, executor=Dask(dask) if dask else local, progress=shows_progress(progress)
-    )
+    data = run_sweep(described, out, executor=executor, progress=report.shows_progress)
     seconds = perf_counter() - began
     facts |= {"failed": data.failed_count, "computing_time": round(seconds, 2)}
-    write_output(as_json, facts, [*str(data).splitlines(), f"computed in {seconds:.1f} s"], out=out)
-
-
-def _described(name: str, options: dict[str, Any], vary: list[str]) -> Sweep:
-    """Return the sweep of a description, or of a robot, with the options' values."""
-    from knode_cosserat.sweeps import Sweep
-    from knode_cosserat.sweeps._description import read_mapping
-
-    mapping: dict[Any, Any] = {"robots": name}
-    if os.path.isfile(name) and name.endswith((".yaml", ".yml")):
-        content = read_mapping(name)
-        mapping = mapping if "kind" in content else content
-    varied = dict(map(_variation, vary))
-    if len(varied) < len(vary):
-        raise ValueError("--vary: a name is given twice; allowed is each name once")
-    options = {key: value for key, value in options.items() if value not in (None, [])}
-    if varied:
-        options["vary"] = {**(mapping.get("vary") or {}), **varied}
-    return Sweep.of({**mapping, **options}, name)
+    write_output(report.as_json, facts, [*str(data).splitlines(), f"computed in {seconds:.1f} s"], out=out)
 
 
 def _variation(text: str) -> tuple[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import webbrowser
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 
@@ -19,18 +19,45 @@ from knode_cosserat.cli.arguments import (
     is_recording,
     is_trajectory,
     load_system,
-    load_trajectory_file,
     option,
     require_writable,
+    trajectories_by_name,
 )
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 
-if TYPE_CHECKING:
-    from knode_cosserat.trajectory import Trajectory
-
 #: robot of `view --live` without a name
 EXAMPLE = "delrin-tendon-robot"
+
+
+class _Live(NamedTuple):
+    """Simulation in real time."""
+
+    live: Annotated[
+        bool, typer.Option("--live", help="Simulate a robot or model in real time, controlled by sliders.")
+    ] = False
+    dt: Annotated[
+        float | None,
+        option("S", "With --live: time step (s).", show_default="the model's training step, or 0.05"),
+    ] = None
+    space: Space = "lobatto2"
+    changes: Changes = None
+    nodes: Nodes = None
+
+
+class _Page(NamedTuple):
+    """Page of the viewer."""
+
+    export: Annotated[Path | None, option("FILE", "Write one self-contained HTML file and exit.")] = None
+    port: Annotated[
+        int,
+        option(
+            "N",
+            "Port of the local web server, reachable from this machine only.",
+            show_default="any free port",
+        ),
+    ] = 0
+    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")] = False
 
 
 @app.command(
@@ -42,30 +69,12 @@ EXAMPLE = "delrin-tendon-robot"
     )
 )
 def view(
+    live: _Live,
+    page: _Page,
     files: Annotated[
         list[str] | None,
         argument("[FILE]…", "Trajectory files; with --live, one robot or model.", show_default=False),
     ] = None,
-    live: Annotated[
-        bool, typer.Option("--live", help="Simulate a robot or model in real time, controlled by sliders.")
-    ] = False,
-    export: Annotated[Path | None, option("FILE", "Write one self-contained HTML file and exit.")] = None,
-    port: Annotated[
-        int,
-        option(
-            "N",
-            "Port of the local web server, reachable from this machine only.",
-            show_default="any free port",
-        ),
-    ] = 0,
-    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")] = False,
-    dt: Annotated[
-        float | None,
-        option("S", "With --live: time step (s).", show_default="the model's training step, or 0.05"),
-    ] = None,
-    space: Space = "lobatto2",
-    changes: Changes = None,
-    nodes: Nodes = None,
     as_json: Json = False,
 ) -> None:
     """Show trajectories in 3-D, or control a robot by sliders.
@@ -74,14 +83,14 @@ def view(
     """
     from knode_cosserat import viewer
 
-    names = files or []
+    names, export = files or [], page.export
 
     def announce(address: str) -> None:
         write_output(as_json, {"address": address}, [f"the viewer is at {address} (Ctrl-C ends it)"])
-        if not no_open:
+        if not page.no_open:
             webbrowser.open(address)
 
-    if live:
+    if live.live:
         if export:
             raise ValueError(
                 "--live and --export exclude each other: a file cannot simulate. Give one of them"
@@ -92,37 +101,26 @@ def view(
         from knode_cosserat.rods.robot_file import catalog
 
         viewer.live.require_websockets()
-        robot = load_system(name, changes, nodes)
+        robot = load_system(name, live.changes, live.nodes)
         if sys.stderr.isatty():
             typer.echo(f"preparing {name} …", err=True)
         viewer.view_live(
-            robot, dt=dt, space=space, title=name if name in catalog() else Path(name).name, port=port,
-            open_browser=announce,
+            robot, dt=live.dt, space=live.space, title=name if name in catalog() else Path(name).name,
+            port=page.port, open_browser=announce,
         )  # fmt: skip
         return
     if not names:
         raise ValueError("no trajectory is given; type: knode-cosserat view FILE…, or view --live ROBOT")
-    if changes or nodes or dt is not None or space != "lobatto2":
+    if live != _Live():
         raise ValueError("--set, --nodes, --dt and --space change a simulation; use them with --live")
     require_writable(export)
-    trajectories = _by_name(names)
+    for file in names:
+        if Path(file).is_file() and not is_trajectory(file) and not is_recording(file):
+            typed = command_line("view", "--live", file)
+            raise ValueError(f"{file}: not a trajectory. To show a robot or model, type: {typed}")
+    trajectories = trajectories_by_name(names)
     if export:
         viewer.export_scene(trajectories, export)
         write_output(as_json, {"trajectories": list(trajectories)}, [], export=export)
     else:
-        viewer.view(trajectories, port=port, open_browser=announce)
-
-
-def _by_name(files: list[str]) -> dict[str, Trajectory]:
-    """Return the trajectories by the stems of their files, or by paths if stems are equal."""
-    short = [Path(file).stem for file in files]
-    trajectories: dict[str, Trajectory] = {}
-    for file, stem in zip(files, short, strict=True):
-        if Path(file).is_file() and not is_trajectory(file) and not is_recording(file):
-            typed = command_line("view", "--live", file)
-            raise ValueError(f"{file}: not a trajectory. To show a robot or model, type: {typed}")
-        name = stem if short.count(stem) == 1 else file
-        while name in trajectories:
-            name += " (again)"
-        trajectories[name] = load_trajectory_file(Path(file))
-    return trajectories
+        viewer.view(trajectories, port=page.port, open_browser=announce)

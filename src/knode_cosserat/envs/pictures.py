@@ -15,7 +15,7 @@ from knode_cosserat.envs.dynamics import EpisodeState
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.policy import Policy
 from knode_cosserat.evaluation.animation import write_frames
-from knode_cosserat.evaluation.figures import require_matplotlib
+from knode_cosserat.evaluation.style import require_matplotlib
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.wrapped import nominal_model
 

@@ -1,1 +1,1 @@
-"""Comparison of predictions with references: metrics, tables and figures."""
+"""Drawing behind `knode_cosserat.figures`, animations, and figures of recordings and residuals."""

@@ -17,9 +17,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from knode_cosserat._files.writing import replacing
-from knode_cosserat.evaluation.drawing import legend_above
+from knode_cosserat.evaluation.drawing import (
+    View,
+    by_label,
+    checked_view,
+    curves_of,
+    flat_height,
+    legend_above,
+    valid_rows,
+)
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
-from knode_cosserat.evaluation.views import View, by_label, checked_view, curves_of, flat_height, valid_rows
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -74,10 +81,10 @@ def animate(
             or planar and spatial trajectories are mixed.
     """
     path = Path(path)
-    given = by_label(trajectories)
-    seconds, delay = _timing(given, path, fps, speed)
+    motions = by_label(trajectories)
+    seconds, delay = _timing(motions, path, fps, speed)
     with style():
-        frames = _frames(given, seconds, view, width_of(columns), dpi)
+        frames = _frames(motions, seconds, view, width_of(columns), dpi)
         return write_frames(frames, path, delay)
 
 
@@ -91,7 +98,7 @@ def write_frames(frames: Iterator[Image], path: Path, delay: float) -> Path:
 
 
 def _timing(
-    given: Mapping[str, Trajectory], path: Path, fps: float, speed: float
+    motions: Mapping[str, Trajectory], path: Path, fps: float, speed: float
 ) -> tuple[NDArray[np.float64], float]:
     """Return the times of the frames in the motion, and the display time of a frame (s)."""
     if path.suffix not in ENDINGS:
@@ -99,8 +106,8 @@ def _timing(
     for name, value, low, high in (("fps", fps, SLOWEST, FASTEST), ("speed", speed, 1e-3, 1e3)):
         if not low <= value <= high:
             raise ValueError(f"{name} is {value!r}; allowed is {low:g} to {high:g}")
-    begin = min(float(one.time[0]) for one in given.values())
-    end = max(float(one.time[-1]) for one in given.values())
+    begin = min(float(one.time[0]) for one in motions.values())
+    end = max(float(one.time[-1]) for one in motions.values())
     if not end > begin:
         raise ValueError("the trajectory has one row: nothing moves; figures.shape draws it")
     delay = max(2, round(100.0 / fps)) / 100.0 if path.suffix == ".gif" else 1.0 / fps
@@ -130,7 +137,7 @@ def _moved(trajectory: Trajectory, seconds: NDArray[np.float64]) -> _Moved:
 
 
 def _frames(
-    given: Mapping[str, Trajectory],
+    motions: Mapping[str, Trajectory],
     seconds: NDArray[np.float64],
     view: str | None,
     width: float,
@@ -140,7 +147,7 @@ def _frames(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
-    moved = [_moved(one, seconds) for one in given.values()]
+    moved = [_moved(one, seconds) for one in motions.values()]
     if len({robot.path.shape[1] for robot in moved}) > 1:
         raise ValueError("some trajectories are in a plane and some in space; allowed is one kind")
     view = checked_view(view, moved[0].path.shape[1])
@@ -151,12 +158,12 @@ def _frames(
     canvas = FigureCanvasAgg(figure)
     seen = View(figure, 111, view)
     seen.frame(everything, zoom=0.82)
-    seen.obstacles(next(iter(given.values())), everything)
+    seen.obstacles(next(iter(motions.values())), everything)
     lines = [
         _lines(seen, label, robot, i, len(moved))
-        for i, (label, robot) in enumerate(zip(given, moved, strict=True))
+        for i, (label, robot) in enumerate(zip(motions, moved, strict=True))
     ]
-    if any(given):
+    if any(motions):
         legend_above(seen.axes)
     clock = figure.text(0.01, 0.99, "", ha="left", va="top", animated=True)
     canvas.draw()

@@ -7,12 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat.evaluation import drawing
 from knode_cosserat.evaluation.drawing import (
-    AXES,
     equal_scales,
     new_figure,
     one_of,
-    require_span,
     tips_of,
 )
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
@@ -83,14 +82,10 @@ def show_all(axes: Any, trajectories: Sequence[Trajectory], zoom: float) -> None
 
 def draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Trajectory]) -> None:
     """Draw the tip's x, y and z over time, one below the other."""
-    true = tips_of(reference)
-    for k, axes in enumerate(column):
-        axes.plot(reference.time, true[:, k], label="reference", **REFERENCE)
-        for place, (label, each) in enumerate(predictions.items()):
-            axes.plot(each.time, tips_of(each)[:, k], label=label, **look_of(label, place))
-        axes.set_ylabel(f"tip {AXES[k]} [m]")
-        require_span(axes, 0.01 * float(np.nanmax(np.abs(true))))
-    column[-1].set_xlabel("time [s]")
+    looks = {label: look_of(label, place) for place, label in enumerate(predictions)}
+    paths = {label: (motion.time, tips_of(motion)) for label, motion in predictions.items()}
+    true = {"reference": (reference.time, tips_of(reference))}
+    drawing.draw_tips(column, true | paths, {"reference": REFERENCE, **looks})
 
 
 def legend_below(figure: Any, axes: Any, columns: int = 6) -> None:

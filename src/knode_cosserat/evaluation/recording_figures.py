@@ -15,15 +15,15 @@ from knode_cosserat.evaluation.drawing import (
     new_figure,
     tips_of,
 )
-from knode_cosserat.evaluation.metrics import dtw_distance, rms_distance
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.metrics import dtw_distance, rms_distance
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from knode_cosserat.recordings.health import Health
     from knode_cosserat.recordings.measurements import Measurements
-    from knode_cosserat.recordings.recording import Body, Recording
+    from knode_cosserat.recordings.recording import Recording
 
 #: markers of events: text in the finding, colour and label
 _MARKS = (
@@ -39,9 +39,10 @@ def health(recording: Recording, report: Health) -> Figure:
     Raises:
         ImportError: matplotlib is not installed.
     """
+    robot = {True: "a simulated robot", False: "a physical robot", None: "not stated whether simulated"}
     with style():
         figure = new_figure(TWO_COLUMNS, 6.0)
-        figure.suptitle(_title(recording, report))
+        figure.suptitle(f"{recording.source}\n{report.duration:.2f} s, {robot[recording.simulated]}")
         left, right = figure.subfigures(1, 2, width_ratios=(2.3, 1.0))
         axes = left.subplots(5, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0, 1.0, 0.9))
         _draw_tensions(axes[0], recording)
@@ -96,11 +97,6 @@ def prediction_against_measurement(prediction: Tips, recording: Measurements) ->
     return figure
 
 
-def _title(recording: Recording, report: Health) -> str:
-    robot = {True: "a simulated robot", False: "a physical robot", None: "not stated whether simulated"}
-    return f"{recording.source}\n{report.duration:.2f} s, {robot[recording.simulated]}"
-
-
 def _end(recording: Recording) -> float:
     return float(max(body.time[-1] for body in recording.bodies))
 
@@ -130,8 +126,12 @@ def _draw_tensions(axes: Any, recording: Recording) -> None:
 
 def _draw_positions(axes: Any, recording: Recording) -> None:
     """Draw x, y and z of all bodies; lines break at gaps too long to be bridged."""
+    from knode_cosserat.recordings.recording import bridge
+
     for k, body in enumerate(recording.bodies):
-        time, position = _with_breaks(body, recording.config.longest_gap)
+        long = np.diff(body.time) > bridge(body.time, recording.config.longest_gap)
+        breaks = np.flatnonzero(long) + 1
+        time, position = (np.insert(values, breaks, np.nan, axis=0) for values in (body.time, body.position))
         for axis in range(3):
             axes[axis].plot(
                 time, position[:, axis], linewidth=1.0, color=PALETTE[k % len(PALETTE)], label=body.name
@@ -142,13 +142,6 @@ def _draw_positions(axes: Any, recording: Recording) -> None:
         for axis in axes:
             axis.axvspan(*recording.rest, color="#EEEEEE", zorder=0)
     legend_above(axes[0])
-
-
-def _with_breaks(body: Body, longest: float) -> tuple[np.ndarray, np.ndarray]:
-    from knode_cosserat.recordings.recording import bridge
-
-    breaks = np.flatnonzero(np.diff(body.time) > bridge(body.time, longest)) + 1
-    return np.insert(body.time, breaks, np.nan), np.insert(body.position, breaks, np.nan, axis=0)
 
 
 def _draw_frames(axes: Any, recording: Recording) -> None:

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.metrics import dtw_distance, pose_mse, rotation_rmse
 from knode_cosserat.identification.steps import simulated_rows
+from knode_cosserat.metrics import dtw_distance, pose_mse, rotation_rmse
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first

@@ -10,20 +10,11 @@ from typing import TYPE_CHECKING
 from knode_cosserat._lazy import make_lazy
 
 __all__ = [
-    "BaseSource",
-    "Body",
-    "ColumnMap",
-    "CommandSource",
     "Finding",
-    "MarkerSource",
     "Measurements",
-    "MotorSource",
     "Recording",
     "RecordingConfig",
     "RecordingError",
-    "TableSource",
-    "TensionSource",
-    "Tensions",
     "estimate_parts",
     "estimate_states",
     "load_example",
@@ -32,31 +23,21 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.config import (
-        BaseSource,
-        ColumnMap,
-        CommandSource,
-        MarkerSource,
-        MotorSource,
-        RecordingConfig,
-        TableSource,
-        TensionSource,
-    )
+    from knode_cosserat.recordings.config import RecordingConfig
     from knode_cosserat.recordings.estimation.estimate import estimate_parts, estimate_states
     from knode_cosserat.recordings.findings import Finding, RecordingError
     from knode_cosserat.recordings.load import load_example, load_recording, proposed_config
     from knode_cosserat.recordings.measurements import Measurements
-    from knode_cosserat.recordings.recording import Body, Recording, Tensions
+    from knode_cosserat.recordings.recording import Recording
 
 make_lazy(
     __name__,
     {
-        f"{__name__}.config": "BaseSource ColumnMap CommandSource MarkerSource MotorSource RecordingConfig "
-        "TableSource TensionSource",
+        f"{__name__}.config": "RecordingConfig",
         f"{__name__}.estimation.estimate": "estimate_parts estimate_states",
         f"{__name__}.findings": "Finding RecordingError",
         f"{__name__}.load": "load_example load_recording proposed_config",
         f"{__name__}.measurements": "Measurements",
-        f"{__name__}.recording": "Body Recording Tensions",
+        f"{__name__}.recording": "Recording",
     },
 )

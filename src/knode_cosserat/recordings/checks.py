@@ -5,25 +5,24 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
+from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.config import (
     MOTOR_UNITS,
     POSITION_UNITS,
-    TENSION_UNITS,
     MotorSource,
     RecordingConfig,
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
-from knode_cosserat.recordings.recording import Body, Tensions, bridge
-from knode_cosserat.recordings.streams import SLOW, period
+from knode_cosserat.recordings.recording import bridge
+from knode_cosserat.recordings.streams import SLOW, Body, Tensions, period
 
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
@@ -45,14 +44,7 @@ _UNITS = {**TENSION_UNITS, **MOTOR_UNITS}
 
 @dataclasses.dataclass
 class _Rows:
-    """Rows of a topic from which errors are removed.
-
-    Attributes:
-        topic: name of the topic.
-        time: times (s).
-        values: numbers of each row.
-        findings: findings on what was removed.
-    """
+    """Rows of a topic, times (s) and numbers, from which errors are removed; and findings on these."""
 
     topic: str
     time: Float[np.ndarray, " n"]
@@ -97,12 +89,8 @@ def cleaned_body(
 ) -> tuple[Body, list[Finding]]:
     """Return a body without errors, in the recording's own frame and units, and the findings.
 
-    Args:
-        config: configuration of the recording.
-        source: name, topic and fraction of the body.
-        time: times (s).
-        pose: positions and, if known, quaternions.
-        path: the file's name in error messages.
+    `source` is its name, topic and fraction; `pose` has positions and, if known, quaternions; `path` is named
+    in errors.
 
     Raises:
         RecordingError: the body has fewer than two usable frames.
@@ -128,9 +116,9 @@ def cleaned_body(
         quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
         quaternion, swaps, unclear = swaps_undone(rows.time, quaternion)
         rows.values = np.concatenate([rows.values[:, :3], quaternion], axis=1)
-        for swap in swaps:
-            when = float(rows.time[swap.row])
-            turned = f"by {swap.angle:.0f} degrees about {swap.axis}"
+        for row, angle, axis in swaps:
+            when = float(rows.time[row])
+            turned = f"by {angle:.0f} degrees about {axis}"
             what = f"its axes were swapped at {when:.3f} s, {turned}; undone"
             rows.findings.append(Finding("warning", topic, what, (when,)))
     wrong = np.zeros(len(rows.time), dtype=bool)
@@ -151,7 +139,7 @@ def cleaned_body(
     rows.drop(wrong, ("pose jumps", "poses jump", "out of the motion and back"), "note")
     rows.add_pauses(config.longest_gap)
     orientation = rows.values[:, 3:] if is_oriented else None
-    return Body(name, topic, fraction, rows.time, rows.values[:, :3], orientation), rows.findings
+    return Body(rows.time, rows.values[:, :3], orientation, name, topic, fraction), rows.findings
 
 
 # tensions
@@ -162,11 +150,7 @@ def cleaned_tensions(
 ) -> tuple[Tensions | None, Tensions | None, list[Finding]]:
     """Return measured and commanded tensions (N, tendon 1 first; None if absent), and the findings.
 
-    Args:
-        config: configuration of the recording.
-        seconds: times (s) by topic.
-        values: numbers by topic.
-        path: the file's name in error messages.
+    `seconds` (s) and `values` are by topic; `path` is named in errors.
 
     Raises:
         RecordingError: messages have another number of tendons, or required tensions have no usable row.
@@ -179,7 +163,7 @@ def cleaned_tensions(
             topic = source.topic
             rows = _cleaned_rows(source, seconds[topic], values[topic], kind, path)
             if len(rows.time):
-                tensions = Tensions(topic, rows.time, rows.values)
+                tensions = Tensions(rows.time, rows.values, topic)
                 if kind == "measured":
                     rows.add_pauses(config.longest_gap)
             elif config.tensions == kind:
@@ -273,20 +257,6 @@ def outliers(
 # swapped axes
 
 
-class Swap(NamedTuple):
-    """Swap of a body's axes at a row; it also applies to all later rows.
-
-    Attributes:
-        row: index of the row.
-        angle: angle of the swap (degrees).
-        axis: its rotation axis in the body's axes.
-    """
-
-    row: int
-    angle: float
-    axis: tuple[int, ...]
-
-
 #: largest rotation by motion between two frames (rad): a larger one cannot be distinguished from a swap
 _LARGEST_TURN = np.radians(45.0)
 #: smallest tolerance of a swap about a multiple of 90 degrees, for motion between the two frames (rad)
@@ -297,16 +267,13 @@ _CUBE = Rotation.create_group("O")
 
 def swaps_undone(
     time: Float[np.ndarray, " n"], quaternion: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 4"], list[Swap], list[int]]:
+) -> tuple[Float[np.ndarray, "n 4"], list[tuple[int, float, tuple[int, ...]]], list[int]]:
     """Return orientations without swapped axes, the swaps, and the rows of other large rotations.
 
-    Between two frames a swap rotates a body by one of the 23 rotations of a cube, plus its motion. The
-    neighbouring rotations bound that motion. A large rotation is left unchanged if it is not a multiple of
-    90 degrees, or if the motion is too fast to decide.
-
-    Args:
-        time: times of the rows (s), increasing.
-        quaternion: orientation of the body, scalar first.
+    A swap is its row (it applies to all later rows, too), its angle (degrees), and its axis among the body's.
+    Between two frames it rotates a body by one of the 23 rotations of a cube, plus its motion, which the
+    neighbouring rotations bound. A large rotation is left unchanged if it is not a multiple of 90 degrees, or
+    if the motion is too fast to decide.
     """
     rotation = Rotation.from_quat(quaternion, scalar_first=True)
     turn = rotation[:-1].inv() * rotation[1:] if len(time) > 1 else rotation[:0]
@@ -314,7 +281,7 @@ def swaps_undone(
     rate = np.where(angle > _LARGEST_TURN, 0.0, angle / np.diff(time))
     undo = Rotation.identity()
     pieces: list[Rotation] = []
-    swaps: list[Swap] = []
+    swaps: list[tuple[int, float, tuple[int, ...]]] = []
     unclear: list[int] = []
     begin = 0
     for step in np.flatnonzero(angle > _LARGEST_TURN):
@@ -331,7 +298,7 @@ def swaps_undone(
         # rotations are measured in the swapped axes: undo the swaps in reverse order
         undo = _CUBE[nearest].inv() * undo
         axis = np.sign(np.round(_CUBE[nearest].as_rotvec(), 6)).astype(int).tolist()
-        swaps.append(Swap(begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))
+        swaps.append((begin, float(np.degrees(_CUBE[nearest].magnitude())), tuple(axis)))
     if not swaps:
         return quaternion, [], unclear
     pieces.append(rotation[begin:] * undo)
@@ -350,11 +317,8 @@ def implausible_sizes(
 ) -> list[Finding]:
     """Return findings on implausible times and units, with the likely error.
 
-    Args:
-        bodies: bodies in the robot's frame.
-        tensions: measured and commanded tensions.
-        at_rest: positions of the bodies at rest (m), if known.
-        is_static: True if rows are equilibria, whose times are arbitrary.
+    `tensions` are measured and commanded ones, `at_rest` the positions of the bodies at rest (m), if known.
+    Times of equilibria (`is_static`) are arbitrary.
     """
     findings, sizes = [], []
     for stream, is_measured in zip(tensions, (True, False), strict=True):

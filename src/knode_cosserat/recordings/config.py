@@ -28,12 +28,13 @@ import fractions
 import functools
 import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_origin, get_type_hints
 
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
+from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.findings import RecordingError
 
 Vector = tuple[float, ...]
@@ -41,20 +42,15 @@ FORMAT = 1
 #: placeholder of the numbers in a command's text, or of the number or topic in a title
 PLACE = "{}"
 #: conversion factors to SI units
-TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
 POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: units of motors: angles to rad, or wound-up lengths to m
 MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
 #: axes of motion capture that point up, with the rotation vector (rad) that turns them to z
 UP: dict[str, Vector] = {
-    "z": (0.0, 0.0, 0.0),
-    "y": (math.pi / 2, 0.0, 0.0),
-    "x": (0.0, -math.pi / 2, 0.0),
-    "-z": (math.pi, 0.0, 0.0),
-    "-y": (-math.pi / 2, 0.0, 0.0),
-    "-x": (0.0, math.pi / 2, 0.0),
-}
+    "z": (0.0, 0.0, 0.0), "y": (math.pi / 2, 0.0, 0.0), "x": (0.0, -math.pi / 2, 0.0),
+    "-z": (math.pi, 0.0, 0.0), "-y": (-math.pi / 2, 0.0, 0.0), "-x": (0.0, math.pi / 2, 0.0),
+}  # fmt: skip
 #: topics of the sources that a map of columns stands for
 MAPPED = {"tensions": "tension", "commands": "command", "motors": "motor"}
 
@@ -144,16 +140,16 @@ def _quaternion(value: Any, name: str) -> Vector:
 
 def _interval(is_open: bool) -> _Check:
     def check(value: Any, name: str) -> tuple[float | None, ...]:
-        ends = [None if end is None and is_open else _real(end) for end in _listed(value)]
-        start, end = ends if len(ends) == 2 else (None, None)
-        wrong = any(
-            stored is None and not (end is None and is_open)
-            for stored, end in zip(ends, _listed(value), strict=True)
+        listed = _listed(value)
+        ends = [_real(end) for end in listed]
+        unread = any(
+            end is None and not (is_open and word is None) for end, word in zip(ends, listed, strict=True)
         )
-        if len(ends) != 2 or wrong or (start is not None and end is not None and not start < end):
+        known = [end for end in ends if end is not None]
+        if len(ends) != 2 or unread or (len(known) == 2 and not known[0] < known[1]):
             words = "[start, end] in s, start before end" + (", either of them null" if is_open else "")
             raise _refused(value, name, words)
-        return start, end
+        return tuple(ends)
 
     return check
 
@@ -180,6 +176,10 @@ def _templates(count: int) -> _Check:
     return check
 
 
+def _template(value: Any, name: str) -> str:
+    return str(_templates(1)([value], name)[0])
+
+
 def _titles(*counts: int) -> _Check:
     """Return the check of titles, or numbers, of columns: so many of them, or any number."""
 
@@ -195,20 +195,69 @@ def _titles(*counts: int) -> _Check:
     return check
 
 
+def _bodies(value: Any, name: str) -> tuple[tuple[str, tuple[str, ...]], ...]:
+    return tuple((_text(body, "body"), _titles(3, 7)(titles, str(body))) for body, titles in value)
+
+
+def _time_title(value: Any, name: str) -> str:
+    return _text(str(value) if type(value) is int else value, name).strip()
+
+
+@functools.cache
+def _checks(kind: type) -> dict[str, _Check]:
+    """Return the checks of settings by name, from the annotations of their fields."""
+    hints = get_type_hints(kind, include_extras=True)
+    return {name: hint.__metadata__[0] for name, hint in hints.items() if get_origin(hint) is Annotated}
+
+
 class _Settings:
     """Settings whose fields are checked when they are made; a field whose default is None may be None."""
 
-    _checks: ClassVar[Mapping[str, _Check]]
-
     def __post_init__(self) -> None:
         defaults = {field.name: field.default for field in dataclasses.fields(self)}  # type: ignore[arg-type]
-        for name, check in self._checks.items():
+        for name, check in _checks(type(self)).items():  # type: ignore[arg-type]
             value = getattr(self, name)
             if value is not None or defaults[name] is not None:
                 self._set(name, check(value, name))
 
     def _set(self, name: str, value: Any) -> None:
         object.__setattr__(self, name, value)
+
+    @classmethod
+    def from_dict(cls, values: dict[Any, Any]) -> Self:
+        """Return settings from plain values; missing keys get defaults. Raises `RecordingError`."""
+        fields = dataclasses.fields(cls)  # type: ignore[arg-type]
+        for key in values:
+            _require_known(key, [field.name for field in fields])
+        required = [field.name for field in fields if field.default is dataclasses.MISSING]
+        missing = [name for name in required if values.get(name) is None]
+        if missing:
+            raise RecordingError(f"the key {missing[0]} is missing; required is {', '.join(required)}")
+        return cls(**values)
+
+
+def _require_known(key: Any, known: list[str]) -> None:
+    if key not in known:
+        raise RecordingError(
+            f"the key {shown(key)} is unknown; allowed is {', '.join(known)}{did_you_mean(key, known)}"
+        )
+
+
+def _part(kind: Any) -> _Check:
+    """Return the check of settings within settings, or of a mapping of them."""
+
+    def check(value: Any, name: str) -> Any:
+        if isinstance(value, dict):
+            try:
+                return kind.from_dict(value)
+            except RecordingError as error:
+                raise RecordingError(f"{name}: {error}") from None
+        if type(value) is not kind:
+            keys = ", ".join(field.name for field in dataclasses.fields(kind))
+            raise _refused(value, name, f"a {kind.__name__}, or nothing; or a mapping with {keys}")
+        return value
+
+    return check
 
 
 # sources
@@ -227,27 +276,40 @@ class MarkerSource(_Settings):
             are calibrated at rest, when the rod points up.
     """
 
-    name: str
-    topic: str
-    fraction: float
-    rotation: Vector | None = None
+    name: Annotated[str, _text]
+    topic: Annotated[str, _text]
+    fraction: Annotated[float, _number(0.0, 1.0)]
+    rotation: Annotated[Vector | None, _quaternion] = None
 
-    _checks: ClassVar = {
-        "name": _text,
-        "topic": _text,
-        "fraction": _number(0.0, 1.0),
-        "rotation": _quaternion,
-    }
+
+def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
+    markers = []
+    for k, marker in enumerate(_listed(value)):
+        where = f"{name}, number {k + 1}"
+        if not isinstance(marker, MarkerSource):
+            if not isinstance(marker, dict):
+                raise _refused(marker, where, "a mapping with name, topic, fraction, rotation")
+            # without a topic it is called like the marker
+            named = {"topic": marker["name"]} if "name" in marker else {}
+            marker = _part(MarkerSource)(named | marker, where)
+        markers.append(marker)
+    if not markers:
+        refused = tuple(value) if isinstance(value, list) else value
+        raise _refused(refused, name, "a list of one marker or more")
+    places, names = [marker.fraction for marker in markers], [marker.name for marker in markers]
+    if any(b <= a for a, b in itertools.pairwise(places)):
+        raise RecordingError(f"markers have the fractions {shown(places)}; allowed is each above the last")
+    if len(set(names)) < len(names):
+        raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
+    return tuple(markers)
 
 
 @dataclasses.dataclass(frozen=True)
 class BaseSource(_Settings):
     """Body fixed to the base, `height` (m) above the rod's clamped end."""
 
-    topic: str
-    height: float = 0.0
-
-    _checks: ClassVar = {"topic": _text, "height": _number(-10.0, 10.0, "m")}
+    topic: Annotated[str, _text]
+    height: Annotated[float, _number(-10.0, 10.0, "m")] = 0.0
 
 
 class _NumbersSource(_Settings):
@@ -258,19 +320,19 @@ class _NumbersSource(_Settings):
     names: tuple[str, ...] | None
 
     def __post_init__(self) -> None:
+        names = None
         if self.names is not None:
             names = tuple(_text(name, "names") for name in _listed(self.names) or [self.names])
             if len(set(names)) < len(names) or self.names in ([], ()):
                 raise _refused(list(_listed(self.names)), "names", "each name once")
-            self._set("names", names)
-            if self.order == ():
-                self._set("order", tuple(range(1, len(names) + 1)))
+            self._set("order", self.order or tuple(range(1, len(names) + 1)))
+        self._set("names", names)
         if self.order == ():
             raise RecordingError("the key order is missing; required is topic, order or names")
         super().__post_init__()
-        if self.names is not None and len(self.names) != len(self.order):
+        if names is not None and len(names) != len(self.order):
             raise RecordingError(
-                f"names has {len(self.names)} names and order {len(self.order)} numbers; allowed is the same "
+                f"names has {len(names)} names and order {len(self.order)} numbers; allowed is the same "
                 "number"
             )
         if self.topic.count(PLACE) > 1:
@@ -292,13 +354,17 @@ class TensionSource(_NumbersSource):
             None: joints whose names end in numbers are matched by these.
     """
 
-    topic: str
-    order: tuple[int, ...] = ()
-    unit: Literal["N", "gf"] = "N"
-    held: bool | None = None
+    topic: Annotated[str, _text]
+    order: Annotated[tuple[int, ...], _order] = ()
+    unit: Annotated[Literal["N", "gf"], _choice(TENSION_UNITS)] = "N"
+    held: Annotated[bool | None, _flag] = None
     names: tuple[str, ...] | None = None
 
-    _checks: ClassVar = {"topic": _text, "order": _order, "unit": _choice(TENSION_UNITS), "held": _flag}
+
+def _command_text(value: Any, name: str) -> str:
+    if str(value).count(PLACE) != 1:
+        raise _refused(value, name, f"text with one {PLACE} where the numbers stand")
+    return str(value)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -311,17 +377,13 @@ class CommandSource(TensionSource):
         latency: delay from a command's stamp until it reaches the tendons (s).
     """
 
-    text: str | None = None
-    latency: float = 0.0
-
-    _checks: ClassVar = {**TensionSource._checks, "latency": _number(0.0, 10.0, "s")}
+    text: Annotated[str | None, _command_text] = None
+    latency: Annotated[float, _number(0.0, 10.0, "s")] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.held is False:
             raise RecordingError("held is false; allowed of a command is true: it is held until the next")
-        if self.text is not None and str(self.text).count(PLACE) != 1:
-            raise _refused(self.text, "text", f"text with one {PLACE} where the numbers stand")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -338,15 +400,11 @@ class MotorSource(_NumbersSource):
             its positions.
     """
 
-    topic: str
-    order: tuple[int, ...] = ()
-    unit: Literal["rad", "deg", "m", "mm"] = "rad"
-    latency: float = 0.0
+    topic: Annotated[str, _text]
+    order: Annotated[tuple[int, ...], _order] = ()
+    unit: Annotated[Literal["rad", "deg", "m", "mm"], _choice(MOTOR_UNITS)] = "rad"
+    latency: Annotated[float, _number(-10.0, 10.0, "s")] = 0.0
     names: tuple[str, ...] | None = None
-
-    _checks: ClassVar = {
-        "topic": _text, "order": _order, "unit": _choice(MOTOR_UNITS), "latency": _number(-10.0, 10.0, "s")
-    }  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -360,17 +418,10 @@ class TableSource(_Settings):
         motor: title of a motor's angle, or of a tension, with `{}` in place of its number.
     """
 
-    rate: float | None = None
-    position: tuple[str, ...] | None = None
-    quaternion: tuple[str, ...] | None = None
-    motor: str | None = None
-
-    _checks: ClassVar = {
-        "rate": _number(1e-6, 1e6, "Hz"),
-        "position": _templates(3),
-        "quaternion": _templates(4),
-        "motor": lambda value, name: _templates(1)([value], name)[0],
-    }
+    rate: Annotated[float | None, _number(1e-6, 1e6, "Hz")] = None
+    position: Annotated[tuple[str, ...] | None, _templates(3)] = None
+    quaternion: Annotated[tuple[str, ...] | None, _templates(4)] = None
+    motor: Annotated[str | None, _template] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -387,21 +438,12 @@ class ColumnMap(_Settings):
         motors: titles of motors' angles.
     """
 
-    bodies: tuple[tuple[str, tuple[str, ...]], ...] = ()
-    time: str | None = None
-    time_unit: Literal["s", "ms", "us", "ns"] | None = None
-    tensions: tuple[str, ...] | None = None
-    commands: tuple[str, ...] | None = None
-    motors: tuple[str, ...] | None = None
-
-    _checks: ClassVar = {
-        "time": lambda value, name: _text(str(value) if type(value) is int else value, name).strip(),
-        "time_unit": _choice(TIME_UNITS),
-        **dict.fromkeys(MAPPED, _titles()),
-        "bodies": lambda value, name: tuple(
-            (_text(body, "body"), _titles(3, 7)(titles, str(body))) for body, titles in value
-        ),
-    }
+    bodies: Annotated[tuple[tuple[str, tuple[str, ...]], ...], _bodies] = ()
+    time: Annotated[str | None, _time_title] = None
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, _choice(TIME_UNITS)] = None
+    tensions: Annotated[tuple[str, ...] | None, _titles()] = None
+    commands: Annotated[tuple[str, ...] | None, _titles()] = None
+    motors: Annotated[tuple[str, ...] | None, _titles()] = None
 
     @classmethod
     def from_dict(cls, values: dict[Any, Any]) -> Self:
@@ -409,11 +451,6 @@ class ColumnMap(_Settings):
         named = {field.name for field in dataclasses.fields(cls)} - {"bodies"}
         bodies = tuple((key, titles) for key, titles in values.items() if key not in named)
         return cls(bodies, **{key: value for key, value in values.items() if key in named})
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return the mapping that `from_dict` reads, as plain values."""
-        named = {field.name: _plain(getattr(self, field.name)) for field in dataclasses.fields(self)[1:]}
-        return {name: value for name, value in named.items() if value is not None} | _plain(dict(self.bodies))
 
 
 # configuration
@@ -423,12 +460,14 @@ class ColumnMap(_Settings):
 class RecordingConfig(_Settings):
     """Configuration of the topics of a bag, or the columns of a table.
 
+    Parts may be mappings, as in a file: `RecordingConfig(markers=[{"name": "tip", "fraction": 1}], …)`.
+
     Attributes:
-        markers: bodies on the rod, from base to tip.
-        tension: measured tensions, or None.
-        motors: measured motor angles in place of tensions, or None.
-        command: commanded tensions, or None.
-        base: body that locates the clamped end; None: `origin` locates it.
+        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, rotation.
+        tension: measured tensions, or None: topic, order of the tendons, unit (N or gf), held, names.
+        motors: measured motor angles in place of tensions, or None: topic, order, unit, latency (s), names.
+        command: commanded tensions, or None: as `tension`, with text and latency (s).
+        base: body that locates the clamped end, or None (`origin` locates it): topic, height above it (m).
         tensions: default choice of the tensions that drive the robot, "measured" or "commanded"; "none" for
             a recording of poses only.
         position_unit: "m" or "mm".
@@ -439,7 +478,8 @@ class RecordingConfig(_Settings):
         rotation: rotation from motion capture's frame (with z up) to the robot's frame, whose z points up
             the straight rod; a quaternion, scalar first.
         clock: "header": measurement times from the messages' headers; "received": recording times.
-        table: titles of a table's columns; None: this package's convention.
+        table: titles of a table's columns, or None (this package's convention): rate of rows without times
+            (Hz), position, quaternion, motor, with `{}` in place of a topic or number.
         columns: titles of a table's columns, one by one; they take precedence over `table`.
         static: True if each row is a separate equilibrium, not part of a motion.
         repeats: "drop": a frame that repeats the previous pose exactly is not a measurement, because some
@@ -455,68 +495,32 @@ class RecordingConfig(_Settings):
         RecordingError: a value is not allowed.
     """
 
-    markers: tuple[MarkerSource, ...]
-    tension: TensionSource | None = None
-    motors: MotorSource | None = None
-    command: CommandSource | None = None
-    base: BaseSource | None = None
-    table: TableSource | None = None
-    columns: ColumnMap | None = None
-    tensions: Literal["measured", "commanded", "none"] = "measured"
-    position_unit: Literal["m", "mm"] = "m"
-    up: str | None = None
-    origin: Vector = (0.0, 0.0, 0.0)
-    rotation: Vector = (1.0, 0.0, 0.0, 0.0)
-    clock: Literal["header", "received"] = "header"
-    static: bool = False
-    repeats: Literal["keep", "drop"] = "keep"
-    longest_gap: float = 0.1
-    rest: Vector | None = None
-    trim: tuple[float | None, float | None] = (None, None)
-    simulated: bool | None = None
-    description: str = ""
+    markers: Annotated[tuple[MarkerSource, ...], _markers]
+    tension: Annotated[TensionSource | None, _part(TensionSource)] = None
+    motors: Annotated[MotorSource | None, _part(MotorSource)] = None
+    command: Annotated[CommandSource | None, _part(CommandSource)] = None
+    base: Annotated[BaseSource | None, _part(BaseSource)] = None
+    table: Annotated[TableSource | None, _part(TableSource)] = None
+    columns: Annotated[ColumnMap | None, _part(ColumnMap)] = None
+    tensions: Annotated[
+        Literal["measured", "commanded", "none"], _choice(("measured", "commanded", "none"))
+    ] = "measured"
+    position_unit: Annotated[Literal["m", "mm"], _choice(POSITION_UNITS)] = "m"
+    up: Annotated[str | None, _choice(UP)] = None
+    origin: Annotated[Vector, _numbers(3, "three numbers (m)")] = (0.0, 0.0, 0.0)
+    rotation: Annotated[Vector, _quaternion] = (1.0, 0.0, 0.0, 0.0)
+    clock: Annotated[Literal["header", "received"], _choice(("header", "received"))] = "header"
+    static: Annotated[bool, _flag] = False
+    repeats: Annotated[Literal["keep", "drop"], _choice(("keep", "drop"))] = "keep"
+    longest_gap: Annotated[float, _number(0.0, 60.0, "s")] = 0.1
+    rest: Annotated[Vector | None, _interval(is_open=False)] = None
+    trim: Annotated[tuple[float | None, float | None], _interval(is_open=True)] = (None, None)
+    simulated: Annotated[bool | None, _flag] = None
+    description: Annotated[str, _any_text] = ""
     initial_tension: Vector | None = None
 
-    _checks: ClassVar = {
-        "tensions": _choice(("measured", "commanded", "none")),
-        "position_unit": _choice(POSITION_UNITS),
-        "up": _choice(UP),
-        "clock": _choice(("header", "received")),
-        "repeats": _choice(("keep", "drop")),
-        "static": _flag,
-        "origin": _numbers(3, "three numbers (m)"),
-        "rotation": _quaternion,
-        "longest_gap": _number(0.0, 60.0, "s"),
-        "rest": _interval(is_open=False),
-        "trim": _interval(is_open=True),
-        "simulated": _flag,
-        "description": _any_text,
-    }
-
     def __post_init__(self) -> None:
-        self._check_markers()
-        for name, kind in _PARTS.items():
-            value = getattr(self, name)
-            if value is not None and type(value) is not kind:
-                raise _refused(value, name, f"a {kind.__name__}, or nothing")
         super().__post_init__()
-        self._check_together()
-
-    def _check_markers(self) -> None:
-        markers = tuple(_listed(self.markers))
-        if not markers or any(not isinstance(marker, MarkerSource) for marker in markers):
-            raise _refused(self.markers, "markers", "a list of one marker or more")
-        places = [marker.fraction for marker in markers]
-        if any(b <= a for a, b in itertools.pairwise(places)):
-            raise RecordingError(
-                f"markers have the fractions {shown(places)}; allowed is each above the last"
-            )
-        names = [marker.name for marker in markers]
-        if len(set(names)) < len(names):
-            raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
-        self._set("markers", markers)
-
-    def _check_together(self) -> None:
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":
@@ -537,19 +541,19 @@ class RecordingConfig(_Settings):
             words = f"{self.tendons} numbers (N), one of each tendon"
             numbers = _numbers(self.tendons, words)(self.initial_tension, "initial_tension")
             self._set("initial_tension", numbers)
-        sources = (*self.markers, self.base, self.measured, self.command)
-        topics = [source.topic for source in sources if source]
-        twice = next((topic for topic in topics if topics.count(topic) > 1), None)
-        if twice is not None:
-            raise RecordingError(f"the topic {twice} is there twice; allowed is one use of each topic")
-        bodies = [name for name, _ in self.columns.bodies] if self.columns else []
+        topics = [
+            source.topic for source in (*self.markers, self.base, self.measured, self.command) if source
+        ]
+        repeated = next((topic for topic in topics if topics.count(topic) > 1), None)
+        if repeated is not None:
+            raise RecordingError(f"the topic {repeated} is there twice; allowed is one use of each topic")
         known = [source.topic for source in (*self.markers, self.base) if source]
-        unknown = next((name for name in bodies if name not in known), None)
-        if unknown is not None:
-            raise RecordingError(
-                f"columns are of {unknown}, and no marker has this topic; allowed is "
-                f"{', '.join(known)}{did_you_mean(unknown, known)}"
-            )
+        for name, _ in self.columns.bodies if self.columns else ():
+            if name not in known:
+                raise RecordingError(
+                    f"columns are of {name}, and no marker has this topic; allowed is "
+                    f"{', '.join(known)}{did_you_mean(name, known)}"
+                )
 
     @property
     def measured(self) -> TensionSource | MotorSource | None:
@@ -632,46 +636,14 @@ class RecordingConfig(_Settings):
         number = values.pop("format", FORMAT)
         if number != FORMAT or isinstance(number, bool):
             raise _refused(number, "format", str(FORMAT))
-        if values.get("columns") is not None:
-            values = _with_mapped_sources(values)
-        for name, kind in _PARTS.items():
-            if values.get(name) is not None and not isinstance(values[name], kind):
-                values[name] = _part(kind, values[name], name)
-        if isinstance(values.get("markers"), list):
-            values["markers"] = tuple(
-                _part(MarkerSource, marker, f"markers, number {k + 1}")
-                for k, marker in enumerate(values["markers"])
-            )
-        return _constructed(cls, values)
-
-
-_PARTS: dict[str, type] = {
-    "tension": TensionSource, "motors": MotorSource, "command": CommandSource, "base": BaseSource,
-    "table": TableSource, "columns": ColumnMap,
-}  # fmt: skip
-
-
-def _part(kind: Any, values: Any, where: str) -> Any:
-    if not isinstance(values, dict):
-        names = ", ".join(field.name for field in dataclasses.fields(kind))
-        raise _refused(values, where, f"a mapping with {names}")
-    if kind is MarkerSource and "name" in values:
-        # without a topic it is called like the marker
-        values = {"topic": values["name"]} | values
-    try:
-        return _constructed(kind, values)
-    except RecordingError as error:
-        raise RecordingError(f"{where}: {error}") from None
+        return super().from_dict(values if values.get("columns") is None else _with_mapped_sources(values))
 
 
 def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
     """Return settings with the sources that follow from their map of columns. Raises `RecordingError`."""
     if not isinstance(values["columns"], dict):
         raise _refused(values["columns"], "columns", "a mapping with time, tensions and the names of bodies")
-    try:
-        columns = ColumnMap.from_dict(values["columns"])
-    except RecordingError as error:
-        raise RecordingError(f"columns: {error}") from None
+    columns = _part(ColumnMap)(values["columns"], "columns")
     values = {**values, "columns": columns}
     for name, part in (("tensions", "tension"), ("commands", "command"), ("motors", "motors")):
         titles, stated = getattr(columns, name), values.get(part) or {}
@@ -693,33 +665,15 @@ def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
     return values | {"markers": values.get("markers") or [{"name": bodies[0], "fraction": 1.0}]}
 
 
-def _constructed(kind: Any, values: dict[Any, Any]) -> Any:
-    fields = dataclasses.fields(kind)
-    for key in values:
-        _require_known(key, [field.name for field in fields])
-    required = [field.name for field in fields if field.default is dataclasses.MISSING]
-    missing = [name for name in required if values.get(name) is None]
-    if missing:
-        raise RecordingError(f"the key {missing[0]} is missing; required is {', '.join(required)}")
-    return kind(**values)
-
-
-def _require_known(key: Any, known: list[str]) -> None:
-    if key not in known:
-        raise RecordingError(
-            f"the key {shown(key)} is unknown; allowed is {', '.join(known)}{did_you_mean(key, known)}"
-        )
-
-
 def _plain(value: Any) -> Any:
     """Return a value as plain values for JSON and YAML; parts without unset settings."""
-    if isinstance(value, ColumnMap):
-        return value.to_dict()
     if isinstance(value, dict):
         return {name: _plain(part) for name, part in value.items()}
     if dataclasses.is_dataclass(value):
         named = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
+        if isinstance(value, ColumnMap):
+            del named["bodies"]
         if not isinstance(value, RecordingConfig):
             named = {name: part for name, part in named.items() if part is not None}
-        return named
+        return named | _plain(dict(value.bodies)) if isinstance(value, ColumnMap) else named
     return [_plain(part) for part in value] if isinstance(value, tuple) else value

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import bz2
+import gzip
+import io
 import zlib
 from pathlib import Path
 from typing import Any
@@ -60,29 +62,19 @@ def file_bytes(path: Path, limit: int) -> bytes:
         return data
     ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
     most = min(ratio * len(data) + allowance, allowed(limit))
-    parts, size, rest = [], 0, data
     try:
-        while len(rest) > 0 and size <= most:
-            file = zlib.decompressobj(zlib.MAX_WBITS | 16)
-            while size <= most:
-                part = file.decompress(rest, _OUTPUT)
-                rest = file.unconsumed_tail
-                parts.append(part)
-                size += len(part)
-                if file.eof:
-                    break
-                if not rest and len(part) < _OUTPUT:
-                    raise RecordingError(f"{path}: cannot be decompressed: the file was cut")
-            # further members follow; zeros may fill the last block
-            rest = file.unused_data.lstrip(b"\0")
-    except zlib.error as error:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            content = file.read(most + 1)
+    except EOFError:
+        raise RecordingError(f"{path}: cannot be decompressed: the file was cut") from None
+    except (OSError, zlib.error) as error:
         raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
-    if size > most:
+    if len(content) > most:
         words = f"{ratio} times the file and {allowance}" if most < allowed(limit) else str(most)
         raise RecordingError(
             f"{path}: it has more than {most} bytes when decompressed; allowed are {words}; {MORE}"
         )
-    return b"".join(parts)
+    return content
 
 
 class Decompression:
@@ -100,13 +92,9 @@ class Decompression:
     def records(self, data: bytes | memoryview, compression: str, size: int = 0) -> bytes:
         """Return the decompressed bytes of a part, as far as they are readable and allowed.
 
-        Args:
-            data: compressed bytes; other bytes may follow them.
-            compression: bz2, lz4 or zstd; of any other one nothing is readable.
-            size: decompressed size (bytes); zero if unknown.
-
-        Raises:
-            ImportError: the library for this compression is not installed.
+        `data` may be followed by other bytes. `compression` is bz2, lz4 or zstd; of any other one nothing is
+        readable. `size` is the decompressed size (bytes), zero if unknown. Raises `ImportError` without the
+        library.
         """
         limit = min(allowed(LARGEST_CHUNK), self._remaining)
         most = min(size or limit, limit)

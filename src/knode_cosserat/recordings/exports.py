@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -22,6 +22,9 @@ from knode_cosserat.recordings.table import (
     position_titles,
     quaternion_titles,
 )
+
+if TYPE_CHECKING:
+    from scipy.spatial.transform import Rotation
 
 #: units of length in m
 LENGTHS = {
@@ -62,14 +65,8 @@ def export_table(
 ) -> Table:
     """Return the table of an export. Bodies with orientations come before markers.
 
-    Args:
-        path: the file.
-        time: times of the rows (s).
-        tracks: bodies and markers; names that are there twice get the kind or a number.
-        up: axis of the file that points up.
-        channels: analog channels, with times of their own.
-        findings: findings from reading.
-        source: name of the take, for the recording's source.
+    Names of tracks that are there twice get the kind or a number. `up` is the axis of the file that points
+    up; `channels` have times of their own; `source` is the name of the take.
 
     Raises:
         RecordingError: no body is there, or too many.
@@ -114,6 +111,16 @@ def export_table(
     return Table(metadata, table, tuple(remarks), tuple(bodies), up)
 
 
+def quaternions_of(
+    numbers: Float[np.ndarray, "n 3"], rotation: Callable[[np.ndarray], Rotation]
+) -> Float[np.ndarray, "n 4"]:
+    """Return the quaternions of rotations in other numbers; NaN in rows without all of these."""
+    known = np.isfinite(numbers).all(axis=1)
+    quaternion = np.full((len(numbers), 4), np.nan)
+    quaternion[known] = rotation(numbers[known]).as_quat(scalar_first=True)
+    return quaternion
+
+
 def length_unit(word: str, path: Path, default: str, findings: list[Finding]) -> float:
     """Return a unit of length in m; a finding states that the default is taken for a missing one.
 
@@ -146,34 +153,25 @@ def text_lines(path: Path) -> list[str]:
     return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
-class Cells:
-    """Rows of numbers of an export's section.
+Columns = Callable[[Sequence[int]], Float[np.ndarray, "n places"]]
 
-    Args:
-        lines: the lines; blank ones are left out.
-        titles: titles of the columns, for errors.
-        delimiter: delimiter of the cells.
-        path: the file.
+
+def cells_reader(lines: Sequence[str], titles: Sequence[str], delimiter: str, path: Path) -> Columns:
+    """Return a function from places to columns of numbers, NaN where a cell is empty.
 
     Raises:
-        RecordingError: there are no rows, or one has more cells than titles.
+        RecordingError: there are no rows, or one has more cells than titles; the function raises it for text.
     """
+    from knode_cosserat.recordings.formats.csv_table import cells_of
 
-    def __init__(self, lines: Sequence[str], titles: Sequence[str], delimiter: str, path: Path) -> None:
-        from knode_cosserat.recordings.formats.csv_table import cells_of
-
-        if reason := excess(len(titles), MOST_COLUMNS, "columns"):
-            raise RecordingError(f"{path}: {reason}")
-        rows = [line for line in lines if line.strip(f"{delimiter} \t")]
-        if not rows:
-            raise RecordingError(f"{path}: no rows after the header")
-        # cells that are empty at the end of a line may be left out
-        rows[0] += delimiter * (len(titles) - 1 - rows[0].count(delimiter))
-        cells = cells_of("\n".join(rows), delimiter, str(path))
-        titles = [*titles, *(f"column {k + 1}" for k in range(len(titles), cells.shape[1]))]
-        self._table = numbers_of(cells.set_axis(titles[: cells.shape[1]], axis="columns"))
-        self._path = path
-
-    def __getitem__(self, places: Sequence[int]) -> Float[np.ndarray, "n places"]:
-        """Return columns; NaN where a cell is empty. Raises `RecordingError` for other text."""
-        return columns_of(self._table, places, str(self._path))
+    if reason := excess(len(titles), MOST_COLUMNS, "columns"):
+        raise RecordingError(f"{path}: {reason}")
+    rows = [line for line in lines if line.strip(f"{delimiter} \t")]
+    if not rows:
+        raise RecordingError(f"{path}: no rows after the header")
+    # cells that are empty at the end of a line may be left out
+    rows[0] += delimiter * (len(titles) - 1 - rows[0].count(delimiter))
+    cells = cells_of("\n".join(rows), delimiter, str(path))
+    titles = [*titles, *(f"column {k + 1}" for k in range(len(titles), cells.shape[1]))]
+    table = numbers_of(cells.set_axis(titles[: cells.shape[1]], axis="columns"))
+    return lambda places: columns_of(table, places, str(path))

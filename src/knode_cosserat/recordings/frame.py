@@ -14,7 +14,7 @@ from knode_cosserat.recordings.config import POSITION_UNITS, UP, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.recording import Body
+    from knode_cosserat.recordings.streams import Body
 
 #: ratio of a normal distribution's standard deviation to its median absolute value
 NORMAL = 1.4826
@@ -245,13 +245,8 @@ def _misread_orientation(
     """Return a finding if a body's quaternions agree with its positions in another reading only.
 
     An arc that leaves the clamped end along z determines the tangent at each position. The body's rotation
-    since the rest has to turn the tangent at rest to it.
-
-    Args:
-        quaternion: recorded orientations, in the frame of motion capture, read as scalar first.
-        turn: rotation from motion capture's frame to the robot's.
-        placed: the body, with positions in the robot's frame (m).
-        still: mask of the rows at rest.
+    since the rest has to turn the tangent at rest to it. `quaternion` is recorded, in the frame of motion
+    capture, which `turn` rotates to the robot's; `placed` is the body there; `still` marks the rows at rest.
     """
     distance = np.linalg.norm(placed.position, axis=1)
     seen = distance > 1e-9

@@ -15,7 +15,8 @@ from knode_cosserat.recordings.frame import NORMAL, rest_mask, rest_positions, r
 from knode_cosserat.recordings.streams import period
 
 if TYPE_CHECKING:
-    from knode_cosserat.recordings.recording import Body, Recording, Tensions
+    from knode_cosserat.recordings.recording import Recording
+    from knode_cosserat.recordings.streams import Body, Tensions
 
 #: smallest standard deviation of commands for an estimate of their latency (N)
 QUIET = 0.05
@@ -59,14 +60,8 @@ class StreamHealth:
 
 
 @dataclasses.dataclass(frozen=True)
-class Latency:
-    """Latency of tensions after commands.
-
-    Attributes:
-        shift: delay of commands that fits the measured tensions best (s).
-        delay: dead time of a fitted model with dead time and first-order lag (s).
-        lag: time constant of that lag (s).
-    """
+class _Latency:
+    """Latency of tensions after commands (s): the best shift, or dead time and time constant of a lag."""
 
     shift: float
     delay: float
@@ -79,7 +74,7 @@ class Latency:
 
 
 @dataclasses.dataclass(frozen=True)
-class TensionError:
+class _TensionError:
     """Measured minus commanded tension of one tendon (N), with commands delayed by their latency."""
 
     tendon: int
@@ -110,8 +105,8 @@ class Health:
     rest: tuple[float, float] | None
     rod_length: tuple[float, ...]
     streams: tuple[StreamHealth, ...]
-    latency: Latency | None
-    tension_errors: tuple[TensionError, ...]
+    latency: _Latency | None
+    tension_errors: tuple[_TensionError, ...]
     findings: tuple[Finding, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -196,7 +191,7 @@ def _noise(
 # tensions and commands
 
 
-def latency_of(recording: Recording) -> Latency | None:
+def latency_of(recording: Recording) -> _Latency | None:
     """Return the latency of measured tensions after commands; None without both, or if they hardly change."""
     tension, command = recording.tension, recording.command
     if tension is None or command is None or len(tension.time) < _ENOUGH:
@@ -229,7 +224,7 @@ def latency_of(recording: Recording) -> Latency | None:
         options=options,
     )
     delay, lag = np.abs(best.x)
-    return Latency(shift, round(float(delay), 4), round(float(lag), 4))
+    return _Latency(shift, round(float(delay), 4), round(float(lag), 4))
 
 
 def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, lag: float) -> np.ndarray:
@@ -246,7 +241,7 @@ def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, la
     return np.asarray(filtered)
 
 
-def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[TensionError, ...]:
+def _tension_errors(recording: Recording, latency: _Latency | None) -> tuple[_TensionError, ...]:
     tension, command = recording.tension, recording.command
     if tension is None or command is None:
         return ()
@@ -257,12 +252,12 @@ def _tension_errors(recording: Recording, latency: Latency | None) -> tuple[Tens
     last = np.searchsorted(command.time, tension.time[known] - late + 1e-9, side="right") - 1
     error = tension.tension[known] - command.tension[np.maximum(last, 0)]
     return tuple(
-        TensionError(k + 1, float(column.mean()), float(np.sqrt(np.mean(column**2))))
+        _TensionError(k + 1, float(column.mean()), float(np.sqrt(np.mean(column**2))))
         for k, column in enumerate(error.T)
     )
 
 
-def _about_latency(recording: Recording, latency: Latency | None) -> list[Finding]:
+def _about_latency(recording: Recording, latency: _Latency | None) -> list[Finding]:
     if latency is None or recording.config.command is None:
         return []
     stated = recording.config.command.latency

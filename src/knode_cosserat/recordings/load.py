@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.resources
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -161,7 +161,10 @@ def _assembled(
     for topic in numbers:
         rows[topic], about_order = streams.ordered(topic, times[topic])
         about_clocks += about_order
-    zero = _zero(config, {topic: times[topic][kept] for topic, kept in rows.items()})
+    # time zero is the first pose or measured tension (ns): commands may start much earlier
+    command = config.command.topic if config.command is not None and config.measured is not None else None
+    begins = (times[topic][kept[0]] for topic, kept in rows.items() if len(kept) and topic != command)
+    zero = min(begins, default=None)
     if zero is None:
         raise RecordingError(f"{path}: no poses and no tensions in this recording")
     seconds = {topic: np.round((times[topic][kept] - zero) * 1e-9, 9) for topic, kept in rows.items()}
@@ -179,11 +182,11 @@ def _assembled(
         bodies.append(body)
     if config.base:
         base = bodies.pop()
-    tension, command, about_tensions = checks.cleaned_tensions(config, seconds, values, path)
+    tension, commanded, about_tensions = checks.cleaned_tensions(config, seconds, values, path)
     bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
     at_rest = frame.rest_positions(bodies, rest)
     findings += about_tensions + about_frame
-    both = (None if config.motors else tension, command)
+    both = (None if config.motors else tension, commanded)
     findings += checks.implausible_sizes(bodies, both, at_rest, is_static=config.static)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
@@ -193,15 +196,9 @@ def _assembled(
         bodies=tuple(bodies),
         base=base,
         tension=tension,
-        command=command,
+        command=commanded,
         rest=rest,
         simulated=config.simulated,
         findings=tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))),
         delays=streams.offsets(list(numbers.values())),
     )
-
-
-def _zero(config: RecordingConfig, times: Mapping[str, Collection[Any]]) -> Any:
-    """Return the time of the first pose or measured tension (ns); commands may start much earlier."""
-    later = config.command.topic if config.command is not None and config.measured is not None else None
-    return min((next(iter(at)) for topic, at in times.items() if len(at) and topic != later), default=None)

@@ -14,8 +14,9 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.table import HELD
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording, writer_of
+from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
@@ -133,7 +134,7 @@ class Measurements:
             rows = self.measured[:, k]
             oriented = bool(np.isfinite(self.quaternion[rows, k]).any())
             quaternion = self.quaternion[rows, k] if oriented else None
-            poses[name] = MocapPoses(self.time[rows], position[rows, k], quaternion)
+            poses[name] = Body(self.time[rows], position[rows, k], quaternion)
         initial = self.initial_tension
         config = RecordingConfig(
             markers=tuple(
@@ -145,7 +146,7 @@ class Measurements:
             description=self.source,
             initial_tension=None if initial is None else tuple(initial.tolist()),
         )
-        tension = Pulls(self.time, self.tension)
+        tension = Tensions(self.time, self.tension)
         if is_table:
             write_recording(path, config, poses, tension)
             return

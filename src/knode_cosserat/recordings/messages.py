@@ -33,13 +33,9 @@ _Row = tuple[int, int, Any]
 class Topic:
     """Raw messages of one topic.
 
-    Attributes:
-        name: name of the topic.
-        type: message type as ROS 2 writes it: geometry_msgs/msg/PoseStamped.
-        ros: ROS version of the serialisation: 1 or 2.
-        digest: hash of the type's definition (ROS 1); empty if unknown.
-        received: recording time of each message (ns).
-        raw: encoded messages.
+    `type` is as ROS 2 writes it: geometry_msgs/msg/PoseStamped. `ros` is the version (1 or 2) of the
+    serialisation, `digest` the hash of the type's definition (ROS 1; empty if unknown), and `received` has
+    the recording time of each message (ns).
     """
 
     name: str
@@ -75,12 +71,9 @@ class Topic:
 class Bag:
     """Raw messages of a bag by topic.
 
-    Attributes:
-        ros: ROS version of the serialisation: 1 or 2.
-        topics: topics by name.
-        lost: number of bytes that could not be read.
-        damage: description of the damage to the file; empty: none.
-        is_limited: true if its chunks expand beyond a limit, so that a part was not read.
+    `ros` is the version (1 or 2) of the serialisation, `lost` the number of bytes that could not be read, and
+    `damage` describes the damage to the file (empty: none). `is_limited` is true if its chunks expand beyond
+    a limit, so that a part was not read.
     """
 
     ros: int
@@ -177,12 +170,6 @@ def topics_of(source: Any) -> list[str]:
 
 def decoded(bag: Bag, source: Any, role: Role, path: str) -> Stream:
     """Return the numbers of a source of a configuration; messages that cannot be decoded are counted.
-
-    Args:
-        bag: the messages of all topics.
-        source: the topic's entry in the configuration.
-        role: role of its numbers.
-        path: the file's name in error messages.
 
     Raises:
         RecordingError: a topic's message type is not allowed for this role, or has no such part.

@@ -150,7 +150,7 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
         others = [title for title in titles if not re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)]
         mapped, sources = _number_columns([title for title in others if title != TIME], remarks)
         columns = ColumnMap.from_dict(mapped) if mapped else None
-        return _config(bodies, sources, remarks, columns=columns, up=table.up)
+        return _config(bodies, sources | {"columns": columns, "up": table.up}, remarks)
     time = next((title for title in titles if _TIME.match(title)), None)
     others = [title for title in titles if title != time]
     bodies = _bodies(table, others, path)
@@ -163,7 +163,8 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
         remarks.append(f"times are in {stated_time_unit(time)} by their title")
     columns = ColumnMap.from_dict({"time": time, **mapped, **{body.topic: body.titles for body in bodies}})
     is_mm = any("mm" in re.findall(r"[a-z]+", title.lower()) for title in used)
-    return _config(bodies, sources, remarks, columns=columns, unit="mm" if is_mm else "m")
+    settings = {"columns": columns, "position_unit": "mm" if is_mm else "m"}
+    return _config(bodies, sources | settings, remarks)
 
 
 def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
@@ -238,24 +239,21 @@ def _number_columns(titles: Sequence[str], remarks: list[str]) -> tuple[dict[str
 
 
 def _config(
-    bodies: Sequence[_Body],
-    sources: dict[str, Any],
-    remarks: list[str],
-    *,
-    columns: ColumnMap | None = None,
-    up: str | None = None,
-    unit: str = "m",
+    bodies: Sequence[_Body], settings: dict[str, Any], remarks: list[str]
 ) -> tuple[RecordingConfig, tuple[str, ...]]:
-    """Return the configuration of bodies whose places are guessed from distances at the start."""
+    """Return the configuration of bodies whose places are guessed from distances at the start.
+
+    `settings` are those that are known: sources, columns, the unit of positions and the axis that points up.
+    """
     where = {}
     for body in bodies:
         seen = body.position[np.isfinite(body.position).all(axis=1)][:_ROWS]
         if len(seen):
-            where[body.topic] = np.median(seen, axis=0) * POSITION_UNITS[unit]
+            where[body.topic] = np.median(seen, axis=0) * POSITION_UNITS[settings.get("position_unit", "m")]
     bodies = [body for body in bodies if body.topic in where]
     if not bodies:
         raise RecordingError("no body is ever seen")
-    upright = Rotation.from_rotvec(UP[up or "z"])
+    upright = Rotation.from_rotvec(UP[settings.get("up") or "z"])
     where = {topic: upright.apply(place) for topic, place in where.items()}
     base = next((body for body in bodies if _BASE.search(body.name)), None) if len(bodies) > 1 else None
     others = [body for body in bodies if body is not base]
@@ -276,8 +274,8 @@ def _config(
         remarks.append(
             "the rod is taken to point from the base to the last body: `rotation` turns this axis to z"
         )
-    kinds = "commanded" if "command" in sources else "none"
-    if "tension" in sources or "motors" in sources:
+    kinds = "commanded" if "command" in settings else "none"
+    if "tension" in settings or "motors" in settings:
         kinds = "measured"
     if kinds == "none":
         remarks.append("no tensions were found: `tensions: none` makes a recording of poses only")
@@ -286,13 +284,10 @@ def _config(
             MarkerSource(body.name, body.topic, fraction)
             for body, fraction in zip(others, fractions, strict=True)
         ),
-        **sources,
         base=BaseSource(base.topic) if base else None,
-        columns=columns,
         tensions=kinds,  # type: ignore[arg-type]
-        position_unit=unit,  # type: ignore[arg-type]
-        up=up,
         rotation=(1.0, 0.0, 0.0, 0.0) if rotation is None else rotation,
+        **settings,
     )
     return config, tuple(remarks)
 

@@ -18,7 +18,7 @@ from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.streams import period
+from knode_cosserat.recordings.streams import Body, Tensions, period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.health import Health
@@ -27,43 +27,6 @@ if TYPE_CHECKING:
 MOST_ROWS = 10_000_000
 #: tolerance of stamps (s)
 _SAME = 1e-6
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Body:
-    """Poses of a body from motion capture, at the times of its frames.
-
-    Attributes:
-        name: name in reports.
-        topic: topic of its poses.
-        fraction: its place on the rod, as a fraction of the length; NaN for the base.
-        time: times from the recording's start, increasing (s).
-        position: positions in the robot's frame (m).
-        quaternion: orientations of the rod's local frame, scalar first; None if unknown.
-    """
-
-    name: str
-    topic: str
-    fraction: float
-    time: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    quaternion: Float[np.ndarray, "n 4"] | None
-
-    def __repr__(self) -> str:
-        return f"Body {self.name} at {self.fraction:.4g} of the length: {count_of(len(self.time), 'pose')}"
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Tensions:
-    """Tensions of all tendons (N), or angles (rad) or lengths (m) of all motors, in order, at their times."""
-
-    topic: str
-    time: Float[np.ndarray, " n"]
-    tension: Float[np.ndarray, "n tendons"]
-
-    def __repr__(self) -> str:
-        tendons = count_of(self.tension.shape[-1], "tendon")
-        return f"Tensions of {tendons} (topic {self.topic}): {count_of(len(self.time), 'row')}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -212,7 +175,7 @@ class Recording:
             raise RecordingError(f"tensions is {kind!r}; allowed is measured, commanded or none")
         if kind == "none":
             time = self.bodies[0].time
-            return Tensions("", time, np.zeros((len(time), 0)))
+            return Tensions(time, np.zeros((len(time), 0)))
         driver = self.tension if kind == "measured" else self.command
         if driver is None:
             raise RecordingError(f"{self.source}: there are no {kind} tensions")

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat._reprs import count_of
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, counted
 
@@ -33,7 +34,6 @@ class Stream:
     """Numbers of one topic, in the units and the order of its messages or columns.
 
     Attributes:
-        topic: name of the topic.
         stamped: measurement times (ns); -1 without a stamp.
         received: recording times (ns).
         values: poses (position and, if known, quaternion, scalar first) or tensions.
@@ -49,15 +49,50 @@ class Stream:
     remarks: tuple[Finding, ...] = ()
 
 
-class OutgoingStream(NamedTuple):
-    """Numbers of a topic to be written.
+@dataclasses.dataclass(frozen=True, eq=False)
+class Body:
+    """Poses of a body from motion capture, at the times of its frames.
+
+    To be written, they are in motion capture's frame and with the body's own axes. In a `Recording` they are
+    in the robot's frame, orientations are those of the rod's local frame, and times begin with the recording.
 
     Attributes:
-        topic: name of the topic.
-        role: role of the numbers.
-        time: times (s).
-        values: poses (position, and quaternion if known), tensions or commands.
-        source: the topic's entry in the configuration; None for poses.
+        time: times, increasing (s).
+        position: positions (m).
+        quaternion: orientations, scalar first; None if unknown.
+        name: name in reports.
+        topic: topic of its poses.
+        fraction: its place on the rod, as a fraction of the length; NaN for the base.
+    """
+
+    time: Float[np.ndarray, " n"]
+    position: Float[np.ndarray, "n 3"]
+    quaternion: Float[np.ndarray, "n 4"] | None = None
+    name: str = ""
+    topic: str = ""
+    fraction: float = float("nan")
+
+    def __repr__(self) -> str:
+        return f"Body {self.name} at {self.fraction:.4g} of the length: {count_of(len(self.time), 'pose')}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Tensions:
+    """Tensions of all tendons (N), or angles (rad) or lengths (m) of all motors, the first one first."""
+
+    time: Float[np.ndarray, " n"]
+    tension: Float[np.ndarray, "n tendons"]
+    topic: str = ""
+
+    def __repr__(self) -> str:
+        tendons = count_of(self.tension.shape[-1], "tendon")
+        return f"Tensions of {tendons} (topic {self.topic}): {count_of(len(self.time), 'row')}"
+
+
+class OutgoingStream(NamedTuple):
+    """Numbers of a topic to be written: times (s), and poses, tensions or commands.
+
+    `source` is the topic's entry in the configuration; None for poses.
     """
 
     topic: str
@@ -70,11 +105,8 @@ class OutgoingStream(NamedTuple):
 class Outgoing(NamedTuple):
     """Recording to be written.
 
-    Attributes:
-        config: configuration of its topics.
-        streams: numbers of the topics.
-        start: time zero on a bag's clock (s since 1970); tables begin at zero.
-        delays: delay from stamp to recording (s) by topic; zero by default.
+    `start` is time zero on a bag's clock (s since 1970); tables begin at zero. `delays` are from stamp to
+    recording (s) by topic, zero by default.
     """
 
     config: RecordingConfig

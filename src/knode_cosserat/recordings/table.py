@@ -58,15 +58,11 @@ _LATEST = 9e9
 
 
 class Table(NamedTuple):
-    """Content of a table.
+    """Content of a table: texts by key, such as the source, and columns by title.
 
-    Attributes:
-        metadata: texts by key, such as the source.
-        numbers: columns by title. A column that is not of numbers is text.
-        findings: findings from reading it.
-        bodies: bodies of an export of motion capture, whose format states names, units and axes; its columns
-            have this package's titles and units. Empty for other tables.
-        up: axis of the file that points up.
+    A column that is not of numbers is text. `bodies` are those of an export of motion capture, whose format
+    states names, units and axes; its columns have this package's titles and units. `up` is the axis that
+    points up.
     """
 
     metadata: dict[str, str]

@@ -9,26 +9,23 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat.recordings.config import TENSION_UNITS, RecordingConfig
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.write import MocapPoses, Pulls, write_recording, writer_of
+from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.rods.tendon_robots import TendonRod, VirtualRobot
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.time import LIGHTLY_DAMPED
 from knode_cosserat.trajectory import Trajectory
 
-if TYPE_CHECKING:
-    from scipy.spatial.transform import Rotation
-
 #: one gram-force (N)
-GRAM = TENSION_UNITS["gf"]
+GRAM = controls.TENSION_UNITS["gf"]
 #: the paper's signals: rest tension, amplitude of sines, range of random ones (gf); rest durations (s)
 REST, SWING, HIGHEST, RESTING, BEFORE_STEP = 500.0, 300.0, 700.0, 1.0, 2.0
 #: period of commands, and hold time of random ones (s)
@@ -127,7 +124,7 @@ def record_virtual(
 # commands and tensions
 
 
-def commands(signal: str, seconds: float) -> Pulls:
+def commands(signal: str, seconds: float) -> Tensions:
     """Return the commands of a signal (see `record_virtual`): whole grams-force, in N, every 50 ms."""
     time = np.round(np.arange(0.0, seconds - 1e-9, COMMANDED), 9)
     grams = np.full((len(time), 4), REST)
@@ -155,7 +152,7 @@ def commands(signal: str, seconds: float) -> Pulls:
         used = newtons[:count]
         grams[len(time) - count : len(time) - count + len(used)] = used / GRAM
         grams[len(time) - count + len(used) :] = grams[len(time) - count + len(used) - 1]
-    return Pulls(time, np.round(grams) * GRAM)
+    return Tensions(time, np.round(grams) * GRAM)
 
 
 def _plain_number(text: str) -> float | None:
@@ -166,7 +163,7 @@ def _plain_number(text: str) -> float | None:
     return number if np.isfinite(number) else None
 
 
-def lagged(sent: Pulls, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:
+def lagged(sent: Tensions, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:
     """Return tensions (N) at evenly spaced times (s): the held commands after a first-order lag.
 
     The result is exact if each command's time is one of these times.
@@ -182,7 +179,7 @@ def lagged(sent: Pulls, time: Float[np.ndarray, " n"], lag: float) -> Float[np.n
     return np.array(followed)
 
 
-def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
+def driven(sent: Tensions, lag: float, robot: TendonRod) -> Trajectory:
     """Return the motion of a robot under commands, in rows 10 ms apart."""
     robot = robot.replace(nodes=PLANT_NODES)
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
@@ -199,52 +196,43 @@ def driven(sent: Pulls, lag: float, robot: TendonRod) -> Trajectory:
 
 
 def simulated_sensors(
-    truth: Trajectory, sent: Pulls, seed: int, sensors: Sensors
-) -> tuple[dict[str, MocapPoses], Pulls]:
+    truth: Trajectory, sent: Tensions, seed: int, sensors: Sensors
+) -> tuple[dict[str, Body], Tensions]:
     """Return simulated motion capture (poses by the paper's marker names) and load cells of a motion."""
+    from scipy.spatial.transform import Rotation
+
     random = np.random.default_rng(seed)
     time = np.round(np.asarray(truth.time), 9)
     config = RecordingConfig.paper_robot()
     assert config.base is not None
     clamped_end = random.uniform([-0.5, -0.5, 0.8], [0.5, 0.5, 1.2])
     kept = random.uniform(size=len(time)) >= sensors.lost
+
+    def seen(place: np.ndarray, turn: np.ndarray, swap: float | None) -> Body:
+        """Return noisy poses of a body with randomly rotated axes, without its lost frames."""
+        axes: Rotation = Rotation.from_quat(random.normal(size=4))
+        # some frames are lost for one body only
+        shown = kept & (random.uniform(size=len(time)) >= sensors.lost / 4)
+        shaken = Rotation.from_rotvec(random.normal(0.0, sensors.turn_noise, (len(time), 3)))
+        turned = shaken * Rotation.from_quat(turn, scalar_first=True) * axes
+        late = time >= (np.inf if swap is None else swap)
+        if late.any():
+            quarter = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
+            turned = Rotation.concatenate([turned[~late], turned[late] * quarter])
+        position = place + random.normal(0.0, sensors.position_noise, place.shape)
+        return Body(time[shown], position[shown], turned.as_quat(scalar_first=True)[shown])
+
     poses = {}
     for k, marker in enumerate(config.markers):
         node = round(marker.fraction * (np.shape(truth.y)[-2] - 1))
         place, turn = np.asarray(truth.position)[:, node], np.asarray(truth.quaternion)[:, node]
-        swap = sensors.swap if k == 2 else None
-        poses[marker.name] = _seen(time, place + clamped_end, turn, kept, swap, random, sensors)
+        poses[marker.name] = seen(place + clamped_end, turn, sensors.swap if k == 2 else None)
     above = clamped_end + np.array([0.0, 0.0, config.base.height])
     upright = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
-    poses["base"] = _seen(time, np.tile(above, (len(time), 1)), upright, kept, None, random, sensors)
+    poses["base"] = seen(np.tile(above, (len(time), 1)), upright, None)
     stamps = np.round(np.arange(0.0, time[-1] - 1e-9, sensors.tension_period), 9)
     fine = np.round(np.arange(0.0, time[-1] + 1e-9, PLANT_STEP), 9)
     true = lagged(sent, fine, sensors.lag)[np.round(stamps / PLANT_STEP).astype(int)]
     noisy = true + random.normal(0.0, sensors.tension_noise, true.shape)
     step = sensors.tension_step
-    return poses, Pulls(stamps, np.round(noisy / step) * step if step > 0.0 else noisy)
-
-
-def _seen(
-    time: Float[np.ndarray, " n"],
-    place: Float[np.ndarray, "n 3"],
-    turn: Float[np.ndarray, "n 4"],
-    kept: np.ndarray,
-    swap: float | None,
-    random: np.random.Generator,
-    sensors: Sensors,
-) -> MocapPoses:
-    """Return noisy poses of a body with randomly rotated axes, without its lost frames."""
-    from scipy.spatial.transform import Rotation
-
-    axes: Rotation = Rotation.from_quat(random.normal(size=4))
-    # some frames are lost for one body only
-    kept = kept & (random.uniform(size=len(time)) >= sensors.lost / 4)
-    shaken = Rotation.from_rotvec(random.normal(0.0, sensors.turn_noise, (len(time), 3)))
-    seen = shaken * Rotation.from_quat(turn, scalar_first=True) * axes
-    if swap is not None:
-        quarter = Rotation.from_rotvec([0.0, 0.0, np.pi / 2])
-        late = time >= swap
-        seen = Rotation.concatenate([seen[~late], seen[late] * quarter]) if late.any() else seen
-    position = place + random.normal(0.0, sensors.position_noise, place.shape)
-    return MocapPoses(time[kept], position[kept], seen.as_quat(scalar_first=True)[kept])
+    return poses, Tensions(stamps, np.round(noisy / step) * step if step > 0.0 else noisy)

@@ -2,59 +2,34 @@
 
 from __future__ import annotations
 
-import dataclasses
 import sqlite3
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
+from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.config import (
     POSITION_UNITS,
-    TENSION_UNITS,
     CommandSource,
     RecordingConfig,
     TensionSource,
 )
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import formats, written_suffixes
-from knode_cosserat.recordings.streams import Outgoing, OutgoingStream
+from knode_cosserat.recordings.streams import Body, Outgoing, OutgoingStream, Tensions
 
 #: default of time zero on the clock of a bag (s since 1970)
 START = 1_720_000_000
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
-class MocapPoses:
-    """Poses of a body from motion capture, in motion capture's frame and with the body's own axes.
-
-    Attributes:
-        time: times (s), increasing.
-        position: positions (m).
-        quaternion: orientations, scalar first; None if only positions are known.
-    """
-
-    time: Float[np.ndarray, " n"]
-    position: Float[np.ndarray, "n 3"]
-    quaternion: Float[np.ndarray, "n 4"] | None = None
-
-
-@dataclasses.dataclass(frozen=True, eq=False)
-class Pulls:
-    """Tensions (N), tendon 1 first, and the times of their measurement or command (s)."""
-
-    time: Float[np.ndarray, " n"]
-    tension: Float[np.ndarray, "n tendons"]
-
-
 def write_recording(
     path: str | Path,
     config: RecordingConfig,
-    poses: Mapping[str, MocapPoses],
-    tension: Pulls | None = None,
-    command: Pulls | None = None,
+    poses: Mapping[str, Body],
+    tension: Tensions | None = None,
+    command: Tensions | None = None,
     *,
     start: int = START,
     delays: Mapping[str, float] | None = None,

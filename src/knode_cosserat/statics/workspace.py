@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from knode_cosserat import named_controls
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import quantity, robot_text, wrapped
+from knode_cosserat.controls import titles
 from knode_cosserat.io import container
 from knode_cosserat.io.container import Variable
 from knode_cosserat.rods.system import System
@@ -115,7 +115,7 @@ class Workspace:
 
     def _netcdf(self, arrays: dict[str, np.ndarray]) -> bytes:
         labels = {
-            "control": ("", f"control: {', '.join(named_controls.titles(self.system.control_layout))}"),
+            "control": ("", f"control: {', '.join(titles(self.system.control_layout))}"),
             "position": ("m", "position of the tip, global frame"),
             "quaternion": ("1", "orientation of the tip, scalar first"),
             "result": ("1", "how it was solved; below zero: not solved"),
@@ -138,7 +138,7 @@ class Workspace:
         for name, array in arrays.items():
             wide = array.reshape(len(array), -1)
             if name == "control":
-                names += named_controls.titles(self.system.control_layout)
+                names += titles(self.system.control_layout)
             else:
                 names += [name] if array.ndim == 1 else [f"{name}_{i}" for i in range(wide.shape[1])]
             columns += list(wide.T)

@@ -97,7 +97,7 @@ class Sweep:
     Attributes:
         robots: a catalog name, a robot or model file, a system, or a list of these. An entry
             {"robot": NAME, "set": {PARAMETER: VALUE}} has changed parameters, also such as `nodes`.
-        controls: words as for `named_controls.parse`, one or several: `sine:1.5`, `base_z=ramp:0.1`, a CSV
+        controls: words as for `controls.parse`, one or several: `sine:1.5`, `base_z=ramp:0.1`, a CSV
             file. A name in braces is a varied number, as in `sine:{period}`; `{seed}` is the case's seed.
         steps: number of time steps.
         dt: time step (s).

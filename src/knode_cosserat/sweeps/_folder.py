@@ -24,13 +24,13 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat import named_controls
 from knode_cosserat._files.json_text import json_checksum, parse_json
 from knode_cosserat._files.limits import excess
 from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat._jax import machine_name
+from knode_cosserat.controls import titles
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.robot_file import format_robot
@@ -95,7 +95,7 @@ def _manifest_of(plan: Plan) -> dict[str, Any]:
         "robots": [
             {
                 "label": entry.label, "text": _robot_text(system),
-                "controls": named_controls.titles(system.control_layout), "columns": _columns(plan, robot),
+                "controls": titles(system.control_layout), "columns": _columns(plan, robot),
             }
             for robot, (entry, system) in enumerate(zip(sweep.robots, plan.systems, strict=True))
         ],

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import jax
 import numpy as np
 
-from knode_cosserat import named_controls
+from knode_cosserat import controls
 from knode_cosserat._files.json_text import json_checksum
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
@@ -270,7 +270,7 @@ def _fixed_controls(sweep: Sweep, systems: tuple[System, ...]) -> dict[tuple[int
     for robot, system in enumerate(systems):
         for w, word in enumerate(sweep.controls):
             if not placeholders(word):
-                fixed[robot, w] = named_controls.parse(system, word, sweep.steps, sweep.dt)
+                fixed[robot, w] = controls.parse(word, sweep.steps, sweep.dt, system)
                 continue
             numbers = trial | {"seed": np.arange(3)}
             _, refused = case_controls(system, word, sweep.steps, sweep.dt, numbers, 3)

@@ -1,6 +1,6 @@
 """Controls of many cases at once, from one word with varied numbers.
 
-`named_controls.parse` takes some 90 µs a case, a twentieth of the solution of 20 steps. The usual signals are
+`controls.parse` takes some 90 µs a case, a twentieth of the solution of 20 steps. The usual signals are
 therefore evaluated for all cases at once. Other words, and cases that `parse` may refuse, go through `parse`
 one by one; tests compare both.
 """
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat import controls, named_controls
+from knode_cosserat import controls
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.controls import ramp_values, sine_values, step_times, step_values
 from knode_cosserat.rods.layout import Layout
@@ -62,7 +62,7 @@ def case_controls(
         # a Python number prints all its digits
         text = word.format(**{name: value[k].item() for name, value in varied.items()})
         try:
-            values[k] = named_controls.parse(robot, text, steps, dt)
+            values[k] = controls.parse(text, steps, dt, robot)
         except controls.ControlsError as error:
             values[k], refused[int(k)] = 0.0, str(error)
     return values, refused
@@ -73,10 +73,10 @@ def _named(
 ) -> Array | None:
     """Return the controls of all cases; None if the word is not `NAME=SIGNAL;…` with usual signals.
 
-    `times` (s) are those of held controls, and of displacements and rotations, as in `named_controls`.
+    `times` (s) are those of held controls, and of displacements and rotations, as in `parse_signals`.
     """
-    controls = np.full((count, len(times[0]), layout.size), np.nan)
-    labels, free = named_controls.labels(layout), np.ones(layout.size, dtype=bool)
+    rows = np.full((count, len(times[0]), layout.size), np.nan)
+    labels, free = controls.labels(layout), np.ones(layout.size, dtype=bool)
     for entry in word.split(";"):
         name, _, text = (part.strip() for part in entry.partition("="))
         values = _numbers_of(text, numbers, _SIGNALS)
@@ -87,9 +87,9 @@ def _named(
             return None
         free[columns] = False
         t = times[int(np.max(layout.moving[columns]))]
-        controls[:, :, columns] = _SIGNALS[text.partition(":")[0]][0](t, *values)[:, :, None]
-    controls[:, :, free] = 0.0
-    return controls
+        rows[:, :, columns] = _SIGNALS[text.partition(":")[0]][0](t, *values)[:, :, None]
+    rows[:, :, free] = 0.0
+    return rows
 
 
 def _tensions(tendons: int, word: str, t: Array, numbers: Mapping[str, Array], count: int) -> Array | None:

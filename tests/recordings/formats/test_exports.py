@@ -7,15 +7,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings import (
-    BaseSource,
-    ColumnMap,
-    MarkerSource,
-    RecordingConfig,
-    RecordingError,
-    TensionSource,
-    load_recording,
-)
+from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
+from knode_cosserat.recordings.config import BaseSource, ColumnMap, MarkerSource, TensionSource
 from knode_cosserat.recordings.formats import format_of, formats
 from tests.recordings.formats import exported
 

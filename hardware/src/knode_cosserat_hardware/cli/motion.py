@@ -117,7 +117,6 @@ def record(
 def _tension_rows(controls: str, seconds: float | None, dt: float | None, count: int) -> tuple[Any, float]:
     """Return tensions (N) in rows, and the time between them (s)."""
     import knode_cosserat as kc
-    from knode_cosserat.rods.layout import Layout
 
     if os.path.isfile(controls):
         step = float(kc.controls.load(controls).dt) if dt is None else dt
@@ -127,8 +126,7 @@ def _tension_rows(controls: str, seconds: float | None, dt: float | None, count:
         if not 0.0 < step <= 10.0:
             raise ValueError(f"--dt must be between 0 and 10 s (got {step:g})")
         steps = round((10.0 if seconds is None else seconds) / step)
-    layout = Layout(("tension", count, "N", "tendon tension"))
-    return np.asarray(kc.named_controls.parse(layout, controls, steps, step)), step
+    return np.asarray(kc.controls.parse(controls, steps, step, count)), step
 
 
 def _read_until(end: float, machine: OpenedDriver, recorder: Any, poses: Any) -> None:

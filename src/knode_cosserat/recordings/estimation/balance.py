@@ -64,7 +64,9 @@ def loads_of(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[np.nd
 def _loads(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[Any, "T P y"]:
     where = robot.y_layout.indices(LOADS)
 
-    def one(t: Any, control: Any, y: Any, y_t: Any, z: Any, z_t: Any) -> Any:
+    def one(row: KnownRows) -> Any:
+        t, control, y, y_t, z, z_t = row
+
         def known_history(j: Any) -> History:
             # the rates are known, not computed from c0 and the history
             return History(jnp.zeros(()), y_t[j], z_t[j], jnp.zeros_like(y_t[j]))
@@ -89,7 +91,7 @@ def _loads(robot: System, s: Float[Any, " P"], rows: KnownRows) -> Float[Any, "T
         loads = jnp.concatenate([pairs[::-1].reshape(-1, last.shape[0]), last[None]])
         return y.at[:, where].set(loads)
 
-    return jax.vmap(one)(*rows)
+    return jax.vmap(one)(rows)
 
 
 def _at_tip(robot: System, t: Any, control: Any, y: Any, history: History) -> Any:
@@ -119,40 +121,38 @@ def _strains(robot: System, rows: KnownRows, coefficients: Float[Any, "4"]) -> F
     s = jnp.linspace(0.0, 1.0, robot.nodes) * robot.length
     c0, c1, c2, d1 = coefficients
 
-    def at_nodes(c0: Any, t: Any, control: Any, y: Any, y_t: Any, hz: Any) -> Any:
+    def at_nodes(c0: Any, row: KnownRows, hz: Any) -> Any:
+        t, control = row.t, row.control
+
         def one(s: Any, y: Any, y_t: Any, hz: Any) -> Any:
             history = History(c0, y_t - c0 * y, hz, jnp.zeros_like(y))
             return semi_discrete.strains(robot, Point(s, t, y, control, history))
 
-        return jax.vmap(one)(s, y, y_t, hz)
+        return jax.vmap(one)(s, row.y, row.y_t, hz)
 
     nothing = jnp.zeros(rows.z.shape[1:])
-    first = at_nodes(jnp.zeros(()), rows.t[0], rows.control[0], rows.y[0], rows.y_t[0], nothing)
+    first = at_nodes(jnp.zeros(()), jax.tree.map(lambda values: values[0], rows), nothing)
 
-    def step(history: Any, row: Any) -> Any:
+    def step(history: Any, row: KnownRows) -> Any:
         last, earlier, rate = history
-        t, control, y, y_t = row
         hz = c1 * last + c2 * earlier + d1 * rate
-        z = at_nodes(c0, t, control, y, y_t, hz)
+        z = at_nodes(c0, row, hz)
         return (z, last, c0 * z + hz), z
 
-    rest = (rows.t[1:], rows.control[1:], rows.y[1:], rows.y_t[1:])
-    _, z = jax.lax.scan(step, (first, first, nothing), rest)
+    _, z = jax.lax.scan(step, (first, first, nothing), jax.tree.map(lambda values: values[1:], rows))
     return jnp.concatenate([first[None], z])
 
 
 def semi_discretised(
-    robot: System, t: Any, control: Any, known: Float[Any, "T N y"], settings: Settings, dt: float
+    robot: System, rows: tuple[Any, Any, Float[Any, "T N y"]], settings: Settings, dt: float
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z at the nodes (paper eq. 14, n and m integrated backwards from the tip).
 
-    The equations are those of a simulation with Euler segments.
-
-    Rates come from the time scheme and earlier rows. The history of the first row is constant (paper,
-    section 3).
+    The equations are those of a simulation with Euler segments. Rates come from the time scheme and earlier
+    rows. The history of the first row is constant (paper, section 3). `rows` are times, controls and y.
     """
     coefficients = coefficient_table(settings, dt)[-1]
-    records = np.asarray(_semi_discretised(robot, *_padded((t, control, known)), coefficients))[: len(t)]
+    records = np.asarray(_semi_discretised(robot, *_padded(rows), coefficients))[: len(rows[0])]
     ny = robot.y_layout.size
     return records[..., :ny], records[..., ny:]
 

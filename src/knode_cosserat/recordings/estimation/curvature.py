@@ -54,15 +54,10 @@ _PROBES = 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class BodyPoses:
-    """Poses of all bodies at F times; masked values are arbitrary but finite.
+class CapturedPoses:
+    """Poses of all bodies at F times (s), quaternions scalar first; unseen values are arbitrary but finite.
 
-    Attributes:
-        time: times (s), increasing.
-        position: positions (m).
-        quaternion: orientations, scalar first.
-        placed: True where a position was seen.
-        turned: True where an orientation was seen.
+    `placed` and `turned` are True where a position or an orientation was seen.
     """
 
     time: Float[np.ndarray, " F"]
@@ -73,17 +68,14 @@ class BodyPoses:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class CurvatureFit:
-    """Fitted curvature.
+class _CurvatureFit:
+    """Fitted curvature: splines in time and their coefficients.
 
-    Attributes:
-        splines: splines in time.
-        curves: coefficients of the splines.
-        stretch: ratio of the rod's length to its model's length.
-        noise: standard deviations of a coordinate (m) and of an angle (rad).
+    `stretch` is the ratio of the rod's length to its model's; `noise` are standard deviations of a coordinate
+    (m) and of an angle (rad).
     """
 
-    splines: Splines
+    splines: _Splines
     curves: Float[np.ndarray, "n K"]
     stretch: float
     noise: tuple[float, float]
@@ -93,10 +85,12 @@ class CurvatureFit:
         return np.stack([np.asarray(self.splines.design(time, order) @ self.curves) for order in range(3)])
 
 
-def fitted(rod: RodGeometry, poses: BodyPoses, stretch: float, noise: tuple[float, float]) -> CurvatureFit:
+def fitted(
+    rod: RodGeometry, poses: CapturedPoses, stretch: float, noise: tuple[float, float]
+) -> _CurvatureFit:
     """Return the most likely curvature over time; `noise` and `stretch` are initial values."""
     usual = float(np.median(np.diff(poses.time)))
-    splines = Splines.of(poses.time[0], poses.time[-1], max(SPACING, usual))
+    splines = _Splines.of(poses.time[0], poses.time[-1], max(SPACING, usual))
     design = splines.design(poses.time)
     groups = kinematics.mode_groups()
     ridge = np.full(rod.modes, 1.0 / LARGEST**2)
@@ -119,7 +113,7 @@ def fitted(rod: RodGeometry, poses: BodyPoses, stretch: float, noise: tuple[floa
         wanted = residual / sigma + (rows @ a[..., None])[..., 0]
         back = np.swapaxes(rows, 1, 2)
         H, g = back @ rows, (back @ wanted[..., None])[..., 0]
-        system = Banded(splines, design, H, g, splines.roots_of(profile))
+        system = _Banded(splines, design, H, g, splines.roots_of(profile))
         if precision is None:
             share = np.einsum("fkk->k", H) / len(H) / usual
             shared = _shared(share / (2 * np.pi * BEGIN) ** (2 * ORDER), groups)
@@ -144,7 +138,7 @@ def fitted(rod: RodGeometry, poses: BodyPoses, stretch: float, noise: tuple[floa
         curves = new
         if correction >= CORRECTIONS and change < CLOSE:
             break
-    return CurvatureFit(splines, curves, stretch, noise)
+    return _CurvatureFit(splines, curves, stretch, noise)
 
 
 def _shared(values: Float[np.ndarray, " K"], groups: np.ndarray) -> Float[np.ndarray, " groups"]:
@@ -152,7 +146,7 @@ def _shared(values: Float[np.ndarray, " K"], groups: np.ndarray) -> Float[np.nda
 
 
 def _likelier(
-    system: Banded, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"], groups: np.ndarray
+    system: _Banded, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"], groups: np.ndarray
 ) -> tuple[Float[np.ndarray, " K"], float]:
     """Return an updated τ for every mode, and the effective number of parameters.
 
@@ -194,7 +188,7 @@ def _decaying(precision: Float[np.ndarray, " groups"], power: float) -> Float[np
 
 
 def _profile(
-    splines: Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
+    splines: _Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
 ) -> Float[np.ndarray, " points"]:
     """Return the prior's relative precision over time: lower where the jerk is large, as after a step."""
     jerk = splines.roots[: splines.points] @ curves
@@ -207,7 +201,7 @@ def _profile(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Splines:
+class _Splines:
     """B-splines on evenly spaced knots.
 
     Attributes:
@@ -222,7 +216,7 @@ class Splines:
     roots: Any
 
     @classmethod
-    def of(cls, start: float, end: float, spacing: float) -> Splines:
+    def of(cls, start: float, end: float, spacing: float) -> _Splines:
         """Return splines from `start` to `end` with a spacing of knots up to `spacing` (s)."""
         pieces = max(1, int(np.ceil((end - start) / spacing - 1e-9)))
         step = (end - start) / pieces
@@ -259,12 +253,12 @@ class Splines:
         return values.tocsr()
 
 
-class Banded:
+class _Banded:
     """Banded linear system of a curve: data of the frames plus the prior."""
 
     def __init__(
         self,
-        splines: Splines,
+        splines: _Splines,
         design: Any,
         H: Float[np.ndarray, "F K K"],
         g: Float[np.ndarray, "F K"],

@@ -12,10 +12,11 @@ from scipy.interpolate import CubicSpline
 
 from knode_cosserat.recordings.estimation import balance, curvature, kinematics
 from knode_cosserat.recordings.estimation.balance import KnownRows, packed_fields
-from knode_cosserat.recordings.estimation.curvature import BodyPoses
+from knode_cosserat.recordings.estimation.curvature import CapturedPoses
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.recording import Body, Recording
+from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.recordings.streams import Body
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import MEASURED, Settings
 from knode_cosserat.solvers.space import Euler
@@ -73,7 +74,7 @@ def estimate_states(
         RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, or has
             too few bodies or no orientations; or the method or a time is not allowed.
     """
-    parts = _parts(recording, robot, method, dt, start, end)
+    parts = _parts(recording, robot, method, (dt, start, end))
     if len(parts) > 1:
         times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in parts)
         raise RecordingError(
@@ -96,23 +97,26 @@ def estimate_parts(
     Raises:
         RecordingError: as in `estimate_states`, except that several parts are allowed.
     """
-    return [_estimated(part, robot, method) for part in _parts(recording, robot, method, dt, start, end)]
+    parts = _parts(recording, robot, method, (dt, start, end))
+    return [_estimated(part, robot, method) for part in parts]
 
 
-def _parts(
-    recording: Recording | Measurements,
-    robot: System,
-    method: str,
-    dt: float,
-    start: float | None,
-    end: float | None,
-) -> list[RecordingPart]:
+#: time from row to row, and times of the first and of the last row (s)
+_Times = tuple[float, float | None, float | None]
+
+
+def _parts(recording: Recording | Measurements, robot: System, method: str, times: _Times) -> list[_Part]:
+    """Return the parts with enough rows for an estimation.
+
+    Raises:
+        RecordingError: an argument is not allowed, the recording does not fit the robot, or has too few data.
+    """
     if method not in get_args(Method):
         raise RecordingError(f'method is {method!r}; allowed is "best" or "paper"')
     if not isinstance(robot, System):
         raise RecordingError(f"robot is a {type(robot).__name__}; allowed is a robot or a model")
     balance.require_rod(robot)
-    parts = _parts_of(recording, robot, dt, start, end)
+    parts = _pieces(recording, robot, times)
     for part in parts:
         ratio = _stretch(part, robot)
         if not 1.0 / UNLIKE < ratio < UNLIKE:
@@ -123,14 +127,14 @@ def _parts(
     return parts
 
 
-def _stretch(part: RecordingPart, robot: System) -> float:
+def _stretch(part: _Part, robot: System) -> float:
     """Return the ratio of the rod's length to its model's, from the straightest row."""
     places = part.fractions * float(robot.length)
     reach = np.linalg.norm(part.rows.position[:, part.rows.fractions > 0.0], axis=2)
     return float(np.nanmax(reach @ places / (places @ places)))
 
 
-def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
+def _estimated(part: _Part, robot: System, method: str) -> Trajectory:
     tension, settings = part.rows.tension, None
     # the tension held from the row before; for the first row, its own
     control = np.concatenate([tension[:1], tension[:-1]])
@@ -155,9 +159,7 @@ def _estimated(part: RecordingPart, robot: System, method: str) -> Trajectory:
     )
 
 
-def _best(
-    part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"]
-) -> tuple[np.ndarray, np.ndarray]:
+def _best(part: _Part, robot: System, control: Float[np.ndarray, "T c"]) -> tuple[np.ndarray, np.ndarray]:
     """Return y and z at the nodes: the motion, n and m from the robot's balance, and v from its law."""
     y0, z0 = (np.asarray(values, dtype=float) for values in robot.rest(jnp.zeros(())))
     h, p = y0[robot.y_layout.slice("h")], y0[robot.y_layout.slice("p")]
@@ -190,7 +192,7 @@ def _best(
 
 
 def _paper_states(
-    part: RecordingPart, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
+    part: _Part, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
     rows = part.rows
@@ -214,7 +216,7 @@ def _paper_states(
     q = (np.swapaxes(R, -1, -2) @ p_t[..., None])[..., 0]
     w = 2.0 * kinematics.hamilton(h * np.array([1.0, -1.0, -1.0, -1.0]), h_t)[..., 1:]
     known = packed_fields(robot, "y", p=p, h=h, q=q, w=w)
-    return balance.semi_discretised(robot, rows.time, control, known, settings, round(dt, 9))
+    return balance.semi_discretised(robot, (rows.time, control, known), settings, round(dt, 9))
 
 
 def _along(
@@ -242,28 +244,19 @@ def _along(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class RecordingPart:
-    """An unbroken part of a recording.
+class _Part:
+    """Unbroken part of a recording: the rows to estimate, and the bodies away from the clamped end.
 
-    Attributes:
-        rows: measurements at the times to estimate.
-        poses: poses of the bodies away from the clamped end, at the full rate.
-        fractions: places of these bodies, as fractions of the rod's length.
+    `poses` are at motion capture's own rate, `fractions` the places of the bodies.
     """
 
     rows: Measurements
-    poses: BodyPoses
+    poses: CapturedPoses
     fractions: Float[np.ndarray, " M"]
 
 
-def _parts_of(
-    recording: Recording | Measurements, robot: System, dt: float, start: float | None, end: float | None
-) -> list[RecordingPart]:
-    """Return the parts with enough rows for an estimation.
-
-    Raises:
-        RecordingError: the recording does not fit the robot, or has too few data.
-    """
+def _pieces(recording: Recording | Measurements, robot: System, times: _Times) -> list[_Part]:
+    dt, start, end = times
     if isinstance(recording, Recording):
         rows = recording.sampled(dt, start, end)
     elif isinstance(recording, Measurements):
@@ -293,7 +286,7 @@ def _parts_of(
             if isinstance(recording, Recording)
             else _of_rows(piece, used)
         )
-        parts.append(RecordingPart(piece, poses, rows.fractions[used]))
+        parts.append(_Part(piece, poses, rows.fractions[used]))
     return parts
 
 
@@ -317,16 +310,16 @@ def _check(rows: Measurements, robot: System) -> None:
         )
 
 
-def _of_rows(rows: Measurements, used: np.ndarray) -> BodyPoses:
+def _of_rows(rows: Measurements, used: np.ndarray) -> CapturedPoses:
     position, quaternion = rows.position[:, used], rows.quaternion[:, used]
     turned = np.isfinite(quaternion).all(axis=2)
     filled = np.where(turned[..., None], quaternion, [1.0, 0.0, 0.0, 0.0])
     # bridged poses are not observations
     seen = rows.measured[:, used]
-    return BodyPoses(rows.time, position, filled, seen, turned & seen)
+    return CapturedPoses(rows.time, position, filled, seen, turned & seen)
 
 
-def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> BodyPoses:
+def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> CapturedPoses:
     """Return the poses of all bodies, grouped by frame."""
     first, last = time[0] - AROUND, time[-1] + AROUND
     inside = [body.time[(body.time >= first) & (body.time <= last)] for body in bodies]
@@ -341,4 +334,4 @@ def _frames(bodies: list[Body], time: Float[np.ndarray, " T"]) -> BodyPoses:
         position[row, k], placed[row, k] = body.position[inside_rows], True
         if body.quaternion is not None:
             quaternion[row, k], turned[row, k] = body.quaternion[inside_rows], True
-    return BodyPoses(frames, position, quaternion, placed, turned)
+    return CapturedPoses(frames, position, quaternion, placed, turned)

@@ -112,7 +112,7 @@ def _basis(places: Float[np.ndarray, "..."]) -> Float[np.ndarray, "... 3 K"]:
     return basis
 
 
-class RodShape(NamedTuple):
+class _RodShape(NamedTuple):
     """Shape of a rod at F times: curvature (1/m), orientation (also as a matrix) and position (m)."""
 
     u: Float[np.ndarray, "F P 3"]
@@ -121,7 +121,7 @@ class RodShape(NamedTuple):
     p: Float[np.ndarray, "F P 3"]
 
 
-def rod_shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> RodShape:
+def rod_shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> _RodShape:
     """Return the shape of a rod from the curvature's coefficients a (1/m); order 4 in the segments."""
     half = np.diff(rod.s)
     u1, u2 = (np.einsum("hck,fk->fhc", rod.gauss[:, i], a, optimize=True) for i in (0, 1))
@@ -136,11 +136,11 @@ def rod_shape(rod: RodGeometry, a: Float[np.ndarray, "F K"], stretch: float) -> 
         h[:, j + 1] = hamilton(h[:, j], steps[:, j])
     R = matrices(h)
     p = rod.origin + cumulative(rod, stretch * R[..., 2])
-    return RodShape(np.einsum("pck,fk->fpc", rod.basis, a, optimize=True), h, R, p)
+    return _RodShape(np.einsum("pck,fk->fpc", rod.basis, a, optimize=True), h, R, p)
 
 
 def sensitivity(
-    rod: RodGeometry, shape: RodShape
+    rod: RodGeometry, shape: _RodShape
 ) -> tuple[Float[np.ndarray, "F M 3 K"], Float[np.ndarray, "F M 3 K"]]:
     """Return derivatives of the bodies' poses by the coefficients: rotations (global, rad), shifts (m)."""
     weights = _weights(rod)  # (M, P)
@@ -160,10 +160,10 @@ def sensitivity(
     return turn, shift
 
 
-class RodMotion(NamedTuple):
+class _RodMotion(NamedTuple):
     """Motion of a rod at F times; q, w and their rates are in the material frame, in SI units."""
 
-    shape: RodShape
+    shape: _RodShape
     q: Float[np.ndarray, "F P 3"]
     w: Float[np.ndarray, "F P 3"]
     q_t: Float[np.ndarray, "F P 3"]
@@ -171,7 +171,7 @@ class RodMotion(NamedTuple):
     u_t: Float[np.ndarray, "F P 3"]
 
 
-def motion(rod: RodGeometry, a: Float[np.ndarray, "3 F K"], stretch: float) -> RodMotion:
+def motion(rod: RodGeometry, a: Float[np.ndarray, "3 F K"], stretch: float) -> _RodMotion:
     """Return shape, velocities and accelerations from the coefficients and their first two rates."""
     shape = rod_shape(rod, a[0], stretch)
     u_t, u_tt = (np.einsum("pck,fk->fpc", rod.basis, rate, optimize=True) for rate in a[1:])
@@ -185,7 +185,7 @@ def motion(rod: RodGeometry, a: Float[np.ndarray, "3 F K"], stretch: float) -> R
     q_local, w_local = rotated(back, p_t), rotated(back, w)
     # rates in a rotating frame; for ω the extra term vanishes
     q_t = rotated(back, p_tt) - np.cross(w_local, q_local)
-    return RodMotion(shape, q_local, w_local, q_t, rotated(back, w_t), u_t)
+    return _RodMotion(shape, q_local, w_local, q_t, rotated(back, w_t), u_t)
 
 
 # integrals

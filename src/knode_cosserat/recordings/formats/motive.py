@@ -22,7 +22,15 @@ from pathlib import Path
 
 import numpy as np
 
-from knode_cosserat.recordings.exports import Cells, Track, export_table, length_unit, text_lines
+from knode_cosserat.recordings.exports import (
+    Columns,
+    Track,
+    cells_reader,
+    export_table,
+    length_unit,
+    quaternions_of,
+    text_lines,
+)
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.table import Table
@@ -66,7 +74,7 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         findings.append(Finding("warning", "", what))
     # the data begin after the row of axes, whose cells have no line breaks
     first = next(k for k, line in enumerate(lines) if line.startswith(("Frame", '"Frame"')))
-    cells = Cells(lines[first + 1 :], axes, delimiter, path)
+    cells = cells_reader(lines[first + 1 :], axes, delimiter, path)
     places: dict[tuple[str, str, str], dict[str, dict[str, int]]] = {}
     for k in range(2, len(axes)):
         if measures[k] in ("Position", "Rotation"):
@@ -79,10 +87,10 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
             continue
         quaternion = None
         if set("XYZW") <= set(turned):
-            quaternion = cells[[turned[axis] for axis in "WXYZ"]]
+            quaternion = cells([turned[axis] for axis in "WXYZ"])
         elif set("XYZ") <= set(turned):
             quaternion = _of_angles(cells, turned, meta.get("Rotation Type", "XYZ"), path)
-        position = scale * cells[[where[axis] for axis in "XYZ"]]
+        position = scale * cells([where[axis] for axis in "XYZ"])
         tracks.append(Track(name, position, quaternion, kind.lower() or "marker"))
     if any(set(columns.get("Rotation", {})) == set("XYZ") for columns in places.values()):
         what = (
@@ -91,11 +99,11 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         findings.append(Finding("note", "", what))
     tracks.sort(key=lambda track: [*map(str.lower, _KINDS), track.kind].index(track.kind))
     return export_table(
-        path, cells[[1]][:, 0], tracks, up="y", findings=findings, source=meta.get("Take Name", "")
+        path, cells([1])[:, 0], tracks, up="y", findings=findings, source=meta.get("Take Name", "")
     )
 
 
-def _of_angles(cells: Cells, places: dict[str, int], order: str, path: Path) -> np.ndarray:
+def _of_angles(cells: Columns, places: dict[str, int], order: str, path: Path) -> np.ndarray:
     """Return quaternions of Euler angles (degrees) about the moving axes in an order such as XYZ."""
     from scipy.spatial.transform import Rotation
 
@@ -103,12 +111,8 @@ def _of_angles(cells: Cells, places: dict[str, int], order: str, path: Path) -> 
         raise RecordingError(
             f"{path}: the rotation type is {order!r}; allowed is Quaternion, or an order as XYZ"
         )
-    angles = cells[[places[axis] for axis in order.upper()]]
-    known = np.isfinite(angles).all(axis=1)
-    quaternion = np.full((len(angles), 4), np.nan)
-    turned = Rotation.from_euler(order.upper(), angles[known], degrees=True)
-    quaternion[known] = turned.as_quat(scalar_first=True)
-    return quaternion
+    angles = cells([places[axis] for axis in order.upper()])
+    return quaternions_of(angles, lambda known: Rotation.from_euler(order.upper(), known, degrees=True))
 
 
 register(

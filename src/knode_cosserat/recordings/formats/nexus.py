@@ -26,7 +26,15 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.recordings.exports import LENGTHS, Cells, Track, export_table, text_lines
+from knode_cosserat.recordings.exports import (
+    LENGTHS,
+    Columns,
+    Track,
+    cells_reader,
+    export_table,
+    quaternions_of,
+    text_lines,
+)
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.formats.csv_table import delimiter_of
@@ -44,7 +52,7 @@ class _Section(NamedTuple):
     #: frame numbers and numbers of the samples within a frame
     frame: Float[np.ndarray, " n"]
     sample: Float[np.ndarray, " n"]
-    cells: Cells
+    cells: Columns
     #: name of the group, title and unit of each column
     groups: Sequence[str]
     titles: Sequence[str]
@@ -97,8 +105,8 @@ def _sections(lines: list[str], path: Path) -> Iterator[_Section]:
         groups, units = ([*row, *[""] * len(titles)][: len(titles)] for row in (groups, units))
         for k in range(3, len(groups)):
             groups[k] = groups[k] or groups[k - 1]
-        cells = Cells(lines[start + 5 : rows], titles, delimiter, path)
-        frame, sample = np.nan_to_num(cells[[0, 1]]).T
+        cells = cells_reader(lines[start + 5 : rows], titles, delimiter, path)
+        frame, sample = np.nan_to_num(cells([0, 1])).T
         yield _Section(rate, frame, sample, cells, groups, titles, units)
 
 
@@ -106,6 +114,8 @@ def _tracks(
     section: _Section, findings: list[Finding], path: Path
 ) -> tuple[list[Track], dict[str, np.ndarray]]:
     """Return the bodies and markers of a section, and its other columns by title."""
+    from scipy.spatial.transform import Rotation
+
     tracks, others = [], {}
     # a group is a run of columns with one name, in which no title comes twice
     begins = [
@@ -120,17 +130,18 @@ def _tracks(
         for where, rotated in (("XYZ", ()), (("TX", "TY", "TZ"), ("RX", "RY", "RZ"))):
             if not all(unit.get(axis) in LENGTHS for axis in where):
                 continue
-            position = section.cells[[places[axis] for axis in where]] * LENGTHS[unit[where[0]]]
+            position = section.cells([places[axis] for axis in where]) * LENGTHS[unit[where[0]]]
             quaternion = None
             if rotated and "RW" in places:
-                quaternion = section.cells[[places[axis] for axis in ("RW", *rotated)]]
+                quaternion = section.cells([places[axis] for axis in ("RW", *rotated)])
             elif rotated and all(axis in places for axis in rotated):
                 size = _ANGLES.get(unit["RX"].rstrip("s"))
                 if size is None:
                     raise RecordingError(
                         f"{path}: the unit of RX of {name} is {unit['RX']!r}; allowed is deg or rad"
                     )
-                quaternion = _of_vectors(size * section.cells[[places[axis] for axis in rotated]])
+                vectors = size * section.cells([places[axis] for axis in rotated])
+                quaternion = quaternions_of(vectors, Rotation.from_rotvec)
                 what = "rotations RX, RY, RZ are read as rotation vectors (helical angles)"
                 findings.append(Finding("note", name, what))
             tracks.append(Track(name, position, quaternion, "segment" if rotated else "marker"))
@@ -138,17 +149,8 @@ def _tracks(
         else:
             for title, k in places.items():
                 ending = f" [{section.units[k]}]" if section.units[k] else ""
-                others[f"{name} {title}{ending}".strip()] = section.cells[[k]][:, 0]
+                others[f"{name} {title}{ending}".strip()] = section.cells([k])[:, 0]
     return tracks, others
-
-
-def _of_vectors(vectors: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 4"]:
-    from scipy.spatial.transform import Rotation
-
-    known = np.isfinite(vectors).all(axis=1)
-    quaternion = np.full((len(vectors), 4), np.nan)
-    quaternion[known] = Rotation.from_rotvec(vectors[known]).as_quat(scalar_first=True)
-    return quaternion
 
 
 register(

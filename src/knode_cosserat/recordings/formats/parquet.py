@@ -32,7 +32,15 @@ def read_parquet(path: Path) -> Table:
     try:
         with parquet_file.open_parquet(path) as file:
             for k in range(file.metadata.num_columns):
-                _check_column(file.metadata.schema.column(k), path)
+                column = file.metadata.schema.column(k)
+                flat = column.max_repetition_level == 0 and column.path == column.name
+                logical = column.logical_type.type
+                if not flat or column.physical_type not in _NUMBERS or logical not in _PLAIN:
+                    kind = (column.physical_type if logical in _PLAIN else logical).lower()
+                    raise RecordingError(
+                        f"{path}: the column {shown(column.path)} has {kind if flat else 'lists'}; allowed "
+                        "are numbers"
+                    )
             parquet_file.require_limited_expansion(file.metadata, path)
             table = file.read()
             metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
@@ -66,17 +74,6 @@ def _pyarrow() -> Any:
     except ImportError:
         raise ImportError("Parquet files need pyarrow: pip install 'knode-cosserat[parquet]'") from None
     return pyarrow
-
-
-def _check_column(column: Any, path: Path) -> None:
-    """Raise `RecordingError` if a column has no plain numbers."""
-    flat = column.max_repetition_level == 0 and column.path == column.name
-    if not flat or column.physical_type not in _NUMBERS or column.logical_type.type not in _PLAIN:
-        kind = column.physical_type if column.logical_type.type in _PLAIN else column.logical_type.type
-        raise RecordingError(
-            f"{path}: the column {shown(column.path)} has {kind.lower() if flat else 'lists'}; allowed are "
-            "numbers"
-        )
 
 
 register(

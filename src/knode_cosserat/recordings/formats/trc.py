@@ -17,7 +17,13 @@ import re
 from collections.abc import Collection
 from pathlib import Path
 
-from knode_cosserat.recordings.exports import Cells, Track, export_table, length_unit, text_lines
+from knode_cosserat.recordings.exports import (
+    Track,
+    cells_reader,
+    export_table,
+    length_unit,
+    text_lines,
+)
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.table import Table
@@ -51,9 +57,9 @@ def read_trc(path: Path, wanted: Collection[str] = ()) -> Table:
         Finding("note", "", "TRC files do not state which axis points up; y is taken (`up` states it)")
     )
     titles = ["Frame#", "Time", *(f"{name} {axis}" for name in markers for axis in "XYZ")]
-    cells = Cells(lines[5 if has_axes else 4 :], titles, "\t", path)
-    tracks = [Track(name, scale * cells[[3 * k + 2, 3 * k + 3, 3 * k + 4]]) for k, name in enumerate(markers)]
-    return export_table(path, cells[[1]][:, 0], tracks, up="y", findings=findings)
+    cells = cells_reader(lines[5 if has_axes else 4 :], titles, "\t", path)
+    tracks = [Track(name, scale * cells([3 * k + 2, 3 * k + 3, 3 * k + 4])) for k, name in enumerate(markers)]
+    return export_table(path, cells([1])[:, 0], tracks, up="y", findings=findings)
 
 
 register(
