@@ -1,6 +1,4 @@
-"""Limits of texts, controls, references, policies and trajectories; and the setting of all limits."""
-
-import zipfile
+"""Limits of texts, controls, references and trajectories; and the setting of all limits."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -11,7 +9,6 @@ from knode_cosserat import controls
 from knode_cosserat._files import csv_rows, limits, yaml_text
 from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
-from knode_cosserat.envs import policy
 from tests.limits import Readers, assert_limited, limit_size
 
 READERS = Readers()
@@ -79,41 +76,6 @@ def reference_size(folder, patch):
     path = folder / "it.csv"
     path.write_text("t,x,y\n0,0.1,0.1\n1,0.1,0.2\n")
     return lambda: parsed_reference(str(path))
-
-
-def saved_policy(folder, compress=False):
-    path = folder / "policy.npz"
-    layers = ((np.zeros((3, 500)), np.ones(500)), (np.zeros((500, 1)), np.ones(1)))
-    policy.Policy(layers, np.zeros(3), np.ones(3)).save(path)
-    if compress:
-        with zipfile.ZipFile(path) as packed:
-            content = {each: packed.read(each) for each in packed.namelist()}
-        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
-            for name, data in content.items():
-                packed.writestr(name, data)
-    return path
-
-
-@READERS
-def policy_size(folder, patch):
-    path = saved_policy(folder)
-    limit_size(patch, policy, path)
-    return lambda: policy.Policy.load(path)
-
-
-@READERS
-def policy_size_when_unpacked(folder, patch):
-    path = saved_policy(folder, compress=True)
-    with zipfile.ZipFile(path) as packed:
-        size = sum(entry.file_size for entry in packed.infolist())
-    patch.setattr(policy, "LARGEST_FILE", size - 1)
-    return lambda: policy.Policy.load(path)
-
-
-@READERS
-def policy_layers(folder, patch):
-    patch.setattr(policy, "MOST_LAYERS", 1)
-    return lambda: policy.Policy.load(saved_policy(folder))
 
 
 @pytest.mark.parametrize("name", READERS)

@@ -16,7 +16,6 @@ from knode_cosserat.control import (
     PredictiveController,
     Sensor,
     SimulatedPlant,
-    Status,
     constant,
     controller_named,
     register_controller,
@@ -47,7 +46,7 @@ class Bend(Controller):
         x, y, _ = reference.at([time])[0]
         pull = np.roll(self.gain * np.array([x, y, -x, -y]), self.turns)
         self._control = self.limits.applied(pull, self._control, self.dt)
-        return Command(self._control, Status.OPTIMAL)
+        return Command(self._control)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -137,8 +137,11 @@ def test_commands_keep_their_limits_and_rate(environment, keys):
         ({"randomisation": {"mass": 1}}, "randomisation is dict"),
         ({"limits": kc.control.ControlLimits(5.0, 1.0)}, "low must be below high"),
         ({"actions": "increment", "limits": kc.control.ControlLimits(0.0, 9.0)}, "finite rate"),
-        ({"task": envs.Reach(position=(9.0, 0.0, 0.0))}, "cannot be reached: the nearest position found"),
-        ({"task": envs.Reach(position=(np.nan, 0.0, 0.0))}, "three finite numbers"),
+        (
+            {"task": envs.tasks.Reach(position=(9.0, 0.0, 0.0))},
+            "cannot be reached: the nearest position found",
+        ),
+        ({"task": envs.tasks.Reach(position=(np.nan, 0.0, 0.0))}, "three finite numbers"),
         ({"task": 3}, "allowed is a name"),
         ({"robot": 3}, "robot is int"),
     ],

@@ -42,7 +42,7 @@ class Command(NamedTuple):
     """Control of one period, and its reason."""
 
     control: Float[np.ndarray, " c"]
-    status: Status
+    status: Status = Status.OPTIMAL
     reason: str = ""
     #: predicted positions of the tip (N, 3), for display; None if the controller predicts nothing
     path: Any = None

@@ -18,7 +18,6 @@ from knode_cosserat.control.commands import (
     Command,
     Controller,
     ControlLimits,
-    Status,
     lagged,
     register_controller,
 )
@@ -154,7 +153,7 @@ class KoopmanController(Controller):
         if x is None:
             return self.fallback("the quadratic program was not solved")
         self._plan = self._plan + x.reshape(self._plan.shape)
-        return Command(self.limits.applied(self._plan[0], self._control, self.dt), Status.OPTIMAL)
+        return Command(self.limits.applied(self._plan[0], self._control, self.dt))
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Take over the control that acts from now on, and expect the next output."""

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_discrete_are
 
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status, register_controller
+from knode_cosserat.control.commands import Command, Controller, ControlLimits, register_controller
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import Belief, Spread, errors_along
@@ -152,7 +152,7 @@ class LQR(Controller):
         steady = np.linalg.pinv((self.model.C @ self._states)[known], rcond=1e-3) @ wanted[known]
         control = self.model.control + steady - self._gain @ (x - self._states @ steady)
         self._control = self.limits.applied(control, self._control, self.dt)
-        return Command(self._control, Status.OPTIMAL)
+        return Command(self._control)
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Predict the state under the control that acts from now on."""

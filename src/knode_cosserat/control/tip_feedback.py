@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status, register_controller
+from knode_cosserat.control.commands import Command, Controller, ControlLimits, register_controller
 from knode_cosserat.control.lqr import PRELOAD
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
@@ -92,7 +92,7 @@ class TipFeedback(Controller):
     def _applied(self, wanted: Any) -> Command:
         """Return a command within the limits."""
         self._control = self.limits.applied(wanted, self._control, self.dt)
-        return Command(self._control, Status.OPTIMAL)
+        return Command(self._control)
 
 
 @register_controller("pid", "PID of the tip's error, through the static Jacobian")

@@ -109,8 +109,7 @@ class Randomisation:
         Raises:
             ParameterError: a parameter that does not exist, or a range with values that are not allowed.
         """
-        low: dict[str, np.ndarray] = {}
-        high: dict[str, np.ndarray] = {}
+        low, high = {}, {}
         for name, distribution in self.parameters.items():
             value = value_at(robot.nominal, name)
             if value is None:
@@ -143,56 +142,6 @@ class Survey(NamedTuple):
     halfway: Float[Any, "n 3"]
     #: lateral distance (m) that is easy to reach
     reach: Float[Any, ""]
-
-
-def surveyed(robot: System, limits: ControlLimits, seed: int) -> Survey:
-    """Return a survey of a robot, from equilibria under random controls within their limits.
-
-    Raises:
-        TaskError: no equilibrium was found.
-    """
-    random = np.random.default_rng(seed)
-    low, high = np.asarray(limits.low), np.asarray(limits.high)
-    controls = low + random.uniform(size=(SURVEYED, len(low))) * (high - low)
-    # the middle of the range is the rest of tendons that pull alike
-    middle = np.tile(np.asarray(limits.safe), (SURVEYED, 1))
-    every = np.concatenate([controls, 0.5 * (controls + middle), middle[:1]])
-    found = equilibrium(robot, every, on_failure="return")
-    y = np.asarray(found.y)[:, -1, -1]
-    valid = np.asarray(found.result)[:, -1] >= 0
-    usable = valid[:SURVEYED] & valid[SURVEYED:-1]
-    if not valid[-1] or not np.any(usable):
-        raise TaskError(
-            f"{type(robot).__name__} has no equilibrium under "
-            f"{'the safe controls' if not valid[-1] else 'any of the random controls'} "
-            f"({limits.safe.tolist()}); give other limits"
-        )
-    position = np.asarray(robot.drawing.positions(y))
-    if "h" in robot.y_layout.names:
-        rotation = jax.vmap(rotation_matrix)(jnp.asarray(robot.drawing.quaternions(y)))
-        frame = np.swapaxes(np.asarray(rotation), 1, 2)
-    else:
-        frame = np.tile(np.eye(3), (len(y), 1, 1))
-    origin, lateral = position[-1], frame[-1][:2]
-    apart = np.linalg.norm((position[:SURVEYED][usable] - origin) @ lateral.T, axis=1)
-    return Survey(
-        origin, frame[-1], position[:SURVEYED][usable], frame[:SURVEYED, 2][usable],
-        position[SURVEYED:-1][usable], np.quantile(apart, EASY),
-    )  # fmt: skip
-
-
-def _check_reachable(robot: System, limits: ControlLimits, position: Any) -> None:
-    """Check that an equilibrium within limits has its tip at a position (m). Raises `TaskError`."""
-    wanted, length = np.asarray(position, dtype=float), float(np.max(robot.nominal.length))
-    if wanted.shape != (3,) or not np.all(np.isfinite(wanted)):
-        raise TaskError(f"the target is {position!r}; allowed are three finite numbers (m)")
-    found = inverse_kinematics(robot, wanted, low=limits.low, high=limits.high)
-    if found.result < 0:
-        raise TaskError(
-            f"the target {wanted.tolist()} m cannot be reached: the nearest position found is "
-            f"{float(found.position_error):.3g} m away (the robot is {length:g} m long); choose another "
-            "target, or wider limits"
-        )
 
 
 # the base of tasks
@@ -250,8 +199,39 @@ class Task(abc.ABC):
         return Randomisation()
 
     def survey(self, robot: System, limits: ControlLimits, seed: int) -> Survey:
-        """Return facts about the robot, from equilibria under random controls."""
-        return surveyed(robot, limits, seed)
+        """Return a survey of a robot, from equilibria under random controls within their limits.
+
+        Raises:
+            TaskError: no equilibrium was found.
+        """
+        random = np.random.default_rng(seed)
+        low, high = np.asarray(limits.low), np.asarray(limits.high)
+        controls = low + random.uniform(size=(SURVEYED, len(low))) * (high - low)
+        # the middle of the range is the rest of tendons that pull alike
+        middle = np.tile(np.asarray(limits.safe), (SURVEYED, 1))
+        equilibria = equilibrium(
+            robot, np.concatenate([controls, 0.5 * (controls + middle), middle[:1]]), on_failure="return"
+        )
+        y = np.asarray(equilibria.y)[:, -1, -1]
+        valid = np.asarray(equilibria.result)[:, -1] >= 0
+        usable = valid[:SURVEYED] & valid[SURVEYED:-1]
+        if not valid[-1] or not np.any(usable):
+            controls_name = "any of the random controls" if valid[-1] else "the safe controls"
+            raise TaskError(
+                f"{type(robot).__name__} has no equilibrium under {controls_name} "
+                f"({limits.safe.tolist()}); give other limits"
+            )
+        position = np.asarray(robot.drawing.positions(y))
+        frame = np.tile(np.eye(3), (len(y), 1, 1))
+        if "h" in robot.y_layout.names:
+            rotation = jax.vmap(rotation_matrix)(jnp.asarray(robot.drawing.quaternions(y)))
+            frame = np.swapaxes(np.asarray(rotation), 1, 2)
+        reached, lateral = position[:SURVEYED][usable], frame[-1][:2]
+        distance = np.linalg.norm((reached - position[-1]) @ lateral.T, axis=1)
+        return Survey(
+            position[-1], frame[-1], reached, frame[:SURVEYED, 2][usable],
+            position[SURVEYED:-1][usable], np.quantile(distance, EASY),
+        )  # fmt: skip
 
     def placed(self, system: System, goal: Any) -> System:
         """Return the system with the parts of an episode, such as its obstacles; by default unchanged."""
@@ -447,11 +427,20 @@ class Reach(Task):
         """Return reachable poses.
 
         Raises:
-            TaskError: the fixed position cannot be reached.
+            TaskError: the fixed position cannot be reached by an equilibrium within limits.
         """
         if self.position is not None:
-            _check_reachable(robot, limits, self.position)
-        return surveyed(robot, limits, seed)
+            target, length = np.asarray(self.position, dtype=float), float(np.max(robot.nominal.length))
+            if target.shape != (3,) or not np.all(np.isfinite(target)):
+                raise TaskError(f"the target is {self.position!r}; allowed are three finite numbers (m)")
+            nearest = inverse_kinematics(robot, target, low=limits.low, high=limits.high)
+            if nearest.result < 0:
+                raise TaskError(
+                    f"the target {target.tolist()} m cannot be reached: the nearest position found is "
+                    f"{float(nearest.position_error):.3g} m away (the robot is {length:g} m long); choose "
+                    "another target, or wider limits"
+                )
+        return super().survey(robot, limits, seed)
 
     def draw(self, key: Any, survey: Survey) -> PoseGoal:
         """Return a random pose of the survey, or the fixed one."""
