@@ -8,8 +8,6 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.control import (
-    CONTROLLERS,
-    PID,
     Command,
     Controller,
     ControlLimits,
@@ -21,6 +19,8 @@ from knode_cosserat.control import (
     register_controller,
     run_loop,
 )
+from knode_cosserat.control.commands import CONTROLLERS
+from knode_cosserat.control.tip_feedback import PID
 from knode_cosserat.estimation import TipPosition
 from tests.commands import run, succeeded, told
 

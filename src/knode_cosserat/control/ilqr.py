@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
-from knode_cosserat.control.planning import PlanController, Weights
+from knode_cosserat.control.planning import Knots, PlanController, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -39,7 +39,7 @@ class ILQR(PlanController):
             weights: of the cost.
             iterations: steps in each period.
         """
-        super().__init__(observer, target, limits, horizon, knots, weights)
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
         self.iterations = iterations
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
-from knode_cosserat.control.planning import PlanController, Weights
+from knode_cosserat.control.planning import Knots, PlanController, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import errors_of
@@ -46,7 +46,7 @@ class MPPI(PlanController):
             temperature: of the weights, relative to the standard deviation of the costs.
             seed: of the random plans.
         """
-        super().__init__(observer, target, limits, horizon, knots, weights)
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
         self.samples, self.deviation, self.temperature = samples, deviation, temperature
         self._random = np.random.default_rng(seed)
 

@@ -13,15 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control import (
-    CONTROLLERS,
-    Command,
-    Controller,
-    Plant,
-    Reference,
-    controller_named,
-    run_loop,
-)
+from knode_cosserat.control import Command, Controller, Plant, Reference, controller_named, run_loop
+from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.envs.dynamics import MEASURED, Ending, EpisodeState, commanded, observed, scaled
 from knode_cosserat.envs.environment import Environment

@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control import Controller, LoopLog, Plant, Status, constant
+from knode_cosserat.control import Controller, LoopLog, Plant, constant
+from knode_cosserat.control.commands import Status
 from knode_cosserat.control.loop import Loop, Period, estimated, joined
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPositions
