@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from knode_cosserat._processes import dask_client, end_with_parent
 from knode_cosserat.solvers.run import usable_cores
-from knode_cosserat.sweeps._data import SweepData
+from knode_cosserat.sweeps._data import SweepData, load_sweep
 from knode_cosserat.sweeps._description import Sweep, SweepError
 from knode_cosserat.sweeps._folder import (
     SHARDS,
@@ -319,4 +319,4 @@ def run_sweep(
         for entry in os.scandir(folder / SHARDS):
             if entry.name.endswith(".tmp") and entry.stat().st_mtime < date:
                 os.unlink(entry.path)
-    return SweepData.open(folder)
+    return load_sweep(folder)
