@@ -295,7 +295,8 @@ def _reward(environment: Environment, goal: Any, t: float, tip: Any) -> float:
     """Return the reward of a position of the tip (m) at a time (s), away from obstacles."""
     tangent = environment.arrays.survey.frame[2]
     length = environment.robot.nominal.length
-    return float(environment.task.outcome(goal, t, Tip(tip, tangent), np.inf, length).reward)
+    error = environment.task.error(goal, t, Tip(tip, tangent))
+    return float(environment.task.reward(error, np.inf, length))
 
 
 def sweep(settings: Any) -> Product:

@@ -100,5 +100,5 @@ def test_options_reach_the_controller():
 def test_the_documentation_lists_the_registry():
     text = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
     rows = re.findall(r"^\| (\w+) \| `(\w+)` \| (.+?) \|$", text, re.MULTILINE)
-    expected = {(name, each.cls.__name__, each.help) for name, each in CONTROLLERS.items() if name != "bend"}
+    expected = {(name, each.__name__, each.help) for name, each in CONTROLLERS.items() if name != "bend"}
     assert set(rows) == expected and len(rows) == len(expected)

@@ -49,9 +49,8 @@ def test_the_reward_falls_to_1_e_at_the_scale(survey):
     goal = goals(task, survey, 1)[0]
     for distance, reward in ((0.0, 1.0), (0.05, np.exp(-1.0)), (0.1, np.exp(-2.0))):
         position = task.target(goal, 1.0) + distance * survey.frame[0] + 0.3 * survey.frame[2]
-        found = task.outcome(goal, 1.0, tasks.Tip(position, survey.frame[2]), jnp.inf, 1.0)
-        assert float(found.reward) == pytest.approx(reward, abs=1e-6)
-        assert not bool(found.terminated)
+        error = task.error(goal, 1.0, tasks.Tip(position, survey.frame[2]))
+        assert float(task.reward(error, jnp.inf, 1.0)) == pytest.approx(reward, abs=1e-6)
 
 
 def test_the_error_of_a_pose_has_its_tangent(survey):
@@ -95,11 +94,8 @@ def test_clearance_is_the_distance_of_the_surface(robot, survey):
     np.testing.assert_allclose(tip_of(system, y).position, [0.0, 0.0, float(system.length)], atol=1e-12)
 
 
-def test_a_touch_halves_the_reward(survey):
-    task = tasks.Pillar()
-    goal = goals(task, survey, 1)[0]
-    tip = tasks.Tip(goal.position, survey.frame[2])
-    free, touching = (float(task.outcome(goal, 0.0, tip, gap, 1.0).reward) for gap in (1e-3, -1e-3))
+def test_a_touch_halves_the_reward():
+    free, touching = (float(tasks.Pillar().reward(0.02, gap, 1.0)) for gap in (1e-3, -1e-3))
     assert touching == pytest.approx(0.5 * free)
 
 

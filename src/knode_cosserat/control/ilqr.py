@@ -28,17 +28,7 @@ class ILQR(PlanController):
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
         knots: int = 8, weights: Weights = Weights(), iterations: int = 2,
     ):  # fmt: skip
-        """Set up the controller; arguments as those of `PredictiveController`.
-
-        Args:
-            observer: estimates the state of the model.
-            target: the tracked output.
-            limits: limits of the controls.
-            horizon: number of predicted periods.
-            knots: number of controls in the plan.
-            weights: of the cost.
-            iterations: steps in each period.
-        """
+        """Set up the controller as `PredictiveController`; `iterations` are the steps in a period."""
         super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
         self.iterations = iterations
 

@@ -21,7 +21,7 @@ DAMPING = 1e-2
 CORRECTIONS, ENOUGH = 4, 1e-5
 
 
-class TipFeedback(Controller):
+class _TipFeedback(Controller):
     """Base of controllers that act on the measured position of the tip, by tip positions of equilibria."""
 
     def __init__(self, robot: System, dt: float, limits: ControlLimits):
@@ -75,7 +75,7 @@ class TipFeedback(Controller):
 
 
 @register_controller("pid", "PID of the tip's error, through the static Jacobian")
-class PID(TipFeedback):
+class PID(_TipFeedback):
     """PID control of the tip's position, through the static Jacobian of the robot under a preload.
 
     The error is mapped to controls by damped least squares; the integral stops where controls are limited.
@@ -104,7 +104,7 @@ class PID(TipFeedback):
 
 
 @register_controller("kinematic", "inverse kinematics of equilibria, with an integral")
-class KinematicController(TipFeedback):
+class KinematicController(_TipFeedback):
     """Inverse kinematics of equilibria as feed-forward, with an integral of the tip's error."""
 
     def __init__(self, robot: System, dt: float, limits: ControlLimits, *, integral: float = 0.5):

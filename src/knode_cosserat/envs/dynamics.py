@@ -325,9 +325,10 @@ def _arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, sol
         tip = Tip(jnp.where(solved, tip.position, measured[0, -3:]), tip.tangent)
         clearance = jnp.where(solved, clearance_of(system, y), jnp.inf)
         t, length = count * spec.dt, arrays.robot.nominal.length
-        reward, terminated, error = spec.task.outcome(state.goal, t, tip, clearance, length)
+        error = spec.task.error(state.goal, t, tip)
+        reward = spec.task.reward(error, clearance, length)
         usable = solved & ~coarse & valid
-        terminated = terminated & usable
+        terminated = spec.task.is_over(state.goal, t, tip) & usable
         ending = jnp.select(
             [~valid, ~solved, coarse, terminated, count >= spec.steps],
             [Ending.INVALID_ACTION, Ending.UNSOLVED, Ending.COARSE, Ending.TERMINATED, Ending.TIME_LIMIT],

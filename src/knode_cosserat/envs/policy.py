@@ -68,7 +68,7 @@ class PolicyController(Controller):
         return Command(self._control)
 
 
-class EpisodePlant(Plant):
+class _EpisodePlant(Plant):
     """An episode of an environment, moved by a controller; it measures the tip."""
 
     def __init__(self, environment: Environment, state: EpisodeState):
@@ -118,7 +118,7 @@ def controller_scores(
     """
     arrays, spec = environment.arrays, environment.spec
     middle = {key: 0.5 * (arrays.least[key] + arrays.greatest[key]) for key in spec.names}
-    adapt = [key for key in spec.task.adapted if CONTROLLERS[name].cls.has_observer and key in spec.names]
+    adapt = [key for key in spec.task.adapted if CONTROLLERS[name].has_observer and key in spec.names]
     measured = TipPosition(sigma=max(float(arrays.noise), LEAST_NOISE))
     scores = []
     for key in np.asarray(keys):
@@ -127,7 +127,7 @@ def controller_scores(
         controller = controller_named(name, robot, spec.dt, environment.limits, adapt, measured)
         if isinstance(controller, PlanController):
             controller.observer.restart()
-        plant = EpisodePlant(environment, state)
+        plant = _EpisodePlant(environment, state)
         run_loop(controller, plant, environment.reference(state), environment.steps * environment.dt)
         scores.append(sum(plant.rewards) / environment.steps)
     return np.array(scores)

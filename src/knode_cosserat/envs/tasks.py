@@ -154,14 +154,6 @@ class Tip(NamedTuple):
     tangent: Float[Any, "3"]
 
 
-class Outcome(NamedTuple):
-    """Reward of a step, True if the episode ended by success or failure, and the error (m)."""
-
-    reward: Any
-    terminated: Any
-    error: Any
-
-
 def _norm(vector: Any) -> Any:
     """Return the length of a vector, with a finite derivative at zero."""
     return jnp.sqrt(jnp.sum(vector**2, axis=-1) + 1e-18)
@@ -249,18 +241,19 @@ class Task(abc.ABC):
         """Return the error of the tip (m) at a time (s): by default its distance from the target."""
         return _norm(tip.position - self.target(goal, t)[:3])
 
-    def outcome(self, goal: Any, t: Any, tip: Tip, clearance: Any, length: Any) -> Outcome:
-        """Return the outcome of a step that ends at a time (s).
+    def reward(self, error: Any, clearance: Any, length: Any) -> Any:
+        """Return the reward of a period, by default exp(-error / (scale length)).
 
         Args:
-            goal: of the episode.
-            t: time (s).
-            tip: pose of the tip.
+            error: of the tip (m).
             clearance: least distance (m) of the robot from obstacles; infinite without obstacles.
             length: of the robot (m).
         """
-        error = self.error(goal, t, tip)
-        return Outcome(jnp.exp(-error / (self.scale * length)), jnp.array(False), error)
+        return jnp.exp(-error / (self.scale * length))
+
+    def is_over(self, goal: Any, t: Any, tip: Tip) -> Any:
+        """Return True if an episode ends by success or failure at a time (s); by default never."""
+        return jnp.array(False)
 
     def observation(self, goal: Any, survey: Survey, length: Any) -> Float[Any, " o"]:
         """Return what is observed of the goal beside the target; by default nothing."""
@@ -300,7 +293,7 @@ def _require_positive(task: Task, *names: str) -> None:
 # following a moving point
 
 
-class PathGoal(NamedTuple):
+class _PathGoal(NamedTuple):
     """A closed path across the tip's direction at rest, followed from its centre outwards."""
 
     centre: Float[Any, "3"]
@@ -333,7 +326,7 @@ class Follow(Task):
         super().__post_init__()
         _require_positive(self, "period", "width")
 
-    def draw(self, key: Any, survey: Survey) -> PathGoal:
+    def draw(self, key: Any, survey: Survey) -> _PathGoal:
         """Return a random path."""
         part = jax.random.uniform(key, (5,))
         (short, long), (thin, wide) = self.period, self.width
@@ -345,16 +338,16 @@ class Follow(Task):
         # an eight is lower than wide, and may be run through backwards
         sign = jnp.where(part[4] < 0.5, 1.0, -1.0)
         width = width * jnp.where(eight, jnp.array([1.0, 0.5]), jnp.ones(2)) * jnp.stack([sign, 1.0])
-        return PathGoal(survey.origin, survey.frame[:2], width, frequency * turns, phase)
+        return _PathGoal(survey.origin, survey.frame[:2], width, frequency * turns, phase)
 
-    def target(self, goal: PathGoal, t: Any) -> Float[Any, "3"]:
+    def target(self, goal: _PathGoal, t: Any) -> Float[Any, "3"]:
         """Return the wanted position of the tip (m)."""
         part = jnp.clip(t / self.rise, 0.0, 1.0) if self.rise else 1.0
         eased = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
         along = eased * goal.width * jnp.sin(goal.frequency * t + goal.phase)
         return goal.centre + along @ goal.across
 
-    def error(self, goal: PathGoal, t: Any, tip: Tip) -> Any:
+    def error(self, goal: _PathGoal, t: Any, tip: Tip) -> Any:
         """Return the distance (m) of the tip from the target, across the tip's direction at rest."""
         return _norm(goal.across @ (tip.position - self.target(goal, t)))
 
@@ -401,7 +394,7 @@ class Adaptation(Follow):
 # reaching a pose
 
 
-class PoseGoal(NamedTuple):
+class _PoseGoal(NamedTuple):
     """A pose to reach: position (m), and unit tangent."""
 
     position: Float[Any, "3"]
@@ -442,17 +435,17 @@ class Reach(Task):
                 )
         return super().survey(robot, limits, seed)
 
-    def draw(self, key: Any, survey: Survey) -> PoseGoal:
+    def draw(self, key: Any, survey: Survey) -> _PoseGoal:
         """Return a random pose of the survey, or the fixed one."""
         k = jax.random.randint(key, (), 0, survey.position.shape[0])
         position = survey.position[k] if self.position is None else jnp.asarray(self.position, dtype=float)
-        return PoseGoal(position, survey.tangent[k])
+        return _PoseGoal(position, survey.tangent[k])
 
-    def target(self, goal: PoseGoal, t: Any) -> Float[Any, "6"]:
+    def target(self, goal: _PoseGoal, t: Any) -> Float[Any, "6"]:
         """Return the wanted position (m) and tangent of the tip."""
         return jnp.concatenate([goal.position, goal.tangent])
 
-    def error(self, goal: PoseGoal, t: Any, tip: Tip) -> Any:
+    def error(self, goal: _PoseGoal, t: Any, tip: Tip) -> Any:
         """Return the distance of the tip (m), and in addition `arm` times the error of its tangent."""
         distance = _norm(tip.position - goal.position)
         if self.position is not None:
@@ -467,7 +460,7 @@ class Reach(Task):
 TOUCHING = 0.5
 
 
-class CourseGoal(NamedTuple):
+class _CourseGoal(NamedTuple):
     """A position to reach (m), and the centres of the obstacles before it."""
 
     position: Float[Any, "3"]
@@ -512,11 +505,11 @@ class Pillar(Task):
         equipped: System = _with_parts(robot, "surroundings", [ball] * self.count, self.name)
         return equipped
 
-    def placed(self, system: System, goal: CourseGoal) -> System:
+    def placed(self, system: System, goal: _CourseGoal) -> System:
         """Return the system with the balls of an episode."""
         return system.replace(**{f"surroundings.{k}.center": goal.centres[k] for k in range(self.count)})
 
-    def draw(self, key: Any, survey: Survey) -> CourseGoal:
+    def draw(self, key: Any, survey: Survey) -> _CourseGoal:
         """Return a position of the survey with balls before it; positions near the rest are left out."""
         one, two = jax.random.split(key)
         lateral = (survey.position - survey.origin) @ survey.frame[:2].T
@@ -525,30 +518,29 @@ class Pillar(Task):
         position, middle = survey.position[k], survey.halfway[k]
         aside = jnp.cross(survey.frame[2], position - survey.origin)
         aside = aside / _norm(aside) * jnp.where(jax.random.uniform(two) < 0.5, 1.0, -1.0)
-        return CourseGoal(position, self._centres(middle, aside), aside)
+        return _CourseGoal(position, self._centres(middle, aside), aside)
 
     def _centres(self, middle: Any, aside: Any) -> Float[Any, "k 3"]:
         # a little off the path: which way is shorter is then certain
         return (middle - 0.3 * self.radius * aside)[None]
 
-    def target(self, goal: CourseGoal, t: Any) -> Float[Any, "3"]:
+    def target(self, goal: _CourseGoal, t: Any) -> Float[Any, "3"]:
         """Return the wanted position of the tip (m)."""
         return goal.position
 
-    def outcome(self, goal: CourseGoal, t: Any, tip: Tip, clearance: Any, length: Any) -> Outcome:
-        """Return the outcome of a step that ends at a time (s)."""
-        outcome = super().outcome(goal, t, tip, clearance, length)
-        return outcome._replace(reward=outcome.reward * jnp.where(clearance < 0.0, TOUCHING, 1.0))
+    def reward(self, error: Any, clearance: Any, length: Any) -> Any:
+        """Return the reward of a period."""
+        return super().reward(error, clearance, length) * jnp.where(clearance < 0.0, TOUCHING, 1.0)
 
-    def observation(self, goal: CourseGoal, survey: Survey, length: Any) -> Float[Any, " o"]:
+    def observation(self, goal: _CourseGoal, survey: Survey, length: Any) -> Float[Any, " o"]:
         """Return the centres of the balls from the tip at rest, in lengths of the robot."""
         return ((goal.centres - survey.origin) / length).ravel()
 
-    def waypoint(self, goal: CourseGoal) -> Float[np.ndarray, "3"]:
+    def waypoint(self, goal: _CourseGoal) -> Float[np.ndarray, "3"]:
         """Return a position (m) on the way that is clear of the balls."""
         return np.asarray(goal.centres[0] + 2.5 * self.radius * goal.aside)
 
-    def reference(self, goal: CourseGoal, survey: Survey) -> Reference:
+    def reference(self, goal: _CourseGoal, survey: Survey) -> Reference:
         """Return a path by the way point to the target; 1 s to each."""
         points = [np.asarray(survey.origin), self.waypoint(goal), np.asarray(goal.position)]
         return table([0.0, 1.0, 2.0], points)
@@ -571,7 +563,7 @@ class Gate(Pillar):
         centre, offset = middle + 0.5 * self.gap * aside, (self.radius + 0.5 * self.gap) * aside
         return jnp.stack([centre - offset, centre + offset])
 
-    def waypoint(self, goal: CourseGoal) -> Float[np.ndarray, "3"]:
+    def waypoint(self, goal: _CourseGoal) -> Float[np.ndarray, "3"]:
         """Return the middle of the gate (m)."""
         return np.asarray(goal.centres).mean(axis=0)
 
