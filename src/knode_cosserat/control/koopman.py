@@ -91,11 +91,11 @@ class _LiftedModel:
 
 @register_controller("koopman", "predictive control by a lifted linear model, fitted to simulated motions")
 class KoopmanController(Controller):
-    """Predictive control by a lifted linear model and one quadratic program a period."""
+    """Predictive control of the tip by a lifted linear model and one quadratic program a period."""
 
     def __init__(
-        self, robot: System, dt: float, limits: ControlLimits, target: Output = TipPosition(), *,
-        horizon: int = 20, knots: int = 8, weights: Weights = Weights(), seed: int = 0,
+        self, robot: System, dt: float, limits: ControlLimits, *, horizon: int = 20, knots: int = 8,
+        weights: Weights = Weights(), seed: int = 0,
     ):  # fmt: skip
         """Simulate random motions of the robot and fit the lifted model.
 
@@ -103,7 +103,6 @@ class KoopmanController(Controller):
             robot: the model.
             dt: period (s).
             limits: hard limits of the controls and their rates.
-            target: the measured and tracked output.
             horizon: number of predicted periods.
             knots: number of controls in the plan.
             weights: of the cost.
@@ -114,10 +113,10 @@ class KoopmanController(Controller):
             ImportError: DAQP is not installed.
         """
         qp.require_daqp()
-        self.dt, self.target, self.limits = float(dt), target, limits.of(robot)
+        self.dt, self.limits, self.target = float(dt), limits.of(robot), TipPosition()
         self.knots = Knots.spaced(horizon, knots)
-        self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
-        self.model = _LiftedModel(*_training_motions(robot, self.dt, target, self.limits, seed))
+        self._tracking = Tracking(self.knots, self.limits, weights, self.target.noise, self.dt)
+        self.model = _LiftedModel(*_training_motions(robot, self.dt, self.target, self.limits, seed))
         self._slopes = self.model.slopes(self.knots.basis)
         self.reset(np.asarray(self.limits.safe))
 

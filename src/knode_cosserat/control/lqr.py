@@ -69,15 +69,15 @@ def realized(
 
 @register_controller("lqr", "regulator of a linear model about an equilibrium, with an estimated offset")
 class LQR(Controller):
-    """Linear-quadratic regulator of a linear model, with an estimated offset of the output.
+    """Linear-quadratic regulator of the tip's position by a linear model, with an estimated offset.
 
     The state and the disturbance are estimated by a stationary Kalman filter. The steady state whose output
     is the reference of the next period is the target of the regulator.
     """
 
     def __init__(
-        self, robot: System, dt: float, limits: ControlLimits, target: Output = TipPosition(), *,
-        change: float = 1e-2, disturbance: float = 0.1,
+        self, robot: System, dt: float, limits: ControlLimits, *, change: float = 1e-2,
+        disturbance: float = 0.1,
     ):  # fmt: skip
         """Linearise the robot about the equilibrium under a quarter of the greatest controls.
 
@@ -85,21 +85,19 @@ class LQR(Controller):
             robot: the model.
             dt: period (s).
             limits: limits of the controls: the regulator's commands are clipped.
-            target: the measured and tracked output, a position.
             change: cost of a control over its whole range, relative to an error of one `noise` of the target.
             disturbance: standard deviation of the disturbance's change in one period, in `noise`.
 
         Raises:
             SimulationError: there is no such equilibrium.
         """
-        self.dt, self.target = float(dt), target
-        self.limits = limits.of(robot)
+        self.dt, self.limits, self.target = float(dt), limits.of(robot), TipPosition()
         low, high = np.asarray(self.limits.low), np.asarray(self.limits.high)
         #: control and output of the equilibrium
         self._control_0 = low + PRELOAD * (high - low)
-        A, B, C, self._output_0 = linear_model(robot, dt, self._control_0, target)
+        A, B, C, self._output_0 = linear_model(robot, dt, self._control_0, self.target)
         n, p = len(A), len(C)
-        Q = C.T @ C / np.mean(target.noise) ** 2
+        Q = C.T @ C / np.mean(self.target.noise) ** 2
         R = np.diag(change / (high - low) ** 2)
         P = solve_discrete_are(A, B, Q + 1e-9 * np.trace(Q) / n * np.eye(n), R)
         self._gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
@@ -107,7 +105,7 @@ class LQR(Controller):
         self._A = np.block([[A, np.zeros((n, p))], [np.zeros((p, n)), np.eye(p)]])
         self._B = np.concatenate([B, np.zeros((p, B.shape[1]))])
         self._C = np.concatenate([C, np.eye(p)], axis=1)
-        noise = np.diag(target.noise**2)
+        noise = np.diag(self.target.noise**2)
         spread = 0.02 * (high - low)
         driven = self._B @ np.diag(spread**2) @ self._B.T
         driven[n:, n:] += disturbance**2 * noise

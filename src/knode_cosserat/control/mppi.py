@@ -35,7 +35,7 @@ class MPPI(PlanController):
         """Set up the controller as `PredictiveController`, with more settings.
 
         `samples` is the number of random plans in each period (the plan itself is one more), `deviation` the
-        standard deviation of a knot's control, relative to the range. `temperature` of the weights is relative
+        standard deviation of a knot's control, relative to the range. `temperature` (of weights) is relative
         to the standard deviation of the costs, and `seed` is that of the random plans.
         """
         super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
