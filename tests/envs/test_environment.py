@@ -62,19 +62,6 @@ def test_drawn_parameters_are_in_their_ranges_and_change_at_their_time(environme
     assert set(np.asarray(states.delay).tolist()) == {0, 1, 2}
 
 
-@pytest.mark.slow
-def test_the_same_key_gives_the_same_bits(environment, keys):
-    def played():
-        states, seen = environment.reset_many(keys)
-        rows = [np.asarray(seen)]
-        for row in tensions(3):
-            states, found = environment.step_many(states, np.tile(actions(environment, row), (2, 1)))
-            rows.append(np.asarray(found.observation))
-        return np.stack(rows).tobytes()
-
-    assert played() == played()
-
-
 def test_an_observation_has_the_error_of_the_tip(environment, keys):
     states, seen = environment.reset_many(keys)
     length = float(environment.robot.length)
