@@ -174,7 +174,7 @@ class Plan:
             elif len(rows):
                 picked = {name: array[rows] for name, array in numbers.items()}
                 controls[rows], reasons = case_controls(
-                    self.systems[robot], text, sweep.steps, sweep.dt, picked, len(rows)
+                    self.systems[robot], text, sweep.steps, sweep.dt, picked
                 )
                 refused |= {int(rows[k]): reason for k, reason in reasons.items()}
         return Cases(robot * self.robot_cases + index, values, word, seed, controls, refused)
@@ -257,7 +257,7 @@ def _fixed_controls(sweep: Sweep, systems: tuple[System, ...]) -> dict[tuple[int
                 fixed[robot, w] = named_controls.parse(system, word, sweep.steps, sweep.dt)
                 continue
             numbers = trial | {"seed": np.arange(3)}
-            _, refused = case_controls(system, word, sweep.steps, sweep.dt, numbers, 3)
+            _, refused = case_controls(system, word, sweep.steps, sweep.dt, numbers)
             if len(refused) == 3:
                 raise SweepError(refused[1])
     return fixed

@@ -37,13 +37,13 @@ def placeholders(word: str) -> list[str]:
 
 
 def case_controls(
-    robot: System, word: str, steps: int, dt: float, numbers: Mapping[str, Array], count: int
+    robot: System, word: str, steps: int, dt: float, numbers: Mapping[str, Array]
 ) -> tuple[Array, dict[int, str]]:
-    """Return the controls (cases, steps, c) of `count` cases, and reasons of refused ones, which are zeros.
+    """Return the controls (cases, steps, c) of cases, and reasons of refused ones, which are zeros.
 
     `numbers` are the values of the names in braces, one a case.
     """
-    layout, values = robot.control_layout, None
+    layout, values, count = robot.control_layout, None, len(next(iter(numbers.values())))
     varied = {name: numbers[name] for name in placeholders(word)}
     if layout.names == ("tension",):
         with np.errstate(all="ignore"):

@@ -124,7 +124,8 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
                 column[k] = int(Result.NOT_REACHED) if name == "result" else np.nan
         elif done[k] < steps:
             case = system.replace(**{name: array[k] for name, array in values.items()}) if values else system
-            reasons[k] = _failed(plan, case, task, cases.controls[first + k], columns, k)
+            rows_of_case = {name: column[k] for name, column in columns.items()}
+            reasons[k] = _failed(plan, case, task, cases.controls[first + k], rows_of_case)
     result = columns["result"]
     carried = carried_results(result[:, 1:], marks[:count])
     columns["result"] = np.concatenate([result[:, :1], carried], axis=1).astype(np.int8)
@@ -170,9 +171,9 @@ def _equilibria(plan: Plan, system: System, values: dict[str, Any]) -> tuple[Any
 
 
 def _failed(
-    plan: Plan, system: System, task: TimeIntegration, controls: Any, columns: dict[str, Any], k: int
+    plan: Plan, system: System, task: TimeIntegration, controls: Any, stored: dict[str, np.ndarray]
 ) -> str:
-    """Return the reason of a failed case, empty after recovery if that is wanted; write its rows.
+    """Return the reason of a failed case, empty after recovery if that is wanted; write into its stored rows.
 
     Neither the recovery nor the pieces of the run depend on times.
     """
@@ -183,10 +184,10 @@ def _failed(
         rows, _, cause = run_one(task, system, controls, at.state.history, at.control, response=np.inf)
         record, rows = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (at.record, rows))
         for name, column in _stored(system, record, rows, plan.sweep.store).items():
-            columns[name][k] = np.asarray(column[0])
+            stored[name][...] = np.asarray(column[0])
         if not cause:
             return ""
-    step = int(np.argmax(columns["result"][k] < 0))
-    code = Result(int(columns["result"][k, step]))
+    step = int(np.argmax(stored["result"] < 0))
+    code = Result(int(stored["result"][step]))
     cause = cause or likely_cause(code, system, plan.settings, controls[step - 1])
     return f"step {step} (t = {step * plan.sweep.dt:g} s): {code.message}. {cause}".strip()
