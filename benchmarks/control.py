@@ -39,7 +39,6 @@ def costs() -> dict[str, Any]:
     import numpy as np
 
     from knode_cosserat.control import circle
-    from knode_cosserat.control.planning import linearised_prediction
     from knode_cosserat.engine.pattern import Pattern
     from knode_cosserat.estimation.online import Spread, errors_of
     from knode_cosserat.solvers.rollout import rollout
@@ -67,7 +66,11 @@ def costs() -> dict[str, Any]:
     controls = np.asarray(basis) @ plan
 
     def linearised(belief: Any) -> Callable[[], Any]:
-        return lambda: linearised_prediction(model, belief, plan, basis, wanted, controller.target, ())
+        def predict() -> Any:
+            observer.belief = belief
+            return controller.predicted(plan, wanted).error
+
+        return predict
 
     return {
         "periods": len(wanted),

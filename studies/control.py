@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control import CONTROLLERS, LoopLog, Sensor, SimulatedPlant, circle, run_loop, steps
-from knode_cosserat.control.commands import Controller
+from knode_cosserat.control import LoopLog, Sensor, SimulatedPlant, circle, run_loop, steps
+from knode_cosserat.control.commands import CONTROLLERS, Controller
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.estimation import (
     Adapted,

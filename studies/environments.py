@@ -18,20 +18,17 @@ from knode_cosserat import controls
 from knode_cosserat.control import Sensor, run_loop
 from knode_cosserat.control.loop import _COMPILATIONS
 from knode_cosserat.envs import (
-    TASKS,
     Environment,
     Factor,
-    Policy,
     PolicyController,
-    PolicyTraining,
     Randomisation,
     TaskError,
-    Tip,
     animate_episode,
     controller_scores,
     make,
     policy_scores,
 )
+from knode_cosserat.envs.tasks import TASKS, Tip
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style, width_of
@@ -43,6 +40,7 @@ from studies import stand_in
 from studies.elastica.plant import ElasticaPlant
 from studies.elastica.rod import ElasticaRod
 from studies.environments_sweep import measure_sweep
+from studies.ppo import Policy, PolicyTraining
 from studies.report import Report, as_json, check_row, checks_table, write_figures, write_texts
 from studies.runner import Job, Product, run
 from studies.tables import markdown_table
@@ -287,7 +285,7 @@ def _on_stand_in(environment: Environment, policy: Policy, key: Any, rod: Elasti
     state, _ = environment.reset(key)
     sensor = Sensor(BodyPositions(environment.spec.output.fractions, sigma=5e-4), noise=1.0)
     plant = ElasticaPlant(rod, environment.dt, sensor)
-    controller = PolicyController(environment, policy, state.goal)
+    controller = PolicyController(environment, policy, state)
     log = run_loop(controller, plant, environment.reference(state), environment.steps * environment.dt)
     rewards = [_reward(environment, state.goal, t, tip) for t, tip in zip(log.time, log.tip, strict=True)]
     return float(np.mean(rewards))
@@ -297,7 +295,8 @@ def _reward(environment: Environment, goal: Any, t: float, tip: Any) -> float:
     """Return the reward of a position of the tip (m) at a time (s), away from obstacles."""
     tangent = environment.arrays.survey.frame[2]
     length = nominal_model(environment.robot).length
-    return float(environment.task.outcome(goal, t, Tip(tip, tangent), np.inf, length).reward)
+    error = environment.task.error(goal, t, Tip(tip, tangent))
+    return float(environment.task.reward(error, np.inf, length))
 
 
 def sweep(settings: Any) -> Product:

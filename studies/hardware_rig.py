@@ -9,7 +9,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat import controls
-from knode_cosserat.control import Controller, ControlLimits, controller_named, identified_lag
+from knode_cosserat.control import Controller, ControlLimits, controller_named
+from knode_cosserat.control.commands import identified_lag
 from knode_cosserat.estimation.outputs import TipPosition
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendons import LoadCells

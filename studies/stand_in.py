@@ -23,9 +23,9 @@ from knode_cosserat.control import (
     Reference,
     Sensor,
     controller_named,
-    identified_lag,
     run_loop,
 )
+from knode_cosserat.control.commands import identified_lag
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.estimation.outputs import TipPosition
 from knode_cosserat.estimation.parameters import Adapted

@@ -1,6 +1,4 @@
-"""Limits of texts, controls, references, policies and trajectories; and the setting of all limits."""
-
-import zipfile
+"""Limits of texts, controls, references and trajectories; and the setting of all limits."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -11,7 +9,6 @@ from knode_cosserat import controls
 from knode_cosserat._files import csv_rows, limits, yaml_text
 from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
 from knode_cosserat.cli.control import parsed_reference
-from knode_cosserat.envs import policy
 from tests.limits import assert_limited, limited
 
 
@@ -45,27 +42,6 @@ def reference(folder):
     return path, lambda: parsed_reference(str(path))
 
 
-def saved_policy(folder):
-    path = folder / "policy.npz"
-    layers = ((np.zeros((3, 500)), np.ones(500)), (np.zeros((500, 1)), np.ones(1)))
-    policy.Policy(layers, np.zeros(3), np.ones(3)).save(path)
-    return path, lambda: policy.Policy.load(path)
-
-
-def packed_policy(folder):
-    path, read = saved_policy(folder)
-    with zipfile.ZipFile(path) as packed:
-        content = {each: packed.read(each) for each in packed.namelist()}
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as packed:
-        for name, data in content.items():
-            packed.writestr(name, data)
-    return path, read
-
-
-#: size of the policy's arrays in an archive
-UNPACKED = 8 * (3 * 500 + 500 + 500 + 1 + 3 + 3)
-
-
 @pytest.mark.parametrize(
     ("file", "module", "limit", "value"),
     [
@@ -78,9 +54,6 @@ UNPACKED = 8 * (3 * 500 + 500 + 500 + 1 + 3 + 3)
         (tensions, csv_rows, "MOST_COLUMNS", 4),
         (lambda folder: tensions(folder, 0.005), csv_rows, "MOST_STEPS", 100),
         (reference, csv_rows, "LARGEST_FILE", 20),
-        (saved_policy, policy, "LARGEST_FILE", None),
-        (packed_policy, policy, "LARGEST_FILE", UNPACKED),
-        (saved_policy, policy, "MOST_LAYERS", 1),
     ],
 )
 def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(

@@ -11,26 +11,23 @@ from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
 from knode_cosserat.control import (
-    ILQR,
-    LQR,
-    MPPI,
-    PID,
     ControlLimits,
-    KinematicController,
-    KoopmanController,
     PredictiveController,
-    ReferenceFormatError,
     Sensor,
     SimulatedPlant,
     SoftLimit,
     circle,
     constant,
-    distance_out_of_reach,
     run_loop,
     steps,
 )
-from knode_cosserat.control.loop import check_reference, warm_up
-from knode_cosserat.control.lqr import realized
+from knode_cosserat.control.ilqr import ILQR
+from knode_cosserat.control.koopman import KoopmanController
+from knode_cosserat.control.loop import check_reference, distance_out_of_reach, warm_up
+from knode_cosserat.control.lqr import LQR, realized
+from knode_cosserat.control.mppi import MPPI
+from knode_cosserat.control.references import ReferenceFormatError
+from knode_cosserat.control.tip_feedback import PID, KinematicController
 from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPosition
 from knode_cosserat.estimation.online import split_record
 from knode_cosserat.identification.evaluate import evaluate
@@ -225,8 +222,8 @@ def test_every_baseline_holds_a_slow_circle():
     """The exact model, so that errors are those of the method: sampling and lifting are rough."""
     target = TipPosition()
     made = {
-        LQR(ROBOT, DT, target, LIMITS): 2e-3,
-        KoopmanController(ROBOT, DT, target, LIMITS): 0.03,
+        LQR(ROBOT, DT, LIMITS): 2e-3,
+        KoopmanController(ROBOT, DT, LIMITS): 0.03,
         ILQR(KalmanObserver(ROBOT, DT, target), target, LIMITS): 5e-3,
         MPPI(KalmanObserver(ROBOT, DT, target), target, LIMITS): 0.03,
     }

@@ -7,17 +7,10 @@ from hypothesis import strategies as st
 from scipy.optimize import minimize
 
 import knode_cosserat as kc
-from knode_cosserat.control import (
-    ControlLimits,
-    ReferenceFormatError,
-    circle,
-    figure_eight,
-    parse_reference,
-    steps,
-    table,
-)
+from knode_cosserat.control import ControlLimits, circle, figure_eight, steps, table
 from knode_cosserat.control.planning import Knots
 from knode_cosserat.control.qp import QuadraticProgram, solve
+from knode_cosserat.control.references import ReferenceFormatError, parse_reference
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 

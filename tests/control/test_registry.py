@@ -8,20 +8,19 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.control import (
-    CONTROLLERS,
-    PID,
     Command,
     Controller,
     ControlLimits,
     PredictiveController,
     Sensor,
     SimulatedPlant,
-    Status,
     constant,
     controller_named,
     register_controller,
     run_loop,
 )
+from knode_cosserat.control.commands import CONTROLLERS
+from knode_cosserat.control.tip_feedback import PID
 from knode_cosserat.estimation import TipPosition
 from tests.commands import run, succeeded, told
 
@@ -47,7 +46,7 @@ class Bend(Controller):
         x, y, _ = reference.at([time])[0]
         pull = np.roll(self.gain * np.array([x, y, -x, -y]), self.turns)
         self._control = self.limits.applied(pull, self._control, self.dt)
-        return Command(self._control, Status.OPTIMAL)
+        return Command(self._control)
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -101,5 +100,5 @@ def test_options_reach_the_controller():
 def test_the_documentation_lists_the_registry():
     text = (Path(__file__).parents[2] / "docs" / "control.md").read_text()
     rows = re.findall(r"^\| (\w+) \| `(\w+)` \| (.+?) \|$", text, re.MULTILINE)
-    expected = {(name, each.cls.__name__, each.help) for name, each in CONTROLLERS.items() if name != "bend"}
+    expected = {(name, each.__name__, each.help) for name, each in CONTROLLERS.items() if name != "bend"}
     assert set(rows) == expected and len(rows) == len(expected)

@@ -13,12 +13,12 @@ from knode_cosserat.control import (
     Plant,
     Sensor,
     SimulatedPlant,
-    Status,
     circle,
     constant,
-    distance_out_of_reach,
     run_loop,
 )
+from knode_cosserat.control.commands import Status
+from knode_cosserat.control.loop import distance_out_of_reach
 from knode_cosserat.estimation import KalmanObserver, TipPosition
 from knode_cosserat.rods.aspects import Drawing
 

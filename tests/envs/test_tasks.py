@@ -7,6 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat import envs
+from knode_cosserat.envs import tasks
 from knode_cosserat.envs.dynamics import clearance_of, tip_of
 from knode_cosserat.rods.aspects import Drawing
 
@@ -18,7 +19,7 @@ def limits(robot):
 
 @pytest.fixture(scope="module")
 def survey(robot, limits):
-    return envs.Follow().survey(robot, limits, 0)
+    return tasks.Follow().survey(robot, limits, 0)
 
 
 def goals(task, survey, count=50):
@@ -34,7 +35,7 @@ def test_surveyed_poses_are_equilibria_within_limits(robot, survey):
 
 
 def test_paths_begin_at_rest_and_are_within_reach(survey):
-    task = envs.Follow()
+    task = tasks.Follow()
     for goal in goals(task, survey):
         np.testing.assert_allclose(task.target(goal, 0.0), survey.origin)
         times = np.linspace(0.0, 20.0, 200)
@@ -45,25 +46,24 @@ def test_paths_begin_at_rest_and_are_within_reach(survey):
 
 
 def test_the_reward_falls_to_1_e_at_the_scale(survey):
-    task = envs.Follow(scale=0.05)
+    task = tasks.Follow(scale=0.05)
     goal = goals(task, survey, 1)[0]
     for distance, reward in ((0.0, 1.0), (0.05, np.exp(-1.0)), (0.1, np.exp(-2.0))):
         position = task.target(goal, 1.0) + distance * survey.frame[0] + 0.3 * survey.frame[2]
-        found = task.outcome(goal, 1.0, envs.Tip(position, survey.frame[2]), jnp.inf, 1.0)
-        assert float(found.reward) == pytest.approx(reward, abs=1e-6)
-        assert not bool(found.terminated)
+        error = task.error(goal, 1.0, tasks.Tip(position, survey.frame[2]))
+        assert float(task.reward(error, jnp.inf, 1.0)) == pytest.approx(reward, abs=1e-6)
 
 
 def test_the_error_of_a_pose_has_its_tangent(survey):
-    task = envs.Reach(arm=0.05)
+    task = tasks.Reach(arm=0.05)
     goal = goals(task, survey, 1)[0]
     aside = np.cross(np.asarray(goal.tangent), [0.3, 0.5, 0.8])
     turned = goal.tangent + 0.01 * aside / np.linalg.norm(aside)
-    tip = envs.Tip(goal.position, turned / jnp.linalg.norm(turned))
+    tip = tasks.Tip(goal.position, turned / jnp.linalg.norm(turned))
     assert float(task.error(goal, 0.0, tip)) == pytest.approx(0.05 * 0.01, rel=1e-3)
 
 
-@pytest.mark.parametrize("task", [envs.Pillar(), envs.Gate()])
+@pytest.mark.parametrize("task", [tasks.Pillar(), tasks.Gate()])
 def test_obstacles_stand_in_the_direct_way(robot, survey, task):
     equipped = task.equipped(robot)
     assert len(equipped.surroundings) == task.count
@@ -85,7 +85,7 @@ def test_obstacles_stand_in_the_direct_way(robot, survey, task):
 
 
 def test_clearance_is_the_distance_of_the_surface(robot, survey):
-    task = envs.Pillar(radius=0.02)
+    task = tasks.Pillar(radius=0.02)
     goal = goals(task, survey, 1)[0]._replace(centres=jnp.array([[0.1, 0.0, 0.3]]))
     system = task.placed(task.equipped(robot), goal)
     y, _ = jax.vmap(system.rest)(np.linspace(0.0, float(system.length), system.nodes))
@@ -95,19 +95,16 @@ def test_clearance_is_the_distance_of_the_surface(robot, survey):
     np.testing.assert_allclose(tip_of(system, y).position, [0.0, 0.0, float(system.length)], atol=1e-12)
 
 
-def test_a_touch_halves_the_reward(survey):
-    task = envs.Pillar()
-    goal = goals(task, survey, 1)[0]
-    tip = envs.Tip(goal.position, survey.frame[2])
-    free, touching = (float(task.outcome(goal, 0.0, tip, gap, 1.0).reward) for gap in (1e-3, -1e-3))
+def test_a_touch_halves_the_reward():
+    free, touching = (float(tasks.Pillar().reward(0.02, gap, 1.0)) for gap in (1e-3, -1e-3))
     assert touching == pytest.approx(0.5 * free)
 
 
 def test_a_payload_and_a_changed_robot_are_drawn(robot):
-    loaded = envs.Payload(mass=0.02).equipped(robot)
-    low, high = envs.Payload(mass=0.02).randomisation().ends(loaded)
+    loaded = tasks.Payload(mass=0.02).equipped(robot)
+    low, high = tasks.Payload(mass=0.02).randomisation().ends(loaded)
     assert low["loads.0.mass"] == 0.0 and high["loads.0.mass"] == 0.02
-    low, high = envs.Adaptation().randomisation().ends(robot)
+    low, high = tasks.Adaptation().randomisation().ends(robot)
     assert set(low) == {"youngs_modulus", "bending_damping", "density"}
     assert high["bending_damping"].shape == (3, 3)
 
@@ -115,9 +112,9 @@ def test_a_payload_and_a_changed_robot_are_drawn(robot):
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda: envs.Follow(scale=0.0), lambda: envs.Follow(period=(3.0, 1.0)),
-        lambda: envs.Follow(width=(0.0, 1.0)), lambda: envs.Pillar(radius=-1.0),
-        lambda: envs.Gate(stiffness=0.0),
+        lambda: tasks.Follow(scale=0.0), lambda: tasks.Follow(period=(3.0, 1.0)),
+        lambda: tasks.Follow(width=(0.0, 1.0)), lambda: tasks.Pillar(radius=-1.0),
+        lambda: tasks.Gate(stiffness=0.0),
     ],
 )  # fmt: skip
 def test_wrong_settings_of_tasks_are_refused(wrong):

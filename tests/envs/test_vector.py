@@ -107,7 +107,7 @@ def test_an_episode_is_drawn(environment):
 
 def test_names_are_registered(robot):
     envs.register()
-    names = {f"knode_cosserat/{name.capitalize()}-v0" for name in envs.TASKS}
+    names = {f"knode_cosserat/{name.capitalize()}-v0" for name in envs.tasks.TASKS}
     assert names <= set(gymnasium.registry)
     made = gymnasium.make("knode_cosserat/Reach-v0", robot=robot, duration=0.5)
     assert made.unwrapped.environment.task.name == "reach"
@@ -131,6 +131,6 @@ def test_stable_baselines(environment):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("name", [name for name in envs.TASKS if name != "follow"])
+@pytest.mark.parametrize("name", [name for name in envs.tasks.TASKS if name != "follow"])
 def test_every_task_passes_the_check(name):
     check_env(envs.SingleEnv(envs.make(name)), skip_render_check=True)

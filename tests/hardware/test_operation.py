@@ -145,7 +145,7 @@ def test_regions():
 
 @pytest.fixture(scope="module")
 def controller():
-    return kc.control.KinematicController(ROD, DT, kc.control.ControlLimits(0.3, 6.0, 40.0))
+    return kc.control.controller_named("kinematic", ROD, DT, kc.control.ControlLimits(0.3, 6.0, 40.0))
 
 
 @pytest.fixture

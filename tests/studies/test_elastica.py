@@ -7,15 +7,8 @@ import pytest
 from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
-from knode_cosserat.control import (
-    ControlLimits,
-    PredictiveController,
-    Sensor,
-    circle,
-    identified_lag,
-    run_loop,
-)
-from knode_cosserat.control.commands import lagged
+from knode_cosserat.control import ControlLimits, PredictiveController, Sensor, circle, run_loop
+from knode_cosserat.control.commands import identified_lag, lagged
 from knode_cosserat.control.planning import lag_weights
 from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPose, TipPosition
 from knode_cosserat.robots import RoutedTendonRobot

@@ -11,7 +11,7 @@ from studies import environments
 
 @pytest.fixture
 def facts():
-    found = {f"task-{name}": {"score": 0.9, "refused": ""} for name in envs.TASKS}
+    found = {f"task-{name}": {"score": 0.9, "refused": ""} for name in envs.tasks.TASKS}
     found["rate"] = {"rate": 7e4, "raw": 8e4, "ratio": 0.875, "compiled": 0, "different": 0}
     found["ppo"] = {"ratio": 0.95, "until": 200.0, "curve": [[4096, 1.0, 0.2]]}
     found["sweep"] = {

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.stats import qmc
 
 from knode_cosserat.sweeps import SweepError
 from knode_cosserat.sweeps._description import SAMPLERS
@@ -28,28 +27,6 @@ def test_parts_of_a_sequence_are_the_sequence(sampler, seed, dimensions, samples
     assert whole.shape == (samples, dimensions)
     assert np.all((whole >= 0.0) & (whole < 1.0))
     np.testing.assert_array_equal(part, whole[first:last])
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(1, 400), st.integers(1, 4), st.integers(0, 2**32))
-def test_a_latin_hypercube_has_one_point_in_each_stratum(samples, dimensions, seed):
-    points = unit_points("latin-hypercube", (0, samples), dimensions, samples, seed)
-    for column in points.T:
-        np.testing.assert_array_equal(np.sort(np.floor(column * samples)), np.arange(samples))
-
-
-def test_permutations_of_variables_are_not_correlated():
-    """Of 2,000 points in 4 variables; independent ones have |r| below 4/√2000 = 0.09 (4 standard errors)."""
-    r = np.corrcoef(unit_points("latin-hypercube", (0, 2000), 4, 2000, 5).T)
-    assert np.max(np.abs(r - np.eye(4))) < 0.09
-
-
-def test_sobol_points_have_the_discrepancy_of_scipys():
-    """Random points have some ten times the discrepancy of 256 Sobol points in two variables."""
-    sobol, random = (unit_points(name, (0, 256), 2, 256, 1) for name in ("sobol", "random"))
-    own = qmc.Sobol(2, seed=np.random.default_rng(7)).random(256)
-    assert qmc.discrepancy(sobol) < 1.5 * qmc.discrepancy(own)
-    assert qmc.discrepancy(sobol) < 0.3 * qmc.discrepancy(random)
 
 
 def test_seeds_of_cases_are_their_own():

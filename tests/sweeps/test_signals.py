@@ -41,7 +41,7 @@ def parsed(robot, text):
 def test_controls_at_once_are_those_case_by_case(robot, word, values):
     a, b = np.array(values).T
     numbers = {"a": a, "b": b, "seed": np.arange(len(a)) + 7}
-    controls, refused = case_controls(robot, word, 6, 0.05, numbers, len(a))
+    controls, refused = case_controls(robot, word, 6, 0.05, numbers)
     for k in range(len(a)):
         text = word.format(**{name: each[k].item() for name, each in numbers.items()})
         expected = parsed(robot, text)

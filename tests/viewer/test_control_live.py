@@ -18,6 +18,7 @@ import knode_cosserat as kc
 from knode_cosserat.control import ControlLimits, PredictiveController, Sensor, SimulatedPlant, SoftLimit
 from knode_cosserat.estimation import KalmanObserver, TipPose, TipPosition
 from knode_cosserat.viewer.closed_loop import STATUSES, FollowedTarget, LoopSession, loop_page
+from knode_cosserat.viewer.pages import document
 from tests.commands import run
 from tests.viewer.connection import Connection, numbers
 
@@ -168,10 +169,10 @@ def test_pause_holds_the_time_and_reset_starts_again(followed):
         assert followed.loop.time == stopped and followed.position[0] == NEAR[0]
         give({"command": "resume"})
         await connection.until(lambda head: is_frame(head) and head[0] == 1 and head[1] > stopped)
-        moved = len(followed.record.moments)
+        moved = len(followed.moments)
         give({"command": "reset"})
         await connection.until(lambda head: is_frame(head) and head[1] == 0.0)
-        assert len(followed.record.moments) < moved
+        assert len(followed.moments) < moved
         assert followed.position[0] == NEAR[0]  # the page sends its own target
 
     converse(followed, talk)
@@ -227,7 +228,7 @@ def test_the_exported_file_and_the_log_are_the_run(followed):
     np.testing.assert_allclose(written["control 1"], log.control[:, 0])
     # a free coordinate of the first target has the tip's value in the picture
     assert np.all(np.isfinite(shown["target"]))
-    assert len(followed.record.page("a robot")) > 1e6
+    assert len(document(followed.scene())) > 1e6
 
 
 def test_messages_are_answered_during_a_slow_period(followed, monkeypatch):
@@ -277,7 +278,7 @@ def test_a_fallback_is_shown_with_its_reason(robot, monkeypatch):
     assert reason == "the quadratic program was not solved"
     assert column(followed, frame, "status")[0] == STATUSES.index("going safe")
     assert np.all(np.isnan(column(followed, frame, "path")))
-    assert {moment.reason for moment in followed.record.moments} == {reason}
+    assert {moment.reason for moment in followed.moments} == {reason}
 
 
 def test_a_second_page_takes_over(followed):
@@ -312,7 +313,7 @@ def test_only_the_estimate_is_drawn_of_a_plant_that_does_not_know_its_shape(robo
         await connection.until(lambda head: is_frame(head) and head[1] > 0.1)
 
     converse(followed, talk)
-    shown = followed.record.scene("a robot")
+    shown = followed.scene()
     assert [(each["name"], each["overlay"]) for each in shown["tracks"]] == [
         ("estimate (the true shape is unknown)", False)
     ]
@@ -404,7 +405,7 @@ def test_the_target_is_dragged_and_the_robot_follows(browser, address, loop, tmp
     browser.wait(lambda: browser.run("viewer.time > 0.2"))
     assert browser.errors() == []
     file = tmp_path / "run.html"
-    file.write_text(loop.record.page("a robot"), encoding="utf-8")
+    file.write_text(document(loop.scene()), encoding="utf-8")
     browser.open(file.as_uri())
     assert browser.run("document.querySelector('.badge').textContent") == "optimal"
     assert browser.run("viewer.robots.map((r) => r.overlay)") == [False, True]

@@ -98,7 +98,6 @@ def _of_recordings() -> dict[str, Sample]:
 
 
 def _of_learning() -> dict[str, Sample]:
-    from knode_cosserat.envs.policy import Policy, network
     from knode_cosserat.learning.config import FitConfig
     from knode_cosserat.learning.residual import Network, input_layout
     from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity
@@ -122,17 +121,12 @@ def _of_learning() -> dict[str, Sample]:
         weights = [np.full((20, 20), 1.0 + version), np.arange(7.0)]
         return {"weights": weights, "step": version, "loss": [0.5, 0.25]}
 
-    def policy(path: Path, version: int) -> None:
-        key = jax.random.key(version)
-        Policy(network(key, (5, 8, 4), 0.01), np.zeros(5), np.ones(5)).save(path)
-
     return {
         "model.model": Sample(lambda path, version: model(version).save(path), kc.load_model),
         "member.checkpoint": Sample(
             lambda path, version: checkpoints(path.parent).save(path.stem, snapshot(version)),
             lambda path: checkpoints(path.parent).load(path.stem),
         ),
-        "policy.npz": Sample(policy, Policy.load),
     }
 
 

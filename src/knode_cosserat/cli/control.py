@@ -37,7 +37,7 @@ PLANTS: dict[str, Callable[[str, float, Any], Any]] = {}
 def _listed(method: str) -> str:
     """Return the name of a controller; for `list`, print all controllers with their options, and exit."""
     if method == "list":
-        from knode_cosserat.control import CONTROLLERS
+        from knode_cosserat.control.commands import CONTROLLERS
 
         for name, controller in CONTROLLERS.items():
             options = ",".join(f"{key}={value}" for key, value in controller.options.items())
@@ -171,6 +171,7 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
     for path in (output.out, output.recording, output.states, output.figure, viewer.export):
         require_writable(path)
     from knode_cosserat import control as kcc
+    from knode_cosserat.control.loop import distance_out_of_reach
     from knode_cosserat.estimation import TipPosition
 
     model = nominal.load()
@@ -182,7 +183,7 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
     beyond = None  # with --live, the target moves
     if task.reference is not None:
         wanted, seconds = parsed_reference(task.reference), task.seconds
-        beyond, time = kcc.distance_out_of_reach(model, limits, wanted, seconds)
+        beyond, time = distance_out_of_reach(model, limits, wanted, seconds)
         if beyond > OUT_OF_REACH * length:
             typer.echo(
                 f"warning: the {wanted.name} is {1e3 * beyond:.3g} mm out of reach at t = {time:.3g} s: no "
@@ -238,7 +239,8 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
 
 def parsed_reference(text: str) -> Any:
     """Return a reference by its text, or from a CSV file with the columns t, x, y and, if tracked, z."""
-    from knode_cosserat.control import ReferenceFormatError, parse_reference, table
+    from knode_cosserat.control import table
+    from knode_cosserat.control.references import ReferenceFormatError, parse_reference
 
     if not text.endswith(".csv"):
         return parse_reference(text)

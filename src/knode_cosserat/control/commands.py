@@ -42,7 +42,7 @@ class Command(NamedTuple):
     """Control of one period, and its reason."""
 
     control: Float[np.ndarray, " c"]
-    status: Status
+    status: Status = Status.OPTIMAL
     reason: str = ""
     #: predicted positions of the tip (N, 3), for display; None if the controller predicts nothing
     path: Any = None
@@ -112,6 +112,9 @@ class Controller(abc.ABC):
 
     #: True if `for_tip` takes `adapt` and `measured`, the adapted parameters and the output of an observer
     has_observer: ClassVar[bool] = False
+    #: of a registered controller: a line of help, and its options with their defaults
+    help: ClassVar[str]
+    options: ClassVar[dict[str, int | float]]
     #: period (s)
     dt: float
     #: control that acts now
@@ -151,16 +154,8 @@ class Controller(abc.ABC):
 # controllers by name
 
 
-class RegisteredController(NamedTuple):
-    """Class of a controller of the tip's position, a line of help, and its options with their defaults."""
-
-    cls: type[Controller]
-    help: str
-    options: dict[str, int | float]
-
-
 #: controllers by name, for `controller_named`, the command line and the documentation
-CONTROLLERS: dict[str, RegisteredController] = {}
+CONTROLLERS: dict[str, type[Controller]] = {}
 
 AnyController = TypeVar("AnyController", bound=type[Controller])
 
@@ -181,15 +176,19 @@ def register_controller(name: str, help: str) -> Callable[[AnyController], AnyCo
     """
 
     def register(cls: AnyController) -> AnyController:
-        if name in CONTROLLERS and CONTROLLERS[name].cls.__qualname__ != cls.__qualname__:
+        if name in CONTROLLERS and CONTROLLERS[name].__qualname__ != cls.__qualname__:
             raise ValueError(f"the controller {name!r} is registered already; allowed is another name")
         parameters = inspect.signature(cls).parameters.values()
-        options = {
-            parameter.name: parameter.default
-            for parameter in parameters
-            if parameter.kind is inspect.Parameter.KEYWORD_ONLY and type(parameter.default) in (int, float)
-        }
-        CONTROLLERS[name] = RegisteredController(cls, help, options)
+        cls.help, cls.options = (
+            help,
+            {
+                parameter.name: parameter.default
+                for parameter in parameters
+                if parameter.kind is inspect.Parameter.KEYWORD_ONLY
+                and type(parameter.default) in (int, float)
+            },
+        )
+        CONTROLLERS[name] = cls
         return cls
 
     return register
@@ -220,21 +219,21 @@ def controller_named(
             f"there is no controller {name!r}; there are {', '.join(CONTROLLERS)}"
             f"{did_you_mean(name, CONTROLLERS)}"
         )
-    cls, _, defaults = CONTROLLERS[name]
+    cls = CONTROLLERS[name]
     if adapt and not cls.has_observer:
-        observing = ", ".join(key for key, entry in CONTROLLERS.items() if entry.cls.has_observer)
+        observing = ", ".join(key for key, entry in CONTROLLERS.items() if entry.has_observer)
         raise ValueError(
             f"the controller {name!r} adapts no parameters; those with an observer do: {observing}"
         )
     options: dict[str, Any] = {"adapt": adapt, "measured": measured} if cls.has_observer else {}
     for word in filter(None, text.split(",")):
         key, _, number = (part.strip() for part in word.partition("="))
-        if key not in defaults:
+        if key not in cls.options:
             raise ValueError(
-                f"the controller {name!r} has no option {key!r}; there are {', '.join(defaults) or 'none'}"
-                f"{did_you_mean(key, defaults)}"
+                f"the controller {name!r} has no option {key!r}; there are {', '.join(cls.options) or 'none'}"
+                f"{did_you_mean(key, cls.options)}"
             )
-        kind = type(defaults[key])
+        kind = type(cls.options[key])
         try:
             options[key] = kind(number)
         except ValueError:

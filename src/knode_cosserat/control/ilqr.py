@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
-from knode_cosserat.control.planning import PlanController, Weights
+from knode_cosserat.control.planning import Knots, PlanController, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -28,18 +28,8 @@ class ILQR(PlanController):
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
         knots: int = 8, weights: Weights = Weights(), iterations: int = 2,
     ):  # fmt: skip
-        """Set up the controller; arguments as those of `PredictiveController`.
-
-        Args:
-            observer: estimates the state of the model.
-            target: the tracked output.
-            limits: limits of the controls.
-            horizon: number of predicted periods.
-            knots: number of controls in the plan.
-            weights: of the cost.
-            iterations: steps in each period.
-        """
-        super().__init__(observer, target, limits, horizon, knots, weights)
+        """Set up the controller as `PredictiveController`; `iterations` are the steps in a period."""
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
         self.iterations = iterations
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:

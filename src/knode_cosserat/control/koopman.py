@@ -8,7 +8,7 @@ controls.
 from __future__ import annotations
 
 import itertools
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -18,7 +18,6 @@ from knode_cosserat.control.commands import (
     Command,
     Controller,
     ControlLimits,
-    Status,
     lagged,
     register_controller,
 )
@@ -36,7 +35,7 @@ RIDGE = 1e-8
 OFFSET = 0.2
 
 
-class LiftedModel:
+class _LiftedModel:
     """Linear model ψ⁺ = A ψ + B u of lifted coordinates, whose first ones are the scaled output."""
 
     def __init__(self, outputs: Float[np.ndarray, "B T p"], controls: Float[np.ndarray, "B T c"]):
@@ -45,14 +44,14 @@ class LiftedModel:
         (self.middle, self.size), (self._middle_u, self._size_u) = (
             (part.mean(axis=0), np.maximum(part.std(axis=0), 1e-9)) for part in both
         )
-        lifted = np.array([self._motion(*each) for each in zip(outputs, controls, strict=True)])
+        lifted = np.array(list(map(self._motion, outputs, controls)))
         u = (controls[:, 1:-1] - self._middle_u) / self._size_u
         count = lifted.shape[-1]
         now = np.concatenate([lifted[:, :-1], u], axis=-1).reshape(-1, count + u.shape[-1])
         later = lifted[:, 1:].reshape(-1, count)
         ridge = RIDGE * len(now) * np.eye(now.shape[1])
-        found = np.linalg.solve(now.T @ now + ridge, now.T @ later).T
-        self.A, self.B = found[:, :count], found[:, count:] / self._size_u
+        AB = np.linalg.solve(now.T @ now + ridge, now.T @ later).T
+        self.A, self.B = AB[:, :count], AB[:, count:] / self._size_u
         self._offset = -self.B @ self._middle_u
 
     def _motion(self, outputs: Any, controls: Any) -> Float[np.ndarray, "T-1 lifted"]:
@@ -70,11 +69,11 @@ class LiftedModel:
         self, lifted: Float[np.ndarray, " lifted"], controls: Float[np.ndarray, "T c"]
     ) -> Float[np.ndarray, "T p"]:
         """Return the outputs after each control."""
-        found = []
+        outputs = []
         for u in controls:
             lifted = self.A @ lifted + self.B @ u + self._offset
-            found.append(lifted[: len(self.middle)])
-        return self.middle + self.size * np.array(found)
+            outputs.append(lifted[: len(self.middle)])
+        return self.middle + self.size * np.array(outputs)
 
     def slopes(self, basis: Float[np.ndarray, "T knots"]) -> Float[np.ndarray, "n T p"]:
         """Return the derivatives of predicted outputs by the numbers of a plan."""
@@ -83,27 +82,26 @@ class LiftedModel:
         for _ in range(steps):
             responses.append(self.size[:, None] * power[:p])
             power = self.A @ power
-        found = np.zeros((basis.shape[1], c, steps, p))
+        slopes = np.zeros((basis.shape[1], c, steps, p))
         for t in range(steps):
             for k in range(t + 1):
-                found[:, :, t] += np.einsum("n,pc->ncp", basis[k], responses[t - k])
-        return found.reshape(-1, steps, p)
+                slopes[:, :, t] += np.einsum("n,pc->ncp", basis[k], responses[t - k])
+        return slopes.reshape(-1, steps, p)
 
 
 @register_controller("koopman", "predictive control by a lifted linear model, fitted to simulated motions")
 class KoopmanController(Controller):
-    """Predictive control by a lifted linear model and one quadratic program a period."""
+    """Predictive control of the tip by a lifted linear model and one quadratic program a period."""
 
     def __init__(
-        self, robot: System, dt: float, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, weights: Weights = Weights(), seed: int = 0,
+        self, robot: System, dt: float, limits: ControlLimits, *, horizon: int = 20, knots: int = 8,
+        weights: Weights = Weights(), seed: int = 0,
     ):  # fmt: skip
         """Simulate random motions of the robot and fit the lifted model.
 
         Args:
             robot: the model.
             dt: period (s).
-            target: the measured and tracked output.
             limits: hard limits of the controls and their rates.
             horizon: number of predicted periods.
             knots: number of controls in the plan.
@@ -115,17 +113,12 @@ class KoopmanController(Controller):
             ImportError: DAQP is not installed.
         """
         qp.require_daqp()
-        self.dt, self.target, self.limits = float(dt), target, limits.of(robot)
+        self.dt, self.limits, self.target = float(dt), limits.of(robot), TipPosition()
         self.knots = Knots.spaced(horizon, knots)
-        self._tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
-        self.model = LiftedModel(*training_motions(robot, self.dt, target, self.limits, seed))
+        self._tracking = Tracking(self.knots, self.limits, weights, self.target.noise, self.dt)
+        self.model = _LiftedModel(*_training_motions(robot, self.dt, self.target, self.limits, seed))
         self._slopes = self.model.slopes(self.knots.basis)
         self.reset(np.asarray(self.limits.safe))
-
-    @classmethod
-    def for_tip(cls, robot: System, dt: float, limits: ControlLimits, **options: Any) -> Self:
-        """Return a controller of the tip's position."""
-        return cls(robot, dt, TipPosition(), limits, **options)
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Start from a control that acts now."""
@@ -154,7 +147,7 @@ class KoopmanController(Controller):
         if x is None:
             return self.fallback("the quadratic program was not solved")
         self._plan = self._plan + x.reshape(self._plan.shape)
-        return Command(self.limits.applied(self._plan[0], self._control, self.dt), Status.OPTIMAL)
+        return Command(self.limits.applied(self._plan[0], self._control, self.dt))
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Take over the control that acts from now on, and expect the next output."""
@@ -165,7 +158,7 @@ class KoopmanController(Controller):
             self._expected = self.model.predicted(lifted, self._control[None])[0]
 
 
-def training_motions(
+def _training_motions(
     robot: System, dt: float, target: Output, limits: ControlLimits, seed: int
 ) -> tuple[Float[np.ndarray, "B T p"], Float[np.ndarray, "B T c"]]:
     """Return outputs and commands of simulated motions under random commands within limits and rates."""
@@ -181,9 +174,9 @@ def training_motions(
             if k % max(1, round(HELD / dt)) == 0:
                 wanted = low + wide * rng.uniform(size=len(low)) * (high - low)
             control = motion[k] = limits.applied(control + 0.3 * (wanted - control), control, dt)
-    acting = np.array([lagged(each, dt, limits.lag, limits.safe) for each in controls])
-    found = simulate(robot, acting, dt)
-    y, z = np.asarray(found.y)[:, :-1], np.asarray(found.z)[:, :-1]
+    acting = np.array([lagged(motion, dt, limits.lag, limits.safe) for motion in controls])
+    motions = simulate(robot, acting, dt)
+    y, z = np.asarray(motions.y)[:, :-1], np.asarray(motions.z)[:, :-1]
     outputs = [
         [np.asarray(target.value(robot, *state)) for state in zip(ys, zs, strict=True)]
         for ys, zs in zip(y, z, strict=True)

@@ -49,20 +49,14 @@ def check_reference(controller: Any, reference: Reference, seconds: float = CHEC
     """
     robot, target = getattr(controller, "robot", None), getattr(controller, "target", None)
     if robot is not None and (target is None or isinstance(target, BodyPositions | BodyPoses)):
-        check_within_length(robot, reference, seconds)
+        _check_within_length(robot, reference, seconds)
 
 
-def check_within_length(robot: System, reference: Reference, seconds: float = CHECKED) -> None:
-    """Raise an error if a reference of tip positions is much further from the base than the rod is long.
+def _check_within_length(robot: System, reference: Reference, seconds: float) -> None:
+    """Raise a `ReferenceFormatError` if tip positions (m) are much further away than the rod is long.
 
-    Args:
-        robot: the model; the check does not apply to robots of several rods.
-        reference: positions (m), perhaps followed by other numbers.
-        seconds: checked duration (s).
-
-    Raises:
-        ReferenceFormatError: a position that no rod of this length reaches, even if it stretches or its base
-            moves.
+    No rod of this length reaches them, even if it stretches or its base moves. Robots of several rods are not
+    checked.
     """
     length = getattr(nominal_model(robot), "length", None)
     if length is None or strand_count(robot) > 1 or reference.size < 3:
@@ -70,12 +64,12 @@ def check_within_length(robot: System, reference: Reference, seconds: float = CH
     y, _ = robot.rest(0.0)
     base = np.asarray(Drawing.of(robot).positions(np.asarray(y)[None]))[0]
     length, times = float(length), np.arange(0.0, seconds, SAMPLING)
-    apart = np.sqrt(np.nansum((reference.at(times)[:, :3] - base) ** 2, axis=1))
-    k = int(np.argmax(apart))
-    if apart[k] > STRETCH * length:
+    distance = np.sqrt(np.nansum((reference.at(times)[:, :3] - base) ** 2, axis=1))
+    k = int(np.argmax(distance))
+    if distance[k] > STRETCH * length:
         raise ReferenceFormatError(
-            f"the {reference.name} is {apart[k]:.4g} m from the base at t = {times[k]:.4g} s, and the robot "
-            f"is {length:.4g} m long; are the positions in metres, in the robot's frame?"
+            f"the {reference.name} is {distance[k]:.4g} m from the base at t = {times[k]:.4g} s, and the "
+            f"robot is {length:.4g} m long; are the positions in metres, in the robot's frame?"
         )
 
 
@@ -93,7 +87,7 @@ def distance_out_of_reach(
         reference: positions (m); coordinates that are free (NaN) in the first row do not count.
         seconds: checked duration (s).
     """
-    check_within_length(robot, reference, seconds)
+    _check_within_length(robot, reference, seconds)
     bounds = limits.of(robot)
     times = np.arange(0.0, seconds, SAMPLING)
     wanted = reference.at(times)[:, :3]
@@ -103,18 +97,18 @@ def distance_out_of_reach(
     wanted = wanted[:, known]
     # rows that are far from each other
     chosen = [int(np.nanargmax(np.linalg.norm(wanted - np.nanmean(wanted, axis=0), axis=1)))]
-    apart = np.linalg.norm(wanted - wanted[chosen[0]], axis=1)
-    while len(chosen) < POINTS and np.nanmax(apart) > 0.0:
-        chosen.append(int(np.nanargmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(wanted - wanted[chosen[-1]], axis=1))
+    distance = np.linalg.norm(wanted - wanted[chosen[0]], axis=1)
+    while len(chosen) < POINTS and np.nanmax(distance) > 0.0:
+        chosen.append(int(np.nanargmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(wanted - wanted[chosen[-1]], axis=1))
     chosen.sort()
-    found = inverse_kinematics(
+    nearest = inverse_kinematics(
         robot, wanted[chosen], low=bounds.low, high=bounds.high, tolerance=REACHED, starts=STARTS,
         pose=_coordinates(known),
     )  # fmt: skip
-    apart = np.where(found.converged, 0.0, np.nan_to_num(found.position_error))
-    k = int(np.argmax(apart))
-    return float(apart[k]), float(times[chosen[k]])
+    errors = np.where(nearest.converged, 0.0, np.nan_to_num(nearest.position_error))
+    k = int(np.argmax(errors))
+    return float(errors[k]), float(times[chosen[k]])
 
 
 @functools.cache
@@ -175,8 +169,7 @@ class LoopLog:
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
         """Distance (m) of the tip from a reference of positions; free coordinates (NaN) do not count."""
-        apart = self.tip - self.reference[:, :3]
-        return np.sqrt(np.nansum(apart**2, axis=1))
+        return np.sqrt(np.nansum((self.tip - self.reference[:, :3]) ** 2, axis=1))
 
     def tip_rmse(self, after: float | None = None) -> float:
         """Return the root mean square of `tip_distance` (m) from a time (s) on.
@@ -419,19 +412,20 @@ class Loop:
         rows = list(self._rows)
         if not rows:
             raise ValueError("no period has passed; there is nothing in the log")
-        commands = [row.command for row in rows]
-        states = [row.estimated for row in rows if row.estimated is not None]
+        columns: Any = Period._make(zip(*rows, strict=True))
+        commands: Any = Command._make(zip(*columns.command, strict=True))
+        states = [state for state in columns.estimated if state is not None]
         return LoopLog(
-            time=np.array([row.time for row in rows]),
-            reference=np.array([row.reference for row in rows]),
-            measured=np.array([row.measured for row in rows]),
-            tip=np.array([row.tip for row in rows]),
-            control=np.array([each.control for each in commands]),
-            status=tuple(each.status.value for each in commands),
-            reason=tuple(each.reason for each in commands),
-            violation=np.array([each.violation for each in commands]),
-            feedback=np.array([row.feedback for row in rows]),
-            preparation=np.array([row.preparation for row in rows]),
+            time=np.array(columns.time),
+            reference=np.array(columns.reference),
+            measured=np.array(columns.measured),
+            tip=np.array(columns.tip),
+            control=np.array(commands.control),
+            status=tuple(status.value for status in commands.status),
+            reason=commands.reason,
+            violation=np.array(commands.violation),
+            feedback=np.array(columns.feedback),
+            preparation=np.array(columns.preparation),
             parameters={
                 name: np.array([row.parameters[name] for row in rows]) for name in rows[0].parameters
             },
@@ -439,7 +433,7 @@ class Loop:
             missed=max(self.missed + self.plant.missed, self._overrun),
             compiled=_COMPILATIONS.count - self._compiled_before,
             initial_control=self._initial if rows[0].time == 0.0 else None,
-            estimated=joined(states, [row.time for row in rows]) if states else None,
+            estimated=joined(states, columns.time) if states else None,
         )
 
 

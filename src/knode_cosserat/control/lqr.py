@@ -6,13 +6,11 @@ eigensystem realization algorithm (Juang & Pappa 1985).
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, Self
-
 import numpy as np
 from jaxtyping import Float
 from scipy.linalg import solve_discrete_are
 
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status, register_controller
+from knode_cosserat.control.commands import Command, Controller, ControlLimits, register_controller
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import Belief, Spread, errors_along
@@ -28,20 +26,12 @@ STEPS = 80
 LEAST, ORDER = 1e-3, 16
 
 
-class LinearModel(NamedTuple):
-    """x⁺ = A x + B (u - u₀), y = y₀ + C x⁺: the output one period after a control."""
-
-    A: Float[np.ndarray, "x x"]
-    B: Float[np.ndarray, "x c"]
-    C: Float[np.ndarray, "p x"]
-    control: Float[np.ndarray, " c"]
-    output: Float[np.ndarray, " p"]
-
-
 def linear_model(
     robot: System, dt: float, control: Float[np.ndarray, " c"], output: Output
-) -> LinearModel:  # fmt: skip
-    """Return the linear model of a robot about the equilibrium under a control.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return A, B, C and y₀ of x⁺ = A x + B (u - u₀), y = y₀ + C x⁺ about the equilibrium under a control u₀.
+
+    y is the output one period after the control u.
 
     Raises:
         SimulationError: there is no such equilibrium.
@@ -59,8 +49,7 @@ def linear_model(
         raise RuntimeError("the motion about the equilibrium was not solved")
     zero = np.zeros((STEPS, output.size))
     values, slopes = errors_along(system, output, motion.records, motion.d_records, zero)
-    A, B, C = realized(np.moveaxis(np.asarray(slopes), 0, -1))
-    return LinearModel(A, B, C, np.asarray(control), np.asarray(values[-1]))
+    return *realized(np.moveaxis(np.asarray(slopes), 0, -1)), np.asarray(values[-1])
 
 
 def realized(
@@ -80,14 +69,14 @@ def realized(
 
 @register_controller("lqr", "regulator of a linear model about an equilibrium, with an estimated offset")
 class LQR(Controller):
-    """Linear-quadratic regulator of a linear model, with an estimated offset of the output.
+    """Linear-quadratic regulator of the tip's position by a linear model, with an estimated offset.
 
     The state and the disturbance are estimated by a stationary Kalman filter. The steady state whose output
     is the reference of the next period is the target of the regulator.
     """
 
     def __init__(
-        self, robot: System, dt: float, target: Output, limits: ControlLimits, *, change: float = 1e-2,
+        self, robot: System, dt: float, limits: ControlLimits, *, change: float = 1e-2,
         disturbance: float = 0.1,
     ):  # fmt: skip
         """Linearise the robot about the equilibrium under a quarter of the greatest controls.
@@ -95,7 +84,6 @@ class LQR(Controller):
         Args:
             robot: the model.
             dt: period (s).
-            target: the measured and tracked output, a position.
             limits: limits of the controls: the regulator's commands are clipped.
             change: cost of a control over its whole range, relative to an error of one `noise` of the target.
             disturbance: standard deviation of the disturbance's change in one period, in `noise`.
@@ -103,13 +91,13 @@ class LQR(Controller):
         Raises:
             SimulationError: there is no such equilibrium.
         """
-        self.dt, self.target = float(dt), target
-        self.limits = limits.of(robot)
+        self.dt, self.limits, self.target = float(dt), limits.of(robot), TipPosition()
         low, high = np.asarray(self.limits.low), np.asarray(self.limits.high)
-        self.model = linear_model(robot, dt, low + PRELOAD * (high - low), target)
-        A, B, C = self.model[:3]
+        #: control and output of the equilibrium
+        self._control_0 = low + PRELOAD * (high - low)
+        A, B, C, self._output_0 = linear_model(robot, dt, self._control_0, self.target)
         n, p = len(A), len(C)
-        Q = C.T @ C / np.mean(target.noise) ** 2
+        Q = C.T @ C / np.mean(self.target.noise) ** 2
         R = np.diag(change / (high - low) ** 2)
         P = solve_discrete_are(A, B, Q + 1e-9 * np.trace(Q) / n * np.eye(n), R)
         self._gain = np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A)
@@ -117,7 +105,7 @@ class LQR(Controller):
         self._A = np.block([[A, np.zeros((n, p))], [np.zeros((p, n)), np.eye(p)]])
         self._B = np.concatenate([B, np.zeros((p, B.shape[1]))])
         self._C = np.concatenate([C, np.eye(p)], axis=1)
-        noise = np.diag(target.noise**2)
+        noise = np.diag(self.target.noise**2)
         spread = 0.02 * (high - low)
         driven = self._B @ np.diag(spread**2) @ self._B.T
         driven[n:, n:] += disturbance**2 * noise
@@ -125,36 +113,32 @@ class LQR(Controller):
         self._filter = np.linalg.solve(self._C @ S @ self._C.T + noise, self._C @ S).T
         # states of steady controls, in which all of them are linear
         self._states = np.linalg.solve(np.eye(n) - A, B)
+        self._outputs = C @ self._states
         self.reset(np.asarray(self.limits.safe))
-
-    @classmethod
-    def for_tip(cls, robot: System, dt: float, limits: ControlLimits, **options: Any) -> Self:
-        """Return a controller of the tip's position."""
-        return cls(robot, dt, TipPosition(), limits, **options)
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Start from a control that acts now, at rest."""
         self._control = np.array(control, dtype=float)
-        x = self._states @ (self._control - self.model.control)
-        self._state = np.concatenate([x, np.zeros(len(self.model.C))])
+        x = self._states @ (self._control - self._control_0)
+        self._state = np.concatenate([x, np.zeros(len(self._output_0))])
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the regulator's control."""
         measured = np.asarray(measured, dtype=float)
-        expected = self.model.output + self._C @ self._state
+        expected = self._output_0 + self._C @ self._state
         error = np.where(np.isfinite(measured), measured - expected, 0.0)
         self._state = self._state + self._filter @ error
-        n = len(self.model.A)
+        n = len(self._states)
         x, offset = self._state[:n], self._state[n:]
-        wanted = reference.expected(time, self.dt)[0] - self.model.output - offset
+        wanted = reference.expected(time, self.dt)[0] - self._output_0 - offset
         known = np.isfinite(wanted)
         # the steady control whose known outputs are the wanted ones
-        steady = np.linalg.pinv((self.model.C @ self._states)[known], rcond=1e-3) @ wanted[known]
-        control = self.model.control + steady - self._gain @ (x - self._states @ steady)
+        steady = np.linalg.pinv(self._outputs[known], rcond=1e-3) @ wanted[known]
+        control = self._control_0 + steady - self._gain @ (x - self._states @ steady)
         self._control = self.limits.applied(control, self._control, self.dt)
-        return Command(self._control, Status.OPTIMAL)
+        return Command(self._control)
 
     def advance(self, control: Float[np.ndarray, " c"]) -> None:
         """Predict the state under the control that acts from now on."""
         self._control = np.asarray(control, dtype=float)
-        self._state = self._A @ self._state + self._B @ (self._control - self.model.control)
+        self._state = self._A @ self._state + self._B @ (self._control - self._control_0)

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
-from knode_cosserat.control.planning import PlanController, Weights
+from knode_cosserat.control.planning import Knots, PlanController, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import errors_of
@@ -32,21 +32,13 @@ class MPPI(PlanController):
         knots: int = 8, weights: Weights = Weights(), samples: int = 32, deviation: float = 0.05,
         temperature: float = 0.1, seed: int = 0,
     ):  # fmt: skip
-        """Set up the controller.
+        """Set up the controller as `PredictiveController`, with more settings.
 
-        Args:
-            observer: estimates the state of the model.
-            target: the tracked output.
-            limits: limits of the controls.
-            horizon: number of predicted periods.
-            knots: number of controls in the plan.
-            weights: of the cost.
-            samples: number of random plans in each period; the plan itself is one more.
-            deviation: standard deviation of a knot's control, relative to the range.
-            temperature: of the weights, relative to the standard deviation of the costs.
-            seed: of the random plans.
+        `samples` is the number of random plans in each period (the plan itself is one more), `deviation` the
+        standard deviation of a knot's control, relative to the range. `temperature` (of weights) is relative
+        to the standard deviation of the costs, and `seed` is that of the random plans.
         """
-        super().__init__(observer, target, limits, horizon, knots, weights)
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
         self.samples, self.deviation, self.temperature = samples, deviation, temperature
         self._random = np.random.default_rng(seed)
 

@@ -26,7 +26,7 @@ from knode_cosserat.control.commands import (
 from knode_cosserat.control.qp import QuadraticProgram
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
-from knode_cosserat.estimation.online import Belief, OnlineModel, errors_along, split_record
+from knode_cosserat.estimation.online import errors_along, split_record
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.rods.aspects import Drawing
@@ -133,15 +133,6 @@ class Weights:
     preferred: Any = None
 
 
-class SoftRows(NamedTuple):
-    """Linearised outputs (m,) with soft limits, and their derivatives by the plan (n, m)."""
-
-    value: Float[np.ndarray, " m"]
-    by_plan: Float[np.ndarray, "n m"]
-    low: Float[np.ndarray, " m"]
-    high: Float[np.ndarray, " m"]
-
-
 class Tracking(NamedTuple):
     """Cost and limits of a plan, without the predicted errors.
 
@@ -171,7 +162,7 @@ class Tracking(NamedTuple):
 
     def program(
         self, error: Float[np.ndarray, "T e"], by_plan: Float[np.ndarray, "n T e"], plan: np.ndarray,
-        control: np.ndarray, soft: SoftRows | None = None,
+        control: np.ndarray,
     ) -> QuadraticProgram:  # fmt: skip
         """Return the program whose unknowns are the changes (n,) of a plan.
 
@@ -180,7 +171,6 @@ class Tracking(NamedTuple):
             by_plan: their derivatives by the plan's numbers.
             plan: (knots, c).
             control: the control that acts before the plan (c,).
-            soft: limited outputs.
         """
         limits, w, c, count = self.limits, self.weights, len(control), self.knots.count
         scale = np.where(np.isfinite(error), 1.0 / self.noise, 0.0)
@@ -196,12 +186,7 @@ class Tracking(NamedTuple):
         most = np.tile(np.asarray(limits.rate) * self.dt, count)
         below, above = -most - changes.ravel(), most - changes.ravel()
         low, high = (np.tile(np.asarray(end), count) - plan.ravel() for end in (limits.low, limits.high))
-        if soft is None:
-            return QuadraticProgram(H, g, low, high, A, below, above)
-        A = np.concatenate([A, soft.by_plan.T])
-        below = np.concatenate([below, soft.low - soft.value])
-        above = np.concatenate([above, soft.high - soft.value])
-        return QuadraticProgram(H, g, low, high, A, below, above, len(soft.value))
+        return QuadraticProgram(H, g, low, high, A, below, above)
 
 
 # predictions
@@ -220,33 +205,17 @@ class Prediction(NamedTuple):
     limited_by_state: Float[Any, "m T q"]
     #: positions of the tip (m)
     path: Float[Any, "T 3"]
-    solved: Any
-
-
-def linearised_prediction(
-    model: OnlineModel, belief: Belief, plan: Float[Any, "knots c"], basis: Float[Any, "T knots"],
-    reference: Float[Any, "T p"], target: Output, limited: tuple[Output, ...],
-) -> Prediction:  # fmt: skip
-    """Return the prediction of a plan, whose controls are `basis` times `plan`, from an estimated state.
-
-    It is linearised by the plan's numbers and by the directions in which the state is uncertain.
-    """
-    (count, c), (steps, m) = plan.shape, (len(basis), len(belief.spread.records))
-    n = count * c
-    by_plan = np.einsum("tk,ij->kjti", basis, np.eye(c)).reshape(n, steps, c)
-    wide = jax.tree.map(lambda part: np.concatenate([np.zeros((n, *part.shape[1:])), part]), belief.spread)
-    d_controls = np.concatenate([by_plan, np.zeros((m, steps, c))])
-    system, rollout = model.rollout(belief._replace(spread=wide), basis @ plan, d_controls)
-    outputs = _outputs(system, rollout.records, rollout.d_records, reference, target, limited)
-    error, slopes, value, slope, path = map(np.asarray, outputs)
-    return Prediction(error, slopes[:n], slopes[n:], value, slope[:n], slope[n:], path, rollout.solved)
 
 
 @functools.partial(jax.jit, static_argnames=("target", "limited"))
 def _outputs(
-    system: System, records: Any, d_records: Any, reference: Any, target: Output, limited: tuple[Output, ...]
+    system: System, motion: tuple[Any, Any], reference: Any, target: Output, limited: tuple[Output, ...]
 ) -> Any:
-    """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
+    """Return errors of the target and the limited outputs, with their tangents, and the tip's path.
+
+    `motion` is its records and their tangents.
+    """
+    records, d_records = motion
     steps, columns = len(records), d_records.shape[-1]
     error, slopes = errors_along(system, target, records, d_records, reference)
     values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((columns, steps, 0))]
@@ -259,17 +228,8 @@ def _outputs(
     return error, slopes, jnp.concatenate(values, axis=-1), jnp.concatenate(moved, axis=-1), path
 
 
-def check_memory(robot: System, horizon: int, columns: int) -> None:
-    """Raise an error if the derivatives of a prediction do not fit in memory.
-
-    Args:
-        robot: the model.
-        horizon: number of predicted periods.
-        columns: number of derivatives.
-
-    Raises:
-        ValueError: the horizon is too long; the message has the longest one.
-    """
+def _check_memory(robot: System, horizon: int, columns: int) -> None:
+    """Raise `ValueError`, with the longest horizon, if its derivatives do not fit in memory."""
     try:
         memory = float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, OSError, ValueError):
@@ -297,13 +257,12 @@ class PlanController(Controller):
     has_observer: ClassVar[bool] = True
 
     def __init__(
-        self, observer: KalmanObserver, target: Output, limits: ControlLimits, horizon: int, knots: int,
-        weights: Weights,
+        self, observer: KalmanObserver, target: Output, limits: ControlLimits, knots: Knots, weights: Weights
     ):  # fmt: skip
         self.observer, self.target, self.dt = observer, target, observer.dt
-        self.limits = limits.of(observer.robot)
-        check_memory(observer.robot, horizon, knots * observer.robot.control_layout.size + observer.columns)
-        self.knots = Knots.spaced(horizon, knots)
+        self.limits, self.knots = limits.of(observer.robot), knots
+        count = observer.robot.control_layout.size
+        _check_memory(observer.robot, knots.horizon, knots.count * count + observer.columns)
         self.tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
         self._basis = self.knots.basis
         if self.limits.lag:
@@ -376,17 +335,26 @@ class PlanController(Controller):
         self, plan: Float[np.ndarray, "knots c"], wanted: Float[np.ndarray, "T p"],
         limited: tuple[Output, ...] = (),
     ) -> Prediction | None:  # fmt: skip
-        """Return the linearised prediction of a plan from the estimated state; None if it is not solved."""
-        model, belief, n = self.observer.model, self.observer.belief, plan.size
-        prediction = linearised_prediction(
-            model, belief, self.with_acting(plan), self._basis, wanted, self.target, limited
+        """Return the prediction of a plan from the estimated state; None if it is not solved.
+
+        It is linearised by the plan's numbers and by the directions in which the state is uncertain.
+        """
+        model, belief, basis = self.observer.model, self.observer.belief, self._basis
+        knots = self.with_acting(plan)
+        (count, c), steps = knots.shape, len(basis)
+        by_plan = np.einsum("tk,ij->kjti", basis, np.eye(c)).reshape(count * c, steps, c)
+        spread = jax.tree.map(
+            lambda part: np.concatenate([np.zeros((count * c, *part.shape[1:])), part]), belief.spread
         )
-        if not prediction.solved:
+        d_controls = np.concatenate([by_plan, np.zeros((len(belief.spread.records), steps, c))])
+        system, motion = model.rollout(belief._replace(spread=spread), basis @ knots, d_controls)
+        if not motion.solved:
             return None
+        outputs = _outputs(system, (motion.records, motion.d_records), wanted, self.target, limited)
+        error, slopes, value, slope, path = map(np.asarray, outputs)
         # without the derivatives by the acting controls
-        return prediction._replace(
-            by_plan=prediction.by_plan[:n], limited_by_plan=prediction.limited_by_plan[:n]
-        )
+        n, first = plan.size, count * c
+        return Prediction(error, slopes[:n], slopes[first:], value, slope[:n], slope[first:], path)
 
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:
         """Return the reference at the ends of the periods of the horizon that begins at `time` (s).

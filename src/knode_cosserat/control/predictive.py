@@ -17,7 +17,7 @@ from jaxtyping import Float
 
 from knode_cosserat.control import qp
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
-from knode_cosserat.control.planning import PlanController, Prediction, SoftRows, Weights
+from knode_cosserat.control.planning import Knots, PlanController, Prediction, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -68,20 +68,13 @@ class PredictiveController(PlanController):
         """
         qp.require_daqp()
         self.soft = tuple(soft)
-        super().__init__(observer, target, limits, horizon, knots, weights)
-        # ends of the soft limits at every sample of the horizon, one sample after the other
-        self._low, self._high = (
-            np.tile(
-                np.concatenate([
-                    np.zeros(0),
-                    *(np.broadcast_to(np.asarray(end, float), (limit.output.size,)) for end, limit in ends),
-                ]),
-                horizon,
-            )
-            for ends in (
-                [(limit.low, limit) for limit in self.soft], [(limit.high, limit) for limit in self.soft]
-            )
-        )  # fmt: skip
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
+        ends = np.concatenate([
+            np.zeros((2, 0)),
+            *([np.full(limit.output.size, end) for end in (limit.low, limit.high)] for limit in self.soft),
+        ], axis=1)  # fmt: skip
+        # at every sample of the horizon, one sample after the other
+        self._low, self._high = np.tile(ends, horizon)
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Forget the plan; the control acts now. The observer keeps its state."""
@@ -101,15 +94,15 @@ class PredictiveController(PlanController):
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the control from the prepared prediction, corrected by the measurement."""
         coordinates = self.observer.update(measured)
-        prediction, soft = self._prediction, None
+        prediction = self._prediction
         if prediction is None:
             return self.fallback(self._reason)
         error = prediction.error + np.tensordot(coordinates, prediction.by_state, 1)
+        problem = self.tracking.program(error, prediction.by_plan, self._plan, self._control)
         if self.soft:
             value = prediction.limited + np.tensordot(coordinates, prediction.limited_by_state, 1)
             slopes = prediction.limited_by_plan.reshape(len(prediction.limited_by_plan), -1)
-            soft = SoftRows(value.ravel(), slopes, self._low, self._high)
-        problem = self.tracking.program(error, prediction.by_plan, self._plan, self._control, soft)
+            problem = problem.with_soft_rows(slopes.T, self._low - value.ravel(), self._high - value.ravel())
         x = qp.solve(problem)
         if x is None:
             return self.fallback("the quadratic program was not solved")

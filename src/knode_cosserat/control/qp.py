@@ -30,6 +30,12 @@ class QuadraticProgram(NamedTuple):
     above: Float[np.ndarray, " m"]
     soft: int = 0
 
+    def with_soft_rows(self, A: Any, below: Any, above: Any) -> QuadraticProgram:
+        """Return the program with soft rows (k, n) after its own."""
+        rows = zip((self.A, self.below, self.above), (A, below, above), strict=True)
+        A, below, above = map(np.concatenate, rows)
+        return self._replace(A=A, below=below, above=above, soft=len(A) - len(self.A))
+
 
 def require_daqp() -> None:
     """Raise `ImportError` in one line if DAQP is not installed."""

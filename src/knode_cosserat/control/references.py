@@ -38,13 +38,13 @@ class Reference:
     def at(self, times: Any) -> Float[np.ndarray, "T p"]:
         """Return the values at times (s)."""
         times = np.atleast_1d(np.asarray(times, dtype=float))
-        found = np.asarray(self.values(times), dtype=float)
-        if found.shape != (len(times), self.size):
+        rows = np.asarray(self.values(times), dtype=float)
+        if rows.shape != (len(times), self.size):
             raise ReferenceFormatError(
-                f"the reference {self.name} gives shape {found.shape} for {len(times)} times; "
+                f"the reference {self.name} gives shape {rows.shape} for {len(times)} times; "
                 f"allowed is ({len(times)}, {self.size})"
             )
-        return found
+        return rows
 
     def expected(self, time: float, later: Any) -> Float[np.ndarray, "T p"]:
         """Return the values (T, p) that are expected at a time (s), some seconds `later` (T,)."""
@@ -56,12 +56,6 @@ def constant(value: Sequence[float]) -> Reference:
     """Return a reference that does not change."""
     one = np.asarray(value, dtype=float)
     return Reference(lambda t: np.tile(one, (len(t), 1)), len(one), f"constant {one.tolist()}")
-
-
-def _eased(t: Any, rise: float) -> Any:
-    """Return a factor from 0 to 1 in the first `rise` seconds, with continuous acceleration."""
-    part = np.clip(t / rise, 0.0, 1.0) if rise else np.ones_like(t)
-    return part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
 
 
 def circle(
@@ -80,30 +74,28 @@ def circle(
     Raises:
         ReferenceFormatError: a radius, period, centre or plane that is not allowed.
     """
-
-    def shape(angle: Any) -> tuple[Any, Any]:
-        return np.cos(angle), np.sin(angle)
-
-    return _closed_path("circle", shape, radius, period, centre, rise, plane)
+    return _closed_path("circle", lambda a: (np.cos(a), np.sin(a)), (radius, period, rise), (plane, centre))
 
 
 def figure_eight(
     radius: float, period: float, centre: Sequence[float] | None = None, rise: float = 2.0, plane: str = "xy"
 ) -> Reference:
     """Return a figure of eight (Gerono's lemniscate) of half-width `radius` (m); see `circle`."""
-
-    def shape(angle: Any) -> tuple[Any, Any]:
-        return np.sin(angle), np.sin(angle) * np.cos(angle)
-
-    return _closed_path("figure of eight", shape, radius, period, centre, rise, plane)
+    eight = "figure of eight"
+    return _closed_path(
+        eight, lambda a: (np.sin(a), np.sin(a) * np.cos(a)), (radius, period, rise), (plane, centre)
+    )
 
 
 def _closed_path(
-    name: str, shape: Callable[[Any], tuple[Any, Any]], radius: float, period: float, centre: Any,
-    rise: float, plane: str,
-) -> Reference:  # fmt: skip
-    """Return a path of the tip by the two coordinates of a unit shape (from an angle) in a plane."""
-    _positive(radius=radius, period=period)
+    name: str, shape: Callable[[Any], tuple[Any, Any]], size: tuple[float, float, float], place: Any
+) -> Reference:
+    """Return a path of the tip by the two coordinates of a unit shape (from an angle) in a plane.
+
+    `size` has the radius, the period and the rise, `place` the plane and the centre.
+    """
+    (radius, period, rise), (plane, centre) = size, place
+    _require_positive(radius=radius, period=period)
     axes = ["xyz".find(axis) for axis in plane]
     if len(axes) != 2 or -1 in axes or axes[0] == axes[1]:
         raise ReferenceFormatError(f"plane is {plane!r}; allowed is two different axes, such as xy, yz or xz")
@@ -115,9 +107,12 @@ def _closed_path(
             raise ReferenceFormatError(f"centre is {centre}; allowed is three numbers (m), NaN if free")
 
     def values(t: Any) -> Any:
-        away = np.zeros((len(t), 3))
-        away[:, axes] = (radius * _eased(t, rise) * np.stack(shape(2.0 * np.pi * t / period))).T
-        return middle + away
+        part = np.clip(t / rise, 0.0, 1.0) if rise else np.ones_like(t)
+        # with continuous acceleration
+        growing = radius * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+        offset = np.zeros((len(t), 3))
+        offset[:, axes] = (growing * np.stack(shape(2.0 * np.pi * t / period))).T
+        return middle + offset
 
     usual = plane == "xy" and np.array_equal(middle, [0.0, 0.0, np.nan], equal_nan=True)
     where = "" if usual else f" in {plane} about {middle.tolist()} m"
@@ -129,7 +124,7 @@ def steps(points: Sequence[Sequence[float]], hold: float, announced: bool = Fals
 
     A predictive controller leaves a point before an `announced` step, for the mean error is then smaller.
     """
-    _positive(hold=hold)
+    _require_positive(hold=hold)
     table = np.asarray(points, dtype=float)
     if table.ndim != 2:
         raise ReferenceFormatError(f"points have shape {table.shape}; allowed is (points, p)")
@@ -161,14 +156,15 @@ def table(time: Sequence[float], values: Any) -> Reference:
     return Reference(interpolated, rows.shape[1], f"table of {len(t)} rows")
 
 
-def _positive(**numbers: float) -> None:
+def _require_positive(**numbers: float) -> None:
     for name, number in numbers.items():
         if not (np.isfinite(number) and number > 0.0):
             raise ReferenceFormatError(f"{name} is {number}; allowed is a positive number")
 
 
-#: references by name, for the command line
+#: references by name, for the command line, and their options
 NAMED: dict[str, Callable[..., Reference]] = {"circle": circle, "eight": figure_eight}
+OPTIONS = ("radius", "period", "rise", "plane", "x", "y", "z")
 
 
 def parse_reference(text: str) -> Reference:
@@ -188,9 +184,9 @@ def parse_reference(text: str) -> Reference:
         )
     options: dict[str, Any] = {}
     for part in filter(None, rest.split(",")):
-        key, _, value = (each.strip() for each in part.partition("="))
-        if key not in _OPTIONS:
-            raise ReferenceFormatError(f"{name} has no option {key!r}; there are {', '.join(_OPTIONS)}")
+        key, _, value = (word.strip() for word in part.partition("="))
+        if key not in OPTIONS:
+            raise ReferenceFormatError(f"{name} has no option {key!r}; there are {', '.join(OPTIONS)}")
         try:
             options[key] = value if key == "plane" else float(value)
         except ValueError:
@@ -201,7 +197,3 @@ def parse_reference(text: str) -> Reference:
     plane = options.get("plane", "xy")
     centre = [options.pop(axis, 0.0 if axis in plane else np.nan) for axis in "xyz"]
     return NAMED[name](**options, centre=centre)
-
-
-#: options of the references by name
-_OPTIONS = ("radius", "period", "rise", "plane", "x", "y", "z")

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, Status, register_controller
+from knode_cosserat.control.commands import Command, Controller, ControlLimits, register_controller
 from knode_cosserat.control.lqr import PRELOAD
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
@@ -21,62 +21,21 @@ DAMPING = 1e-2
 CORRECTIONS, ENOUGH = 4, 1e-5
 
 
-class StaticMap:
-    """Tip positions of equilibria, their Jacobian, and the inverse by damped least squares."""
+class _TipFeedback(Controller):
+    """Base of controllers that act on the measured position of the tip, by tip positions of equilibria."""
 
-    def __init__(self, robot: System, limits: ControlLimits):
+    def __init__(self, robot: System, dt: float, limits: ControlLimits):
         """Solve the equilibrium under the preload.
 
         Raises:
             SimulationError: there is no equilibrium there.
         """
-        self.robot, self.limits = robot, limits
-        self._settings = static_settings("lobatto2", NewtonOptions())
-        low, high = np.asarray(limits.low), np.asarray(limits.high)
-        self.preload = low + PRELOAD * (high - low)
-        self._found = first_solved(robot, self._settings, tip_pose, self.preload)
-
-    def solved(self, control: Any) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 c"], bool]:
-        """Return the tip's position (m), its Jacobian (m per control), and True if it was solved."""
-        found = respond(self.robot, self._settings, tip_pose, control, self._found.y)
-        if bool(found.error <= self._settings.newton.acceptable):
-            self._found = found
-            return np.asarray(found.position), np.asarray(found.jacobian)[:3], True
-        return np.asarray(self._found.position), np.asarray(self._found.jacobian)[:3], False
-
-    def inverse(self, position: Float[np.ndarray, "3"], control: Any) -> Float[np.ndarray, " c"]:
-        """Return controls within the limits whose equilibrium has the tip nearest to a position (m).
-
-        NaN coordinates are free. The search starts at a control and stays near the preload.
-        """
-        known = np.isfinite(position)
-        control = np.array(control, dtype=float)
-        for _ in range(CORRECTIONS):
-            here, jacobian, solved = self.solved(control)
-            error = (np.asarray(position) - here)[known]
-            if not solved or np.max(np.abs(error), initial=0.0) < ENOUGH:
-                break
-            control = np.clip(
-                control + self.step(error, jacobian[known], control), self.limits.low, self.limits.high
-            )
-        return control
-
-    def step(self, error: Any, jacobian: Any, control: Any) -> Float[np.ndarray, " c"]:
-        """Return the change of controls by damped least squares, as near to the preload as possible."""
-        U, s, Vt = np.linalg.svd(jacobian, full_matrices=False)
-        gains = s / (s * s + (DAMPING * s[0]) ** 2)
-        null = np.eye(len(control)) - Vt.T @ Vt
-        away = self.preload - control
-        return Vt.T @ (gains * (U.T @ error)) + 0.5 * null @ away
-
-
-class TipFeedback(Controller):
-    """Base of controllers that act on the measured position of the tip."""
-
-    def __init__(self, robot: System, dt: float, limits: ControlLimits):
         self.robot, self.dt = robot, float(dt)
         self.limits = limits.of(robot)
-        self.map = StaticMap(robot, self.limits)
+        self._settings = static_settings("lobatto2", NewtonOptions())
+        low, high = np.asarray(self.limits.low), np.asarray(self.limits.high)
+        self.preload = low + PRELOAD * (high - low)
+        self._response = first_solved(robot, self._settings, tip_pose, self.preload)
         self.reset(np.asarray(self.limits.safe))
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
@@ -84,19 +43,39 @@ class TipFeedback(Controller):
         self._control = np.array(control, dtype=float)
         self._sum, self._last = np.zeros(3), np.full(3, np.nan)
 
+    def _solved(self, control: Any) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 c"], bool]:
+        """Return the tip's position (m), its Jacobian (m per control), and True if it was solved.
+
+        Without a solution they are those of the last one.
+        """
+        response = respond(self.robot, self._settings, tip_pose, control, self._response.y)
+        solved = bool(response.error <= self._settings.newton.acceptable)
+        if solved:
+            self._response = response
+        return np.asarray(self._response.position), np.asarray(self._response.jacobian)[:3], solved
+
+    def _step(self, error: Any, jacobian: Any, control: Any) -> Float[np.ndarray, " c"]:
+        """Return the change of controls by damped least squares, as near to the preload as possible."""
+        U, s, Vt = np.linalg.svd(jacobian, full_matrices=False)
+        gains = s / (s * s + (DAMPING * s[0]) ** 2)
+        null = np.eye(len(control)) - Vt.T @ Vt
+        return Vt.T @ (gains * (U.T @ error)) + 0.5 * null @ (self.preload - control)
+
     def _error(self, time: float, measured: Any, reference: Reference) -> Float[np.ndarray, "3"]:
         """Return the wanted less the measured position (m); zero where either is unknown or free."""
         error = reference.at([time])[0, :3] - np.asarray(measured, dtype=float)[:3]
         return np.where(np.isfinite(error), error, 0.0)
 
-    def _applied(self, wanted: Any) -> Command:
-        """Return a command within the limits."""
-        self._control = self.limits.applied(wanted, self._control, self.dt)
-        return Command(self._control, Status.OPTIMAL)
+    def _applied(self, control: Any, total: Float[np.ndarray, "3"]) -> Command:
+        """Return a command within the limits; the integral becomes `total` unless they clip the control."""
+        self._control = self.limits.applied(control, self._control, self.dt)
+        if np.allclose(self._control, control):  # no wind-up
+            self._sum = total
+        return Command(self._control)
 
 
 @register_controller("pid", "PID of the tip's error, through the static Jacobian")
-class PID(TipFeedback):
+class PID(_TipFeedback):
     """PID control of the tip's position, through the static Jacobian of the robot under a preload.
 
     The error is mapped to controls by damped least squares; the integral stops where controls are limited.
@@ -109,7 +88,7 @@ class PID(TipFeedback):
         """Set the gains: dimensionless, in 1/s, and in s."""
         self._gains = proportional, integral, derivative
         super().__init__(robot, dt, limits)
-        _, self._jacobian, _ = self.map.solved(self.map.preload)
+        _, self._jacobian, _ = self._solved(self.preload)
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the control from the error of the tip."""
@@ -119,17 +98,13 @@ class PID(TipFeedback):
         total = self._sum + error * self.dt
         proportional, integral, derivative = self._gains
         wanted = (proportional * error + integral * total + derivative * change)[known]
-        preload = self.map.preload
-        control = preload + self.map.step(wanted, self._jacobian[known], preload)
-        found = self._applied(control)
-        if np.allclose(found.control, control):  # no wind-up
-            self._sum = total
         self._last = error
-        return found
+        step = self._step(wanted, self._jacobian[known], self.preload)
+        return self._applied(self.preload + step, total)
 
 
 @register_controller("kinematic", "inverse kinematics of equilibria, with an integral")
-class KinematicController(TipFeedback):
+class KinematicController(_TipFeedback):
     """Inverse kinematics of equilibria as feed-forward, with an integral of the tip's error."""
 
     def __init__(self, robot: System, dt: float, limits: ControlLimits, *, integral: float = 0.5):
@@ -141,8 +116,20 @@ class KinematicController(TipFeedback):
         """Return the control whose equilibrium is the wanted position, shifted by the integral."""
         total = self._sum + self._integral * self.dt * self._error(time, measured, reference)
         wanted = reference.expected(time, self.dt)[0, :3] + total
-        control = self.map.inverse(wanted, self._control)
-        found = self._applied(control)
-        if np.allclose(found.control, control):
-            self._sum = total
-        return found
+        return self._applied(self._inverse(wanted), total)
+
+    def _inverse(self, position: Float[np.ndarray, "3"]) -> Float[np.ndarray, " c"]:
+        """Return controls within the limits whose equilibrium has the tip nearest to a position (m).
+
+        NaN coordinates are free. The search starts at the control that acts and stays near the preload.
+        """
+        known = np.isfinite(position)
+        control = self._control
+        for _ in range(CORRECTIONS):
+            tip, jacobian, solved = self._solved(control)
+            error = (position - tip)[known]
+            if not solved or np.max(np.abs(error), initial=0.0) < ENOUGH:
+                break
+            step = self._step(error, jacobian[known], control)
+            control = np.clip(control + step, self.limits.low, self.limits.high)
+        return control

@@ -1,4 +1,4 @@
-"""Pure functions of an environment: settings, reset, and steps of many episodes at once.
+"""Pure functions of an environment: reset, and steps of many episodes at once.
 
 The motion is that of `simulate`. All but the solution of the steps is computed for all robots together.
 """
@@ -17,19 +17,18 @@ from jaxtyping import Bool, Float, Int
 
 from knode_cosserat.control import ControlLimits
 from knode_cosserat.engine.pattern import Pattern
-from knode_cosserat.envs.tasks import Randomisation, Survey, Task, TaskError, Tip
+from knode_cosserat.envs.tasks import Survey, Task, Tip
+from knode_cosserat.estimation.online import split_record
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
 from knode_cosserat.solvers.history import StateHistory, StepRows, rest_record, resting_history
-from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.simulate import checked_dt
 
 Actions = Literal["tension", "increment"]
 
@@ -54,14 +53,14 @@ class Ending(enum.IntEnum):
     @property
     def message(self) -> str:
         """The reason in words."""
-        return {
-            Ending.RUNNING: "running",
-            Ending.TERMINATED: "the task ended",
-            Ending.TIME_LIMIT: "time limit",
-            Ending.UNSOLVED: "the step was not solved; the state is the one before it",
-            Ending.COARSE: "the grid is too coarse for this shape; use more nodes",
-            Ending.INVALID_ACTION: "the action is not finite; the control was held",
-        }[self]
+        return (
+            "running",
+            "the task ended",
+            "time limit",
+            "the step was not solved; the state is the one before it",
+            "the grid is too coarse for this shape; use more nodes",
+            "the action is not finite; the control was held",
+        )[self]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,71 +136,6 @@ def commanded(
     return jnp.clip(wanted, arrays.low, arrays.high)
 
 
-def specified(
-    robot: System, task: Task, randomisation: Randomisation, limits: ControlLimits | None, *, dt: float,
-    duration: float, actions: Actions, bodies: tuple[float, ...], seed: int,
-) -> tuple[Spec, Arrays]:  # fmt: skip
-    """Return settings and arrays of an environment.
-
-    Raises:
-        TaskError: settings that are not allowed, or a task that this robot cannot do.
-        ParameterError: a parameter that does not exist.
-    """
-    if np.ndim(robot.length):
-        raise TaskError(
-            "an environment has one robot, not a batch; use Randomisation(models=...) for several"
-        )
-    if actions not in ("tension", "increment"):
-        raise TaskError(f'actions is {actions!r}; allowed is "tension" or "increment"')
-    dt = checked_dt(dt)
-    steps = round(duration / dt) if np.isfinite(duration) else 0
-    if steps < 1:
-        raise TaskError(f"duration is {duration!r} s; allowed is at least one period, {dt:g} s")
-    if limits is None:
-        if set(robot.control_layout.names) != {"tension"}:
-            names = ", ".join(f"{field.name} ({field.unit})" for field in robot.control_layout.fields)
-            raise TaskError(f"limits are needed for the controls {names}: give kc.control.ControlLimits")
-        limits = TENSIONS
-    try:
-        within = limits.of(robot)
-    except ValueError as error:
-        raise TaskError(f"limits: {error}") from None
-    if actions == "increment" and not np.all(np.isfinite(within.rate)):
-        raise TaskError("increments need a finite rate of the limits")
-    equipped = task.equipped(robot)
-    if set(equipped.control_layout.names) != set(robot.control_layout.names):
-        raise TaskError(f"the task {task.name} adds controls to the robot; that is not allowed")
-    least, greatest = randomisation.ends(equipped)
-    settings = Settings()
-    models = tuple(task.equipped(model) for model in randomisation.models)
-    for model in models:
-        if model.control_layout.size != equipped.control_layout.size:
-            raise TaskError(
-                f"a model has {model.control_layout.size} controls, the robot "
-                f"{equipped.control_layout.size}; allowed are models of this robot"
-            )
-    if len({jax.tree.structure(model) for model in models}) > 1:
-        raise TaskError("the models must be of one class, with the same nodes and options")
-    stacked = (
-        jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(leaf) for leaf in leaves]), *models)
-        if models
-        else None
-    )
-    spec = Spec(
-        task, dt, steps, actions, settings, BodyPositions(bodies), tuple(randomisation.parameters),
-        float(randomisation.change), (randomisation.delay[0], randomisation.delay[1]), len(models),
-    )  # fmt: skip
-    rest = None
-    if Ends.of(equipped).rest_is_guess:
-        at_start = initial_state(equipped, settings)
-        rest = (at_start.state.history, at_start.record)
-    arrays = Arrays(
-        equipped, stacked, least, greatest, within.low, within.high, within.rate,
-        within.safe, float(randomisation.noise), task.survey(robot, within, seed), rest,
-    )  # fmt: skip
-    return spec, arrays
-
-
 # episodes
 
 
@@ -242,12 +176,6 @@ class Transition(NamedTuple):
     control: Float[Any, " c"]
 
 
-def observation_size(spec: Spec, arrays: Arrays) -> int:
-    """Return the number of numbers in an observation."""
-    per_target = len(PREVIEW) * spec.task.target_size
-    return MEASURED * spec.output.size + len(arrays.low) + per_target + 3 + spec.task.observed
-
-
 # an episode's robot
 
 
@@ -261,14 +189,11 @@ def _assembled(spec: Spec, arrays: Arrays, drawn: Any, model: Any, goal: Any) ->
     system: System = arrays.robot
     if spec.models:
         system = jax.tree.map(lambda leaf: leaf[model], arrays.models)
-    if spec.names:
-        system = system.replace(
-            **{
-                name: arrays.least[name] + drawn[k] * (arrays.greatest[name] - arrays.least[name])
-                for k, name in enumerate(spec.names)
-            }
-        )
-    return spec.task.placed(system, goal)
+    values = {
+        name: arrays.least[name] + drawn[k] * (arrays.greatest[name] - arrays.least[name])
+        for k, name in enumerate(spec.names)
+    }
+    return spec.task.placed(system.replace(**values) if values else system, goal)
 
 
 # measurements
@@ -294,9 +219,9 @@ def clearance_of(system: System, y: Float[Any, "N y"]) -> Float[Any, ""]:
     return jnp.min(jnp.stack(distances)) - radius
 
 
-def _measured(spec: Spec, arrays: Arrays, key: Any, system: System, y: Any, z: Any) -> Any:
-    value = spec.output.value(system, y, z)
-    return value + arrays.noise * jax.random.normal(key, value.shape)
+def _noisy(arrays: Arrays, key: Any, positions: Float[Any, " p"]) -> Float[Any, " p"]:
+    """Return measurements of positions (m)."""
+    return positions + arrays.noise * jax.random.normal(key, positions.shape)
 
 
 def observed(spec: Spec, arrays: Arrays, state: Any) -> Float[Any, " o"]:
@@ -305,8 +230,7 @@ def observed(spec: Spec, arrays: Arrays, state: Any) -> Float[Any, " o"]:
     Lengths are in lengths of the nominal robot from its tip at rest, and controls from -1 to 1.
     """
     length, origin = nominal_model(arrays.robot).length, arrays.survey.origin
-    bodies = state.measured.reshape(MEASURED, -1, 3)
-    measured = (bodies - origin) / length
+    measured = (state.measured.reshape(MEASURED, -1, 3) - origin) / length
     control = scaled(arrays, state.commands[0])
     times = (state.count + np.asarray(PREVIEW)) * spec.dt
     targets = jax.vmap(lambda t: spec.task.target(state.goal, t))(times)
@@ -335,9 +259,7 @@ def reset(spec: Spec, arrays: Arrays, key: Any) -> tuple[EpisodeState, Float[Any
         history, record = resting_history(system, spec.settings), rest_record(system)
     else:
         history, record = arrays.rest
-    ny = system.y_layout.size
-    y, z = record[:, :ny], record[:, ny : ny + system.z_layout.size]
-    measured = _measured(spec, arrays, noise_key, system, y, z)
+    measured = _noisy(arrays, noise_key, spec.output.value(system, *split_record(system, record)))
     state = EpisodeState(
         history, goal, drawn, changes_at, model, jnp.tile(arrays.start, (spec.delay[1] + 1, 1)), delay,
         jnp.tile(measured, (MEASURED, 1)), jnp.array(0), key,
@@ -348,111 +270,87 @@ def reset(spec: Spec, arrays: Arrays, key: Any) -> tuple[EpisodeState, Float[Any
 # steps
 
 
-class Move(NamedTuple):
-    """Command of a step, before it is solved."""
-
-    system: Any
-    state: EpisodeState
-    acting: Float[Any, " c"]
-    valid: Any
-
-
-def _moved_one(spec: Spec, arrays: Arrays, state: EpisodeState, action: Any) -> Move:
-    """Return the command of an action, and the acting control after its delay."""
-    before, action = state.commands[0], jnp.asarray(action, dtype=float)
-    valid = jnp.all(jnp.isfinite(action))
-    command = commanded(spec, arrays, before, jnp.where(valid, action, 0.0))
-    command = jnp.where(valid, command, before)
-    commands = jnp.concatenate([command[None], state.commands[:-1]])
-    history = state.history._replace(t0=jnp.asarray(state.count * spec.dt, dtype=float))
-    state = state._replace(commands=commands, history=history)
-    system = None if spec.is_shared else system_of(spec, arrays, state)
-    return Move(system, state, commands[state.delay], valid)
-
-
-def _arrived_one(
-    spec: Spec, arrays: Arrays, move: Move, history: StateHistory, row: StepRows
+def step_many(
+    spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]
 ) -> tuple[EpisodeState, Transition]:
-    """Return the state after a solved step, and its outcome; without a solution the state before it."""
-    state, system = move.state, arrays.robot if spec.is_shared else move.system
-    solved, ny = row.result >= 0, system.y_layout.size
-    coarse = row.result == int(Result.COARSE)
-    record = jnp.where(solved, row.records, 0.0)
-    y, z = record[:, :ny], record[:, ny : ny + system.z_layout.size]
-    key, noise_key = jax.random.split(state.key)
-    measured = jnp.where(solved, _measured(spec, arrays, noise_key, system, y, z), state.measured[0])
-    count = state.count + 1
-    state = state._replace(
-        history=history, measured=jnp.concatenate([measured[None], state.measured[:-1]]), count=count,
-        key=key,
-    )  # fmt: skip
-    tip = tip_of(system, y)
-    tip = Tip(jnp.where(solved, tip.position, state.measured[0, -3:]), tip.tangent)
-    clearance = jnp.where(solved, clearance_of(system, y), jnp.inf)
-    t, length = count * spec.dt, nominal_model(arrays.robot).length
-    reward, terminated, error = spec.task.outcome(state.goal, t, tip, clearance, length)
-    usable = solved & ~coarse & move.valid
-    terminated = terminated & usable
-    ending = jnp.select(
-        [~move.valid, ~solved, coarse, terminated, count >= spec.steps],
-        [Ending.INVALID_ACTION, Ending.UNSOLVED, Ending.COARSE, Ending.TERMINATED, Ending.TIME_LIMIT],
-        Ending.RUNNING,
+    """Return the states after one period of many episodes under actions (B, c), and their transitions."""
+    systems, states, acting, valid = _moved(spec, arrays, states, actions)
+    task = TimeIntegration(spec.settings, spec.dt, 1, spec.settings.memory)
+    if is_traced((arrays, states, actions)):
+        solve, axes = rollout(task, Pattern.of(systems)), (None if spec.is_shared else 0, 0, 0)
+        rows, histories = jax.vmap(solve, in_axes=axes)(systems, acting, states.history)
+    else:
+        _, histories, rows = task.solve(systems, np.asarray(acting), states.history)
+    after: tuple[EpisodeState, Transition] = _arrived(
+        spec, arrays, systems, states._replace(history=histories), (rows, valid)
     )
-    truncated = (ending != Ending.RUNNING) & ~terminated
-    transition = Transition(
-        observed(spec, arrays, state), jnp.where(usable, reward, 0.0).astype(jnp.float32), terminated,
-        truncated, ending, error, tip.position, clearance, state.commands[0],
-    )  # fmt: skip
-    return state, transition
+    return after
 
 
-# compiled programs of many episodes
+@functools.partial(jax.jit, static_argnames="spec")
+def _moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Any:
+    """Return systems, states with the commands of actions, acting controls (B, 1, c), and valid actions."""
+
+    def moved(state: EpisodeState, action: Any) -> Any:
+        before, action = state.commands[0], jnp.asarray(action, dtype=float)
+        valid = jnp.all(jnp.isfinite(action))
+        command = commanded(spec, arrays, before, jnp.where(valid, action, 0.0))
+        commands = jnp.concatenate([jnp.where(valid, command, before)[None], state.commands[:-1]])
+        history = state.history._replace(t0=jnp.asarray(state.count * spec.dt, dtype=float))
+        state = state._replace(commands=commands, history=history)
+        system = None if spec.is_shared else system_of(spec, arrays, state)
+        return system, state, commands[state.delay][None], valid
+
+    systems, *rest = jax.vmap(moved)(states, actions)
+    return arrays.robot if spec.is_shared else systems, *rest
+
+
+@functools.partial(jax.jit, static_argnames="spec")
+def _arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solution: Any) -> Any:
+    """Return the states after a solved step, with rows (B, 1, ...), and the transitions.
+
+    `solution` has the rows, and True for valid actions. Without a solution, the state is the one before.
+    """
+
+    def arrived(system: System, state: EpisodeState, row: StepRows, valid: Any) -> Any:
+        solved, coarse = row.result >= 0, row.result == int(Result.COARSE)
+        y, z = split_record(system, jnp.where(solved, row.records, 0.0))
+        key, noise_key = jax.random.split(state.key)
+        positions = _noisy(arrays, noise_key, spec.output.value(system, y, z))
+        measured = jnp.concatenate([
+            jnp.where(solved, positions, state.measured[0])[None], state.measured[:-1]
+        ])  # fmt: skip
+        count = state.count + 1
+        state = state._replace(measured=measured, count=count, key=key)
+        tip = tip_of(system, y)
+        tip = Tip(jnp.where(solved, tip.position, measured[0, -3:]), tip.tangent)
+        clearance = jnp.where(solved, clearance_of(system, y), jnp.inf)
+        t, length = count * spec.dt, nominal_model(arrays.robot).length
+        error = spec.task.error(state.goal, t, tip)
+        reward = spec.task.reward(error, clearance, length)
+        usable = solved & ~coarse & valid
+        terminated = spec.task.is_over(state.goal, t, tip) & usable
+        ending = jnp.select(
+            [~valid, ~solved, coarse, terminated, count >= spec.steps],
+            [Ending.INVALID_ACTION, Ending.UNSOLVED, Ending.COARSE, Ending.TERMINATED, Ending.TIME_LIMIT],
+            Ending.RUNNING,
+        )
+        truncated = (ending != Ending.RUNNING) & ~terminated
+        transition = Transition(
+            observed(spec, arrays, state), jnp.where(usable, reward, 0.0).astype(jnp.float32), terminated,
+            truncated, ending, error, tip.position, clearance, state.commands[0],
+        )  # fmt: skip
+        return state, transition
+
+    rows, valid = solution
+    rows = jax.tree.map(lambda leaf: leaf[:, 0], rows)
+    return jax.vmap(arrived, in_axes=(None if spec.is_shared else 0, 0, 0, 0))(systems, states, rows, valid)
 
 
 @functools.partial(jax.jit, static_argnames="spec")
 def reset_many(spec: Any, arrays: Any, keys: Any) -> Any:
     """Return states and observations at the starts of episodes, for keys (B, 2)."""
     return jax.vmap(lambda key: reset(spec, arrays, key))(keys)
-
-
-def step_many(
-    spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]
-) -> tuple[EpisodeState, Transition]:
-    """Return the states after one period of many episodes under actions (B, c), and their transitions."""
-    traced = is_traced((arrays, states, actions))
-    moves = (_moved if traced else _compiled_moved)(spec, arrays, states, actions)
-    systems = arrays.robot if spec.is_shared else moves.system
-    task, acting, histories = (
-        TimeIntegration(spec.settings, spec.dt, 1, spec.settings.memory),
-        moves.acting[:, None],
-        moves.state.history,
-    )
-    if traced:
-        solve = rollout(task, Pattern.of(systems))
-        rows, histories = jax.vmap(solve, in_axes=(None if spec.is_shared else 0, 0, 0))(
-            systems, acting, histories
-        )
-        return _arrived(spec, arrays, moves, histories, rows)
-    _, histories, rows = task.solve(systems, np.asarray(acting), histories)
-    arrived: tuple[EpisodeState, Transition] = _compiled_arrived(spec, arrays, moves, histories, rows)
-    return arrived
-
-
-def _moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Move:
-    """Return the commands of many episodes."""
-    return jax.vmap(lambda state, action: _moved_one(spec, arrays, state, action))(states, actions)
-
-
-def _arrived(
-    spec: Spec, arrays: Arrays, moves: Move, histories: StateHistory, rows: StepRows
-) -> tuple[EpisodeState, Transition]:
-    """Return the states after a solved step of many episodes, with rows (B, 1, ...), and the transitions."""
-    rows = jax.tree.map(lambda leaf: leaf[:, 0], rows)
-    return jax.vmap(lambda *parts: _arrived_one(spec, arrays, *parts))(moves, histories, rows)
-
-
-_compiled_moved = jax.jit(_moved, static_argnames="spec")
-_compiled_arrived = jax.jit(_arrived, static_argnames="spec")
 
 
 @functools.partial(jax.jit, static_argnames="spec", donate_argnames="states")

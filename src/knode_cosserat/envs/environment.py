@@ -14,11 +14,16 @@ from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.control import ControlLimits, Reference
 from knode_cosserat.envs import dynamics
-from knode_cosserat.envs.dynamics import Actions, EpisodeState, Transition, specified
+from knode_cosserat.envs.dynamics import TENSIONS, Actions, Arrays, EpisodeState, Spec, Transition
 from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError
+from knode_cosserat.estimation.outputs import BodyPositions
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.run import usable_cores
+from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.simulate import checked_dt
 
 #: robot of an environment by default
 ROBOT = "delrin-tendon-robot"
@@ -57,15 +62,62 @@ class Environment:
             TaskError: settings that are not allowed, or a task that this robot cannot do.
             ParameterError: a randomised parameter that does not exist.
         """
-        chosen = task.randomisation() if randomisation is None else randomisation
-        if not isinstance(chosen, Randomisation):
-            raise TaskError(f"randomisation is {type(chosen).__name__}; allowed is a Randomisation, or None")
+        randomisation = task.randomisation() if randomisation is None else randomisation
+        if not isinstance(randomisation, Randomisation):
+            kind = type(randomisation).__name__
+            raise TaskError(f"randomisation is {kind}; allowed is a Randomisation, or None")
         if not bodies or bodies[-1] != 1.0:
             raise TaskError(f"bodies is {bodies!r}; the last one must be 1.0, the tip")
-        self.task, self.robot, self.randomisation = task, robot, chosen
-        self.spec, self.arrays = specified(
-            robot, task, chosen, limits, dt=dt, duration=duration, actions=actions, bodies=bodies, seed=seed
+        if np.ndim(robot.length):
+            raise TaskError(
+                "an environment has one robot, not a batch; use Randomisation(models=...) for several"
+            )
+        if actions not in ("tension", "increment"):
+            raise TaskError(f'actions is {actions!r}; allowed is "tension" or "increment"')
+        dt = checked_dt(dt)
+        steps = round(duration / dt) if np.isfinite(duration) else 0
+        if steps < 1:
+            raise TaskError(f"duration is {duration!r} s; allowed is at least one period, {dt:g} s")
+        controls = robot.control_layout
+        if limits is None and set(controls.names) != {"tension"}:
+            names = ", ".join(f"{field.name} ({field.unit})" for field in controls.fields)
+            raise TaskError(f"limits are needed for the controls {names}: give kc.control.ControlLimits")
+        try:
+            within = (limits or TENSIONS).of(robot)
+        except ValueError as error:
+            raise TaskError(f"limits: {error}") from None
+        if actions == "increment" and not np.all(np.isfinite(within.rate)):
+            raise TaskError("increments need a finite rate of the limits")
+        equipped = task.equipped(robot)
+        if set(equipped.control_layout.names) != set(controls.names):
+            raise TaskError(f"the task {task.name} adds controls to the robot; that is not allowed")
+        models = [task.equipped(model) for model in randomisation.models]
+        for model in models:
+            if model.control_layout.size != equipped.control_layout.size:
+                raise TaskError(
+                    f"a model has {model.control_layout.size} controls, the robot "
+                    f"{equipped.control_layout.size}; allowed are models of this robot"
+                )
+        if len({jax.tree.structure(model) for model in models}) > 1:
+            raise TaskError("the models must be of one class, with the same nodes and options")
+        stacked = (
+            jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), *models)
+            if models
+            else None
         )
+        settings, rest = Settings(), None
+        if Ends.of(equipped).rest_is_guess:
+            at_start = initial_state(equipped, settings)
+            rest = (at_start.state.history, at_start.record)
+        self.task, self.robot, self.randomisation = task, robot, randomisation
+        self.spec = Spec(
+            task, dt, steps, actions, settings, BodyPositions(bodies), tuple(randomisation.parameters),
+            float(randomisation.change), (randomisation.delay[0], randomisation.delay[1]), len(models),
+        )  # fmt: skip
+        self.arrays = Arrays(
+            equipped, stacked, *randomisation.ends(equipped), within.low, within.high, within.rate,
+            within.safe, float(randomisation.noise), task.survey(robot, within, seed), rest,
+        )  # fmt: skip
 
     @property
     def dt(self) -> float:
@@ -85,7 +137,9 @@ class Environment:
     @property
     def observation_size(self) -> int:
         """Number of numbers in an observation."""
-        return dynamics.observation_size(self.spec, self.arrays)
+        task, measured = self.task, dynamics.MEASURED * self.spec.output.size
+        targets = len(dynamics.PREVIEW) * task.target_size
+        return measured + self.action_size + targets + 3 + task.observed
 
     @property
     def limits(self) -> ControlLimits:
@@ -147,9 +201,8 @@ def make(task: str | Task, robot: str | System = ROBOT, **settings: Any) -> Envi
     """
     if isinstance(task, str):
         if task not in TASKS:
-            raise TaskError(
-                f"there is no task {task!r}; there are {', '.join(TASKS)}{did_you_mean(task, TASKS)}"
-            )
+            names = ", ".join(TASKS)
+            raise TaskError(f"there is no task {task!r}; there are {names}{did_you_mean(task, TASKS)}")
         task = TASKS[task]()
     if not isinstance(task, Task):
         raise TaskError(f"task is {type(task).__name__}; allowed is a name ({', '.join(TASKS)}) or a Task")
@@ -157,23 +210,6 @@ def make(task: str | Task, robot: str | System = ROBOT, **settings: Any) -> Envi
     if not isinstance(system, System):
         raise TaskError(f"robot is {type(robot).__name__}; allowed is a robot, a model, a name or a file")
     return Environment(task, system, **settings)
-
-
-def checked_action(action: Any, size: int) -> np.ndarray:
-    """Return an action (c,) or (B, c) as numbers. Raises `TaskError` for a wrong shape or NaN."""
-    try:
-        numbers = np.asarray(action, dtype=float)
-    except (TypeError, ValueError):
-        raise TaskError(
-            f"the action is {str(action)[:60]}; allowed are {size} numbers from -1 to 1"
-        ) from None
-    finite = bool(np.all(np.isfinite(numbers)))
-    if numbers.shape[-1:] != (size,) or not finite:
-        problem = "" if finite else " and is not finite"
-        raise TaskError(
-            f"the action has shape {numbers.shape}{problem}; allowed are {size} finite numbers from -1 to 1"
-        )
-    return numbers
 
 
 # many episodes
@@ -186,8 +222,7 @@ class Episodes:
     """States of many episodes, in one part for each core."""
 
     def __init__(self, environment: Environment, count: int):
-        whole: Any = count
-        if not isinstance(whole, int) or isinstance(whole, bool) or count < 1:
+        if type(count) is not int or count < 1:
             raise TaskError(f"count is {count!r}; allowed is a whole number from 1")
         self.environment, self.count = environment, count
         parts = min(usable_cores(), count)

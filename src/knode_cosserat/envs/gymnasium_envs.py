@@ -16,7 +16,7 @@ from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
 
 from knode_cosserat.envs.dynamics import Ending
-from knode_cosserat.envs.environment import Environment, Episodes, checked_action, make
+from knode_cosserat.envs.environment import Environment, Episodes, make
 from knode_cosserat.envs.tasks import TASKS, TaskError
 
 
@@ -27,6 +27,22 @@ def spaces(environment: Environment) -> tuple[gymnasium.spaces.Box, gymnasium.sp
         gymnasium.spaces.Box(-np.inf, np.inf, (seen,), np.float32),
         gymnasium.spaces.Box(-1.0, 1.0, (moved,), np.float32),
     )
+
+
+def checked_action(action: Any, size: int) -> np.ndarray:
+    """Return an action (c,) or (B, c) as numbers. Raises `TaskError` for a wrong shape or NaN."""
+    try:
+        numbers = np.asarray(action, dtype=float)
+    except (TypeError, ValueError):
+        text = str(action)[:60]
+        raise TaskError(f"the action is {text}; allowed are {size} numbers from -1 to 1") from None
+    is_finite = bool(np.all(np.isfinite(numbers)))
+    if numbers.shape[-1:] != (size,) or not is_finite:
+        problem = "" if is_finite else " and is not finite"
+        raise TaskError(
+            f"the action has shape {numbers.shape}{problem}; allowed are {size} finite numbers from -1 to 1"
+        )
+    return numbers
 
 
 class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -62,19 +78,15 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("call reset before step")
         action = checked_action(action, self.environment.action_size)
-        self._state, found = self.environment.step(self._state, action)
-        ending = Ending(int(found.ending))
-        info = {
-            "error": float(found.error),
-            "tip": np.asarray(found.tip),
-            "control": np.asarray(found.control),
-        }
+        self._state, after = self.environment.step(self._state, action)
+        ending = Ending(int(after.ending))
+        info: dict[str, Any] = {
+            "error": float(after.error), "tip": np.asarray(after.tip), "control": np.asarray(after.control),
+        }  # fmt: skip
         if ending is not Ending.RUNNING:
             info["ending"] = ending.message
-        return (
-            np.asarray(found.observation), float(found.reward), bool(found.terminated),
-            bool(found.truncated), info,
-        )  # fmt: skip
+        ends = bool(after.terminated), bool(after.truncated)
+        return np.asarray(after.observation), float(after.reward), *ends, info
 
     def render(self) -> Any:
         """Return a picture (H, W, 3) of the robot and its target; None without a render mode."""
@@ -170,33 +182,27 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             raise TaskError(
                 f"episode {int(np.argmax(self._ended))} has ended; call reset with a reset_mask first"
             )
-        found = self._episodes.step(actions)
-        terminated, truncated = np.array(found.terminated), np.array(found.truncated)
-        reward = np.array(found.reward, dtype=np.float64)
+        after = self._episodes.step(actions)
+        terminated, truncated = np.array(after.terminated), np.array(after.truncated)
+        reward = np.array(after.reward, dtype=np.float64)
         info: dict[str, Any] = {
-            "error": found.error, "tip": found.tip, "control": found.control,
-            "ending": np.array(found.ending),
+            "error": after.error, "tip": after.tip, "control": after.control,
+            "ending": np.array(after.ending),
         }  # fmt: skip
         restarted = np.flatnonzero(self._ended)
-        self._seen = np.array(found.observation)
+        self._seen = np.array(after.observation)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and len(restarted):
             self._restart(restarted)
             reward[restarted], terminated[restarted], truncated[restarted] = 0.0, False, False
             info["ending"][restarted] = Ending.RUNNING
         self._ended = terminated | truncated
         if self.autoreset_mode is AutoresetMode.SAME_STEP and np.any(self._ended):
-            info = self._final(info)
-            self._restart(np.flatnonzero(self._ended))
+            ended, last = self._ended.copy(), np.full(self.num_envs, None, dtype=object)
+            for k in np.flatnonzero(ended):
+                last[k] = self._seen[k].copy()
+            info |= {"final_obs": last, "_final_obs": ended, "final_info": dict(info), "_final_info": ended}
+            self._restart(np.flatnonzero(ended))
         return self._seen.copy(), reward, terminated, truncated, info
-
-    def _final(self, info: dict[str, Any]) -> dict[str, Any]:
-        """Return the information of a step with that of the episodes which ended in it."""
-        ended = self._ended.copy()
-        last = np.full(self.num_envs, None, dtype=object)
-        for k in np.flatnonzero(ended):
-            last[k] = self._seen[k].copy()
-        names = {name: value for name, value in info.items() if not name.startswith("_")}
-        return {**info, "final_obs": last, "_final_obs": ended, "final_info": names, "_final_info": ended}
 
     def _restart(self, where: np.ndarray) -> None:
         if len(where):

@@ -72,7 +72,7 @@ def animate_episode(environment: Environment, policy: Policy, key: Any, path: st
         state, observation = environment.reset(jnp.asarray(key))
         yield Image.fromarray(picture(environment, state))
         for _ in range(environment.steps):
-            state, after = environment.step(state, policy.action(observation))
+            state, after = environment.step(state, policy(np.asarray(observation)))
             yield Image.fromarray(picture(environment, state))
             if bool(after.terminated | after.truncated):
                 return

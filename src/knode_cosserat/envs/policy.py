@@ -1,165 +1,46 @@
-"""Policies: networks from observations to actions, their files, their use as controllers, and scores."""
+"""Policies of environments: their use as controllers, the comparison with controllers, and scores.
+
+A policy is a function from observations (..., o) to actions (..., c), of any library.
+"""
 
 from __future__ import annotations
 
-import itertools
-import json
-from pathlib import Path
-from typing import Any, NamedTuple, Self
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files.arrays import read_arrays
-from knode_cosserat._files.json_text import parse_json
-from knode_cosserat._files.limits import LimitSettingError, excess
-from knode_cosserat._files.reading import ReadError
-from knode_cosserat._files.writing import replacing
-from knode_cosserat.control import (
-    CONTROLLERS,
-    Command,
-    Controller,
-    Plant,
-    Reference,
-    Status,
-    controller_named,
-    run_loop,
-)
+from knode_cosserat.control import Command, Controller, Plant, Reference, controller_named, run_loop
+from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.control.planning import PlanController
 from knode_cosserat.envs.dynamics import MEASURED, Ending, EpisodeState, commanded, observed, scaled
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.tasks import TaskError
 from knode_cosserat.estimation.outputs import TipPosition
-from knode_cosserat.rods.system import System
 
-#: version of the files
-VERSION = 1
-#: greatest size of a file (bytes), unpacked too, and greatest number of layers
-LARGEST_FILE, MOST_LAYERS = 50_000_000, 20
-#: normalised observations are clipped here
-CLIP = 10.0
+Policy = Callable[[Any], Any]
 
-Layers = tuple[tuple[Float[Any, "i o"], Float[Any, " o"]], ...]
-
-
-def network(key: Any, sizes: tuple[int, ...], last: float) -> Layers:
-    """Return random layers with orthogonal weights; those of the last layer are multiplied by `last`."""
-    layers = []
-    for k, (before, after) in enumerate(itertools.pairwise(sizes)):
-        key, own = jax.random.split(key)
-        gain = last if k == len(sizes) - 2 else np.sqrt(2.0)
-        weights = jax.nn.initializers.orthogonal(gain)(own, (before, after), jnp.float32)
-        layers.append((weights, jnp.zeros(after, dtype=jnp.float32)))
-    return tuple(layers)
-
-
-def evaluated(layers: Layers, x: Float[Any, "... i"]) -> Float[Any, "... o"]:
-    """Return the output of a network with tanh between its layers."""
-    for weights, bias in layers[:-1]:
-        x = jnp.tanh(x @ weights + bias)
-    weights, bias = layers[-1]
-    return x @ weights + bias
-
-
-class Policy(NamedTuple):
-    """A deterministic policy: the mean action of a network of normalised observations."""
-
-    layers: Layers
-    #: mean and standard deviation of the observations in training
-    mean: Float[Any, " o"]
-    deviation: Float[Any, " o"]
-
-    def normalised(self, observation: Float[Any, "... o"]) -> Float[Any, "... o"]:
-        """Return an observation in standard deviations from its mean."""
-        return jnp.clip((observation - self.mean) / self.deviation, -CLIP, CLIP)
-
-    def action(self, observation: Float[Any, "... o"]) -> Float[Any, "... c"]:
-        """Return the action, -1 to 1."""
-        return jnp.clip(evaluated(self.layers, self.normalised(observation)), -1.0, 1.0)
-
-    def save(self, path: str | Path) -> None:
-        """Write the policy to a file (.npz), which holds arrays only."""
-        header = json.dumps({"version": VERSION, "layers": len(self.layers)})
-        arrays: dict[str, Any] = {"header": np.array(header), "mean": self.mean, "deviation": self.deviation}
-        for k, (weights, bias) in enumerate(self.layers):
-            arrays |= {f"weights{k}": weights, f"bias{k}": bias}
-        with replacing(Path(path)) as part, part.open("wb") as file:
-            np.savez(file, allow_pickle=False, **{name: np.asarray(value) for name, value in arrays.items()})
-
-    @classmethod
-    def load(cls, path: str | Path) -> Self:
-        """Return the policy of a file; no code of the file runs.
-
-        Raises:
-            TaskError: no file of a policy, or a damaged one.
-        """
-        path = Path(path)
-        try:
-            file = read_arrays(path, LARGEST_FILE)
-            header = parse_json(str(file["header"]))
-            if header.get("version") != VERSION:
-                raise ValueError(f"its version is {header.get('version')!r}; this package reads {VERSION}")
-            count = header["layers"]
-            if not isinstance(count, int) or count < 1:
-                raise ValueError(f"it has {count!r} layers")
-            if reason := excess(count, MOST_LAYERS, "layers"):
-                raise ValueError(reason)
-            layers = tuple((file[f"weights{k}"], file[f"bias{k}"]) for k in range(count))
-            policy = cls(layers, file["mean"], file["deviation"])
-        except LimitSettingError:
-            raise
-        except ReadError as error:
-            raise TaskError(f"the policy {path} cannot be read: {error}") from None
-        except KeyError as error:
-            raise TaskError(f"{path} is no policy: it has no {error.args[0]}") from None
-        except (ValueError, TypeError, AttributeError) as error:
-            raise TaskError(f"{path} is no policy: {error}") from None
-        policy._check(path)
-        return policy
-
-    def _check(self, path: Path) -> None:
-        size = np.shape(self.mean)
-        shapes = [size == np.shape(self.deviation) and len(size) == 1]
-        for weights, bias in self.layers:
-            shapes.append(np.ndim(weights) == 2 and size == (len(weights),) and np.ndim(bias) == 1)
-            size = np.shape(bias)
-            shapes.append(np.shape(weights)[1:] == size)
-        leaves = jax.tree.leaves(tuple(self))
-        if not all(shapes) or not all(np.all(np.isfinite(leaf)) for leaf in leaves if leaf.dtype.kind == "f"):
-            raise TaskError(f"{path} is no policy: its arrays do not fit together, or are not finite")
-        if not np.all(np.asarray(self.deviation) > 0.0):
-            raise TaskError(f"{path} is no policy: a standard deviation is not positive")
-
-
-# controllers and plants
-
-
-class _Seen(NamedTuple):
-    """Part of an episode's state that an observation depends on."""
-
-    measured: Any
-    commands: Any
-    count: Any
-    goal: Any
+#: standard deviation (m) of measured positions that a reference controller assumes, at least
+LEAST_NOISE = 2e-4
 
 
 class PolicyController(Controller):
     """A policy as a controller of a plant that measures the bodies which the environment observes."""
 
-    def __init__(self, environment: Environment, policy: Policy, goal: Any):
-        """Take over a policy of an environment, and the goal that it is to reach or follow."""
+    def __init__(self, environment: Environment, policy: Policy, state: EpisodeState):
+        """Take over a policy of an environment; `state` is the start of an episode, whose goal it pursues."""
         self.environment, self.policy, self.dt = environment, policy, environment.dt
-        self._goal = goal
-
-        @jax.jit
-        def following(arrays: Any, state: _Seen) -> Any:
-            action = policy.action(observed(environment.spec, arrays, state))
-            return commanded(environment.spec, arrays, state.commands[0], action.astype(float))
-
-        self._next = following
-        self.reset(np.asarray(environment.arrays.start))
+        spec, arrays = environment.spec, environment.arrays
+        self._observed = jax.jit(
+            lambda measured, control, count: observed(
+                spec, arrays, state._replace(measured=measured, commands=control[None], count=count)
+            )
+        )
+        self._commanded = jax.jit(lambda control, action: commanded(spec, arrays, control, action))
+        self.reset(np.asarray(arrays.start))
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Start from a control that acts now."""
@@ -171,26 +52,23 @@ class PolicyController(Controller):
 
         A lost measurement (NaN) is replaced by the last one.
         """
-        wanted = self.environment.spec.output.size
-        if np.shape(measured) != (wanted,):
+        output = self.environment.spec.output
+        if np.shape(measured) != (output.size,):
             raise TaskError(
-                f"the plant measures {np.shape(measured)[0]} numbers; the policy needs {wanted}, the "
-                f"positions at {self.environment.spec.output.fractions} of the length"
+                f"the plant measures {np.shape(measured)[0]} numbers; the policy needs {output.size}, the "
+                f"positions at {output.fractions} of the length"
             )
         if self._measured is None:
             self._measured = np.tile(np.nan_to_num(measured), (MEASURED, 1))
         newest = np.where(np.isfinite(measured), measured, self._measured[0])
         self._measured = np.concatenate([newest[None], self._measured[:-1]])
-        state = _Seen(self._measured, self._control[None], round(time / self.dt), self._goal)
-        self._control = np.asarray(self._next(self.environment.arrays, state))
-        return Command(self._control, Status.OPTIMAL)
-
-    def fallback(self, reason: str) -> Command:
-        """Return the last control again."""
-        return Command(self._control, Status.HELD, reason)
+        observation = self._observed(self._measured, self._control, round(time / self.dt))
+        action = np.asarray(self.policy(np.asarray(observation)), dtype=float)
+        self._control = np.asarray(self._commanded(self._control, action))
+        return Command(self._control)
 
 
-class EpisodePlant(Plant):
+class _EpisodePlant(Plant):
     """An episode of an environment, moved by a controller; it measures the tip."""
 
     def __init__(self, environment: Environment, state: EpisodeState):
@@ -208,7 +86,7 @@ class EpisodePlant(Plant):
         """Go to the start, and return the control that acts there."""
         self.state, self.ending = self._first, Ending.RUNNING
         self.rewards: list[float] = []
-        self._tip = np.asarray(self.state.measured[0, -3:])
+        self._tip = self.measure()
         return np.asarray(self.state.commands[0])
 
     def measure(self) -> Float[np.ndarray, "3"]:
@@ -229,40 +107,27 @@ class EpisodePlant(Plant):
         return self._tip
 
 
-# scores
-
-#: standard deviation (m) of measured positions that a reference controller assumes, at least
-LEAST_NOISE = 2e-4
-
-
-def reference_controller(
-    environment: Environment, state: EpisodeState, name: str = "predictive"
-) -> Controller:
-    """Return a controller whose model has the middle of all parameters, and the obstacles of an episode."""
-    arrays, spec = environment.arrays, environment.spec
-    middle = {name: 0.5 * (arrays.least[name] + arrays.greatest[name]) for name in spec.names}
-    robot: System = spec.task.placed(arrays.robot.replace(**middle), state.goal)
-    noise = max(float(arrays.noise), LEAST_NOISE)
-    has_observer = CONTROLLERS[name].cls.has_observer
-    adapt = [key for key in spec.task.adapted if has_observer and key in spec.names]
-    return controller_named(name, robot, spec.dt, environment.limits, adapt, TipPosition(sigma=noise))
-
-
 def controller_scores(
     environment: Environment, keys: Any, name: str = "predictive"
 ) -> Float[np.ndarray, " n"]:
     """Return the mean reward of a controller in the episode of each key (n, 2).
 
-    It knows the middle of the parameters and the target, and measures the tip. It adapts the parameters that
-    the task names. An episode that ends early counts zero for the rest of its time.
+    Its model has the middle of the randomised parameters and the obstacles; it knows the target, measures the
+    tip, and adapts the parameters that the task names. An episode that ends early counts zero for the rest of
+    its time.
     """
+    arrays, spec = environment.arrays, environment.spec
+    middle = {key: 0.5 * (arrays.least[key] + arrays.greatest[key]) for key in spec.names}
+    adapt = [key for key in spec.task.adapted if CONTROLLERS[name].has_observer and key in spec.names]
+    measured = TipPosition(sigma=max(float(arrays.noise), LEAST_NOISE))
     scores = []
     for key in np.asarray(keys):
         state, _ = environment.reset(jnp.asarray(key))
-        controller = reference_controller(environment, state, name)
+        robot = spec.task.placed(arrays.robot.replace(**middle), state.goal)
+        controller = controller_named(name, robot, spec.dt, environment.limits, adapt, measured)
         if isinstance(controller, PlanController):
             controller.observer.restart()
-        plant = EpisodePlant(environment, state)
+        plant = _EpisodePlant(environment, state)
         run_loop(controller, plant, environment.reference(state), environment.steps * environment.dt)
         scores.append(sum(plant.rewards) / environment.steps)
     return np.array(scores)
@@ -271,10 +136,9 @@ def controller_scores(
 def policy_scores(environment: Environment, policy: Policy, keys: Any) -> Float[np.ndarray, " n"]:
     """Return the mean reward of a policy in the episode of each key (n, 2), as in `controller_scores`."""
     states, observations = environment.reset_many(jnp.asarray(keys))
-    act = jax.jit(lambda observation: policy.action(observation))
     running, total = np.ones(len(keys), dtype=bool), np.zeros(len(keys))
     for _ in range(environment.steps):
-        states, after = environment.step_many(states, act(observations))
+        states, after = environment.step_many(states, policy(np.asarray(observations)))
         total += np.where(running, np.asarray(after.reward), 0.0)
         running &= ~np.asarray(after.terminated | after.truncated)
         observations = after.observation

@@ -110,8 +110,7 @@ class Randomisation:
         Raises:
             ParameterError: a parameter that does not exist, or a range with values that are not allowed.
         """
-        low: dict[str, np.ndarray] = {}
-        high: dict[str, np.ndarray] = {}
+        low, high = {}, {}
         for name, distribution in self.parameters.items():
             value = value_at(nominal_model(robot), name)
             if value is None:
@@ -146,56 +145,6 @@ class Survey(NamedTuple):
     reach: Float[Any, ""]
 
 
-def surveyed(robot: System, limits: ControlLimits, seed: int) -> Survey:
-    """Return a survey of a robot, from equilibria under random controls within their limits.
-
-    Raises:
-        TaskError: no equilibrium was found.
-    """
-    random = np.random.default_rng(seed)
-    low, high = np.asarray(limits.low), np.asarray(limits.high)
-    controls = low + random.uniform(size=(SURVEYED, len(low))) * (high - low)
-    # the middle of the range is the rest of tendons that pull alike
-    middle = np.tile(np.asarray(limits.safe), (SURVEYED, 1))
-    every = np.concatenate([controls, 0.5 * (controls + middle), middle[:1]])
-    found = equilibrium(robot, every, on_failure="return")
-    y = np.asarray(found.y)[:, -1, -1]
-    valid = np.asarray(found.result)[:, -1] >= 0
-    usable = valid[:SURVEYED] & valid[SURVEYED:-1]
-    if not valid[-1] or not np.any(usable):
-        raise TaskError(
-            f"{type(robot).__name__} has no equilibrium under "
-            f"{'the safe controls' if not valid[-1] else 'any of the random controls'} "
-            f"({limits.safe.tolist()}); give other limits"
-        )
-    position = np.asarray(Drawing.of(robot).positions(y))
-    if "h" in robot.y_layout.names:
-        rotation = jax.vmap(rotation_matrix)(jnp.asarray(Drawing.of(robot).quaternions(y)))
-        frame = np.swapaxes(np.asarray(rotation), 1, 2)
-    else:
-        frame = np.tile(np.eye(3), (len(y), 1, 1))
-    origin, lateral = position[-1], frame[-1][:2]
-    apart = np.linalg.norm((position[:SURVEYED][usable] - origin) @ lateral.T, axis=1)
-    return Survey(
-        origin, frame[-1], position[:SURVEYED][usable], frame[:SURVEYED, 2][usable],
-        position[SURVEYED:-1][usable], np.quantile(apart, EASY),
-    )  # fmt: skip
-
-
-def _check_reachable(robot: System, limits: ControlLimits, position: Any) -> None:
-    """Check that an equilibrium within limits has its tip at a position (m). Raises `TaskError`."""
-    wanted, length = np.asarray(position, dtype=float), float(np.max(nominal_model(robot).length))
-    if wanted.shape != (3,) or not np.all(np.isfinite(wanted)):
-        raise TaskError(f"the target is {position!r}; allowed are three finite numbers (m)")
-    found = inverse_kinematics(robot, wanted, low=limits.low, high=limits.high)
-    if found.result < 0:
-        raise TaskError(
-            f"the target {wanted.tolist()} m cannot be reached: the nearest position found is "
-            f"{float(found.position_error):.3g} m away (the robot is {length:g} m long); choose another "
-            "target, or wider limits"
-        )
-
-
 # the base of tasks
 
 
@@ -204,14 +153,6 @@ class Tip(NamedTuple):
 
     position: Float[Any, "3"]
     tangent: Float[Any, "3"]
-
-
-class Outcome(NamedTuple):
-    """Reward of a step, True if the episode ended by success or failure, and the error (m)."""
-
-    reward: Any
-    terminated: Any
-    error: Any
 
 
 def _norm(vector: Any) -> Any:
@@ -251,8 +192,39 @@ class Task(abc.ABC):
         return Randomisation()
 
     def survey(self, robot: System, limits: ControlLimits, seed: int) -> Survey:
-        """Return facts about the robot, from equilibria under random controls."""
-        return surveyed(robot, limits, seed)
+        """Return a survey of a robot, from equilibria under random controls within their limits.
+
+        Raises:
+            TaskError: no equilibrium was found.
+        """
+        random = np.random.default_rng(seed)
+        low, high = np.asarray(limits.low), np.asarray(limits.high)
+        controls = low + random.uniform(size=(SURVEYED, len(low))) * (high - low)
+        # the middle of the range is the rest of tendons that pull alike
+        middle = np.tile(np.asarray(limits.safe), (SURVEYED, 1))
+        equilibria = equilibrium(
+            robot, np.concatenate([controls, 0.5 * (controls + middle), middle[:1]]), on_failure="return"
+        )
+        y = np.asarray(equilibria.y)[:, -1, -1]
+        valid = np.asarray(equilibria.result)[:, -1] >= 0
+        usable = valid[:SURVEYED] & valid[SURVEYED:-1]
+        if not valid[-1] or not np.any(usable):
+            controls_name = "any of the random controls" if valid[-1] else "the safe controls"
+            raise TaskError(
+                f"{type(robot).__name__} has no equilibrium under {controls_name} "
+                f"({limits.safe.tolist()}); give other limits"
+            )
+        position = np.asarray(Drawing.of(robot).positions(y))
+        frame = np.tile(np.eye(3), (len(y), 1, 1))
+        if "h" in robot.y_layout.names:
+            rotation = jax.vmap(rotation_matrix)(jnp.asarray(Drawing.of(robot).quaternions(y)))
+            frame = np.swapaxes(np.asarray(rotation), 1, 2)
+        reached, lateral = position[:SURVEYED][usable], frame[-1][:2]
+        distance = np.linalg.norm((reached - position[-1]) @ lateral.T, axis=1)
+        return Survey(
+            position[-1], frame[-1], reached, frame[:SURVEYED, 2][usable],
+            position[SURVEYED:-1][usable], np.quantile(distance, EASY),
+        )  # fmt: skip
 
     def placed(self, system: System, goal: Any) -> System:
         """Return the system with the parts of an episode, such as its obstacles; by default unchanged."""
@@ -270,18 +242,19 @@ class Task(abc.ABC):
         """Return the error of the tip (m) at a time (s): by default its distance from the target."""
         return _norm(tip.position - self.target(goal, t)[:3])
 
-    def outcome(self, goal: Any, t: Any, tip: Tip, clearance: Any, length: Any) -> Outcome:
-        """Return the outcome of a step that ends at a time (s).
+    def reward(self, error: Any, clearance: Any, length: Any) -> Any:
+        """Return the reward of a period, by default exp(-error / (scale length)).
 
         Args:
-            goal: of the episode.
-            t: time (s).
-            tip: pose of the tip.
+            error: of the tip (m).
             clearance: least distance (m) of the robot from obstacles; infinite without obstacles.
             length: of the robot (m).
         """
-        error = self.error(goal, t, tip)
-        return Outcome(jnp.exp(-error / (self.scale * length)), jnp.array(False), error)
+        return jnp.exp(-error / (self.scale * length))
+
+    def is_over(self, goal: Any, t: Any, tip: Tip) -> Any:
+        """Return True if an episode ends by success or failure at a time (s); by default never."""
+        return jnp.array(False)
 
     def observation(self, goal: Any, survey: Survey, length: Any) -> Float[Any, " o"]:
         """Return what is observed of the goal beside the target; by default nothing."""
@@ -321,7 +294,7 @@ def _require_positive(task: Task, *names: str) -> None:
 # following a moving point
 
 
-class PathGoal(NamedTuple):
+class _PathGoal(NamedTuple):
     """A closed path across the tip's direction at rest, followed from its centre outwards."""
 
     centre: Float[Any, "3"]
@@ -354,7 +327,7 @@ class Follow(Task):
         super().__post_init__()
         _require_positive(self, "period", "width")
 
-    def draw(self, key: Any, survey: Survey) -> PathGoal:
+    def draw(self, key: Any, survey: Survey) -> _PathGoal:
         """Return a random path."""
         part = jax.random.uniform(key, (5,))
         (short, long), (thin, wide) = self.period, self.width
@@ -366,16 +339,16 @@ class Follow(Task):
         # an eight is lower than wide, and may be run through backwards
         sign = jnp.where(part[4] < 0.5, 1.0, -1.0)
         width = width * jnp.where(eight, jnp.array([1.0, 0.5]), jnp.ones(2)) * jnp.stack([sign, 1.0])
-        return PathGoal(survey.origin, survey.frame[:2], width, frequency * turns, phase)
+        return _PathGoal(survey.origin, survey.frame[:2], width, frequency * turns, phase)
 
-    def target(self, goal: PathGoal, t: Any) -> Float[Any, "3"]:
+    def target(self, goal: _PathGoal, t: Any) -> Float[Any, "3"]:
         """Return the wanted position of the tip (m)."""
         part = jnp.clip(t / self.rise, 0.0, 1.0) if self.rise else 1.0
         eased = part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
         along = eased * goal.width * jnp.sin(goal.frequency * t + goal.phase)
         return goal.centre + along @ goal.across
 
-    def error(self, goal: PathGoal, t: Any, tip: Tip) -> Any:
+    def error(self, goal: _PathGoal, t: Any, tip: Tip) -> Any:
         """Return the distance (m) of the tip from the target, across the tip's direction at rest."""
         return _norm(goal.across @ (tip.position - self.target(goal, t)))
 
@@ -422,7 +395,7 @@ class Adaptation(Follow):
 # reaching a pose
 
 
-class PoseGoal(NamedTuple):
+class _PoseGoal(NamedTuple):
     """A pose to reach: position (m), and unit tangent."""
 
     position: Float[Any, "3"]
@@ -448,23 +421,32 @@ class Reach(Task):
         """Return reachable poses.
 
         Raises:
-            TaskError: the fixed position cannot be reached.
+            TaskError: the fixed position cannot be reached by an equilibrium within limits.
         """
         if self.position is not None:
-            _check_reachable(robot, limits, self.position)
-        return surveyed(robot, limits, seed)
+            target, length = np.asarray(self.position, dtype=float), float(np.max(nominal_model(robot).length))
+            if target.shape != (3,) or not np.all(np.isfinite(target)):
+                raise TaskError(f"the target is {self.position!r}; allowed are three finite numbers (m)")
+            nearest = inverse_kinematics(robot, target, low=limits.low, high=limits.high)
+            if nearest.result < 0:
+                raise TaskError(
+                    f"the target {target.tolist()} m cannot be reached: the nearest position found is "
+                    f"{float(nearest.position_error):.3g} m away (the robot is {length:g} m long); choose "
+                    "another target, or wider limits"
+                )
+        return super().survey(robot, limits, seed)
 
-    def draw(self, key: Any, survey: Survey) -> PoseGoal:
+    def draw(self, key: Any, survey: Survey) -> _PoseGoal:
         """Return a random pose of the survey, or the fixed one."""
         k = jax.random.randint(key, (), 0, survey.position.shape[0])
         position = survey.position[k] if self.position is None else jnp.asarray(self.position, dtype=float)
-        return PoseGoal(position, survey.tangent[k])
+        return _PoseGoal(position, survey.tangent[k])
 
-    def target(self, goal: PoseGoal, t: Any) -> Float[Any, "6"]:
+    def target(self, goal: _PoseGoal, t: Any) -> Float[Any, "6"]:
         """Return the wanted position (m) and tangent of the tip."""
         return jnp.concatenate([goal.position, goal.tangent])
 
-    def error(self, goal: PoseGoal, t: Any, tip: Tip) -> Any:
+    def error(self, goal: _PoseGoal, t: Any, tip: Tip) -> Any:
         """Return the distance of the tip (m), and in addition `arm` times the error of its tangent."""
         distance = _norm(tip.position - goal.position)
         if self.position is not None:
@@ -479,7 +461,7 @@ class Reach(Task):
 TOUCHING = 0.5
 
 
-class CourseGoal(NamedTuple):
+class _CourseGoal(NamedTuple):
     """A position to reach (m), and the centres of the obstacles before it."""
 
     position: Float[Any, "3"]
@@ -524,11 +506,11 @@ class Pillar(Task):
         equipped: System = _with_parts(robot, "surroundings", [ball] * self.count, self.name)
         return equipped
 
-    def placed(self, system: System, goal: CourseGoal) -> System:
+    def placed(self, system: System, goal: _CourseGoal) -> System:
         """Return the system with the balls of an episode."""
         return system.replace(**{f"surroundings.{k}.center": goal.centres[k] for k in range(self.count)})
 
-    def draw(self, key: Any, survey: Survey) -> CourseGoal:
+    def draw(self, key: Any, survey: Survey) -> _CourseGoal:
         """Return a position of the survey with balls before it; positions near the rest are left out."""
         one, two = jax.random.split(key)
         lateral = (survey.position - survey.origin) @ survey.frame[:2].T
@@ -537,30 +519,29 @@ class Pillar(Task):
         position, middle = survey.position[k], survey.halfway[k]
         aside = jnp.cross(survey.frame[2], position - survey.origin)
         aside = aside / _norm(aside) * jnp.where(jax.random.uniform(two) < 0.5, 1.0, -1.0)
-        return CourseGoal(position, self._centres(middle, aside), aside)
+        return _CourseGoal(position, self._centres(middle, aside), aside)
 
     def _centres(self, middle: Any, aside: Any) -> Float[Any, "k 3"]:
         # a little off the path: which way is shorter is then certain
         return (middle - 0.3 * self.radius * aside)[None]
 
-    def target(self, goal: CourseGoal, t: Any) -> Float[Any, "3"]:
+    def target(self, goal: _CourseGoal, t: Any) -> Float[Any, "3"]:
         """Return the wanted position of the tip (m)."""
         return goal.position
 
-    def outcome(self, goal: CourseGoal, t: Any, tip: Tip, clearance: Any, length: Any) -> Outcome:
-        """Return the outcome of a step that ends at a time (s)."""
-        outcome = super().outcome(goal, t, tip, clearance, length)
-        return outcome._replace(reward=outcome.reward * jnp.where(clearance < 0.0, TOUCHING, 1.0))
+    def reward(self, error: Any, clearance: Any, length: Any) -> Any:
+        """Return the reward of a period."""
+        return super().reward(error, clearance, length) * jnp.where(clearance < 0.0, TOUCHING, 1.0)
 
-    def observation(self, goal: CourseGoal, survey: Survey, length: Any) -> Float[Any, " o"]:
+    def observation(self, goal: _CourseGoal, survey: Survey, length: Any) -> Float[Any, " o"]:
         """Return the centres of the balls from the tip at rest, in lengths of the robot."""
         return ((goal.centres - survey.origin) / length).ravel()
 
-    def waypoint(self, goal: CourseGoal) -> Float[np.ndarray, "3"]:
+    def waypoint(self, goal: _CourseGoal) -> Float[np.ndarray, "3"]:
         """Return a position (m) on the way that is clear of the balls."""
         return np.asarray(goal.centres[0] + 2.5 * self.radius * goal.aside)
 
-    def reference(self, goal: CourseGoal, survey: Survey) -> Reference:
+    def reference(self, goal: _CourseGoal, survey: Survey) -> Reference:
         """Return a path by the way point to the target; 1 s to each."""
         points = [np.asarray(survey.origin), self.waypoint(goal), np.asarray(goal.position)]
         return table([0.0, 1.0, 2.0], points)
@@ -583,7 +564,7 @@ class Gate(Pillar):
         centre, offset = middle + 0.5 * self.gap * aside, (self.radius + 0.5 * self.gap) * aside
         return jnp.stack([centre - offset, centre + offset])
 
-    def waypoint(self, goal: CourseGoal) -> Float[np.ndarray, "3"]:
+    def waypoint(self, goal: _CourseGoal) -> Float[np.ndarray, "3"]:
         """Return the middle of the gate (m)."""
         return np.asarray(goal.centres).mean(axis=0)
 

@@ -10,13 +10,12 @@ from knode_cosserat._lazy import make_lazy
 if TYPE_CHECKING:
     from knode_cosserat.sweeps._data import SweepData, load_sweep
     from knode_cosserat.sweeps._description import Range, Sweep, SweepError
-    from knode_cosserat.sweeps._plan import Plan
+    from knode_cosserat.sweeps._plan import Plan as Plan
     from knode_cosserat.sweeps._run import Dask, Local, Slurm, run_sweep
 
 __all__ = [
     "Dask",
     "Local",
-    "Plan",
     "Range",
     "Slurm",
     "Sweep",

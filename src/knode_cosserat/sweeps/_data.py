@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,13 +38,6 @@ class SweepData:
     manifest: dict[str, Any]
     #: numbers of the shards that are there
     present: tuple[int, ...]
-
-    @classmethod
-    def open(cls, folder: str | Path) -> Self:
-        """Return the data in a folder. Raises `SweepError`."""
-        folder = Path(folder)
-        manifest = read_manifest(folder)
-        return cls(folder, manifest, shard_numbers(folder, manifest["shards"]))
 
     @property
     def is_complete(self) -> bool:
@@ -202,4 +195,6 @@ def load_sweep(folder: str | Path) -> SweepData:
     Raises:
         SweepError: there is no sweep, or it has a version that this package does not read.
     """
-    return SweepData.open(folder)
+    folder = Path(folder)
+    manifest = read_manifest(folder)
+    return SweepData(folder, manifest, shard_numbers(folder, manifest["shards"]))

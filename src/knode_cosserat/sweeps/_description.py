@@ -64,13 +64,6 @@ class Range:
         if self.count is not None:
             _require_count("count", self.count, least=2)
 
-    def values(self, fraction: np.ndarray) -> np.ndarray:
-        """Return the values at fractions 0 to 1 of the range; they never leave it."""
-        low, high = self.low, self.high
-        if self.scale == "log":
-            return np.clip(np.exp(np.log(low) + fraction * (np.log(high) - np.log(low))), low, high)
-        return np.clip(low + fraction * (high - low), low, high)
-
 
 @dataclasses.dataclass(frozen=True)
 class RobotEntry:
@@ -263,6 +256,17 @@ def read_mapping(path: str | Path) -> dict[Any, Any]:
 def value_count(variation: Range | tuple[Any, ...]) -> int:
     """Return the number of values of a variation on a grid."""
     return int(variation.count or 1) if isinstance(variation, Range) else len(variation)
+
+
+def values_at(variation: Range | tuple[Any, ...], fraction: np.ndarray) -> np.ndarray:
+    """Return the values of a variation at fractions 0 to 1; they never leave its range."""
+    if not isinstance(variation, Range):
+        index = np.minimum((fraction * len(variation)).astype(int), len(variation) - 1)
+        return np.asarray(variation, dtype=float)[index]
+    low, high = variation.low, variation.high
+    if variation.scale == "log":
+        return np.clip(np.exp(np.log(low) + fraction * (np.log(high) - np.log(low))), low, high)
+    return np.clip(low + fraction * (high - low), low, high)
 
 
 # checks

@@ -94,7 +94,7 @@ def _manifest_of(plan: Plan) -> dict[str, Any]:
         "cases": sweep.case_count, "shards": plan.shard_count, "shard_cases": plan.shard_cases,
         "robots": [
             {
-                "label": entry.label, "text": _robot_text(system),
+                "label": entry.label, "text": _text(system),
                 "controls": titles(system.control_layout), "columns": _columns(plan, robot),
             }
             for robot, (entry, system) in enumerate(zip(sweep.robots, plan.systems, strict=True))
@@ -103,7 +103,7 @@ def _manifest_of(plan: Plan) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _robot_text(system: System) -> str:
+def _text(system: System) -> str:
     """Return the text of a robot file, or the text of a system that has none."""
     try:
         return format_robot(system)
@@ -169,18 +169,6 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         )
     if stated != json_checksum(manifest):
         raise SweepError(f"{path}: damaged or changed: its contents do not have its checksum")
-    counts: list[Any] = [manifest.get(name) for name in ("cases", "shards", "shard_cases")]
-    robots = manifest.get("robots")
-    if not all(isinstance(manifest.get(name), dict) for name in ("sweep", "made_by", "machine")):
-        raise SweepError(f"{path}: damaged: keys are missing")
-    if not isinstance(robots, list) or not robots or not all(
-        isinstance(robot, dict) and isinstance(robot.get("columns"), dict) for robot in robots
-    ):  # fmt: skip
-        raise SweepError(f"{path}: damaged: a robot has no columns")
-    if not all(type(count) is int and count > 0 for count in counts) or counts[1] != len(robots) * -(
-        -counts[0] // (len(robots) * counts[2])
-    ):
-        raise SweepError(f"{path}: damaged: its numbers of robots, cases and shards contradict each other")
     return manifest
 
 

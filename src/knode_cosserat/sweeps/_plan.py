@@ -27,7 +27,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import checked_dt
-from knode_cosserat.sweeps._description import Range, RobotEntry, Sweep, SweepError, value_count
+from knode_cosserat.sweeps._description import Range, RobotEntry, Sweep, SweepError, value_count, values_at
 from knode_cosserat.sweeps._sampling import case_seeds, unit_points
 from knode_cosserat.sweeps._signals import case_controls, placeholders
 
@@ -174,36 +174,25 @@ class Plan:
             elif len(rows):
                 picked = {name: array[rows] for name, array in numbers.items()}
                 controls[rows], reasons = case_controls(
-                    self.systems[robot], text, sweep.steps, sweep.dt, picked, len(rows)
+                    self.systems[robot], text, sweep.steps, sweep.dt, picked
                 )
                 refused |= {int(rows[k]): reason for k, reason in reasons.items()}
         return Cases(robot * self.robot_cases + index, values, word, seed, controls, refused)
 
     def _samples(self, span: tuple[int, int]) -> dict[str, np.ndarray]:
         """Return the varied numbers of samples first to last (exclusive)."""
-        sweep = self.sweep
-        varied: dict[str, np.ndarray] = {}
+        sweep, fractions = self.sweep, {}
         if sweep.sampler == "grid":
             rest = np.arange(*span)
-            for name, values in reversed(sweep.vary.items()):
-                count = value_count(values)
+            for name, variation in reversed(sweep.vary.items()):
+                count = value_count(variation)
                 rest, digit = np.divmod(rest, count)
-                varied[name] = (
-                    values.values(digit / (count - 1))
-                    if isinstance(values, Range)
-                    else np.asarray(values, dtype=float)[digit]
-                )
-            return {name: varied[name] for name in sweep.vary}
-        points = unit_points(sweep.sampler, span, len(sweep.vary), sweep.sample_count, int(sweep.seed))
-        for (name, values), fraction in zip(sweep.vary.items(), points.T, strict=True):
-            varied[name] = (
-                values.values(fraction)
-                if isinstance(values, Range)
-                else np.asarray(values, dtype=float)[
-                    np.minimum((fraction * len(values)).astype(int), len(values) - 1)
-                ]
-            )
-        return varied
+                is_range = isinstance(variation, Range)
+                fractions[name] = digit / (count - 1) if is_range else (digit + 0.5) / count
+        else:
+            points = unit_points(sweep.sampler, span, len(sweep.vary), sweep.sample_count, int(sweep.seed))
+            fractions = dict(zip(sweep.vary, points.T, strict=True))
+        return {name: values_at(variation, fractions[name]) for name, variation in sweep.vary.items()}
 
 
 # checks
@@ -261,19 +250,14 @@ def _fixed_controls(sweep: Sweep, systems: tuple[System, ...]) -> dict[tuple[int
     A word with varied numbers must be possible for its first, middle or last value: else the word is wrong.
     """
     fixed = {}
-    trial = {
-        name: values.values(np.array([0.0, 0.5, 1.0]))
-        if isinstance(values, Range)
-        else np.asarray([values[0], values[len(values) // 2], values[-1]], dtype=float)
-        for name, values in sweep.vary.items()
-    }
+    trial = {name: values_at(variation, np.array([0.0, 0.5, 1.0])) for name, variation in sweep.vary.items()}
     for robot, system in enumerate(systems):
         for w, word in enumerate(sweep.controls):
             if not placeholders(word):
                 fixed[robot, w] = controls.parse(word, sweep.steps, sweep.dt, system)
                 continue
             numbers = trial | {"seed": np.arange(3)}
-            _, refused = case_controls(system, word, sweep.steps, sweep.dt, numbers, 3)
+            _, refused = case_controls(system, word, sweep.steps, sweep.dt, numbers)
             if len(refused) == 3:
                 raise SweepError(refused[1])
     return fixed

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import abc
 import concurrent.futures
 import contextlib
 import dataclasses
@@ -19,7 +18,7 @@ from tqdm import tqdm
 
 from knode_cosserat._processes import dask_client, end_with_parent
 from knode_cosserat.solvers.run import usable_cores
-from knode_cosserat.sweeps._data import SweepData
+from knode_cosserat.sweeps._data import SweepData, load_sweep
 from knode_cosserat.sweeps._description import Sweep, SweepError
 from knode_cosserat.sweeps._folder import (
     SHARDS,
@@ -93,20 +92,8 @@ class Work:
         return Done(number, cases, failed, seconds, cpu, content if self.folder is None else None)
 
 
-class Executor(abc.ABC):
-    """Executor of a sweep's shards."""
-
-    @abc.abstractmethod
-    def run(self, work: Work, shards: Sequence[int]) -> Iterator[Done]:
-        """Solve shards; yield each when it is in the folder.
-
-        Raises:
-            SweepError: a worker died, or cannot work; complete shards are kept.
-        """
-
-
 @dataclasses.dataclass(frozen=True)
-class Local(Executor):
+class Local:
     """Processes of this machine, each with a core of its own; one worker is this process, with all cores.
 
     Attributes:
@@ -158,7 +145,7 @@ def _solve(number: int) -> Done:
 
 
 @dataclasses.dataclass(frozen=True)
-class Dask(Executor):
+class Dask:
     """Workers of a running Dask cluster. They need not see the folder: this process writes the shards.
 
     Attributes:
@@ -195,7 +182,7 @@ class Dask(Executor):
 
 
 @dataclasses.dataclass(frozen=True)
-class Slurm(Executor):
+class Slurm:
     """Jobs of SLURM, by submitit. All jobs must see the folder of the sweep: each writes its shards.
 
     The jobs do not need this process: if it ends, they go on, and the same call waits for the rest.
@@ -266,7 +253,7 @@ class ShardJob:
 
 
 def run_sweep(
-    sweep: Sweep, folder: str | Path, *, executor: Executor | None = None, progress: bool = False
+    sweep: Sweep, folder: str | Path, *, executor: Local | Dask | Slurm | None = None, progress: bool = False
 ) -> SweepData:
     """Solve all cases of a sweep into a folder, and return its data.
 
@@ -289,7 +276,7 @@ def run_sweep(
         raise SweepError(f"sweep is a {type(sweep).__name__}; allowed is a Sweep")
     require_pyarrow()
     folder, executor = Path(folder).absolute(), executor or Local()
-    if not isinstance(executor, Executor):
+    if not isinstance(executor, Local | Dask | Slurm):
         raise SweepError(f"executor is a {type(executor).__name__}; allowed is Local, Dask or Slurm")
     plan, began, date = Plan.of(sweep), time.perf_counter(), time.time()
     open_folder(plan, folder)
@@ -319,4 +306,4 @@ def run_sweep(
         for entry in os.scandir(folder / SHARDS):
             if entry.name.endswith(".tmp") and entry.stat().st_mtime < date:
                 os.unlink(entry.path)
-    return SweepData.open(folder)
+    return load_sweep(folder)

@@ -10,7 +10,7 @@ import concurrent.futures
 import dataclasses
 import functools
 import threading
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -43,21 +43,14 @@ _COMPILED: set[tuple[str, int]] = set()
 _COMPILING = threading.Lock()
 
 
-class Start(NamedTuple):
-    """Initial states of a chunk: y and z at the nodes, and the histories of the first step."""
-
-    record: Any
-    history: Any
-
-
 @functools.partial(jax.jit, static_argnames=("settings", "size"))
 def _started(robot, values, start, settings, size):  # type: ignore[no-untyped-def]
-    """Return the systems of a chunk, or one for all, and their initial states; None: at rest."""
+    """Return the systems of a chunk, or one for all, with initial records and histories; None: at rest."""
     systems = jax.vmap(lambda changes: robot.replace(**changes))(values) if values else robot
     if start is None:
         at = initial_state(systems, settings, size)
-        start = Start(at.record, at.state.history)
-    return systems, start
+        start = at.record, at.state.history
+    return systems, *start
 
 
 @functools.partial(jax.jit, static_argnames="store")
@@ -122,9 +115,9 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
     values = {name: array[index] for name, array in cases.values.items() if parameter_at(nominal, name)}
     start, marks, reasons = _equilibria(plan, system, values)
     task = TimeIntegration(settings, plan.sweep.dt, steps)
-    systems, start = _started(system, values, start, settings, CHUNK)
-    done, _, rows = task.solve(systems, cases.controls[index], start.history)
-    stored = _stored(systems, start.record, rows, plan.sweep.store)
+    systems, record, history = _started(system, values, start, settings, CHUNK)
+    done, _, rows = task.solve(systems, cases.controls[index], history)
+    stored = _stored(systems, record, rows, plan.sweep.store)
     columns: dict[str, Any] = jax.tree.map(lambda leaf: np.array(leaf[:count]), stored)
     for k in range(count):
         if cause := cases.refused.get(first + k) or reasons.get(k):
@@ -133,7 +126,8 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
                 column[k] = int(Result.NOT_REACHED) if name == "result" else np.nan
         elif done[k] < steps:
             case = system.replace(**{name: array[k] for name, array in values.items()}) if values else system
-            reasons[k] = _failed(plan, case, task, cases.controls[first + k], columns, k)
+            rows_of_case = {name: column[k] for name, column in columns.items()}
+            reasons[k] = _failed(plan, case, task, cases.controls[first + k], rows_of_case)
     result = columns["result"]
     carried = carried_results(result[:, 1:], marks[:count])
     columns["result"] = np.concatenate([result[:, :1], carried], axis=1).astype(np.int8)
@@ -146,10 +140,8 @@ def _solved_system(plan: Plan, robot: int) -> System:
     return without_range(plan.systems[robot])
 
 
-def _equilibria(
-    plan: Plan, system: System, values: dict[str, Any]
-) -> tuple[Start | None, Any, dict[int, str]]:
-    """Return the initial states of a chunk, their result codes, and by case the reasons of missing ones.
+def _equilibria(plan: Plan, system: System, values: dict[str, Any]) -> tuple[Any, Any, dict[int, str]]:
+    """Return records and histories at the start of a chunk, result codes, and by case reasons of failures.
 
     A robot such as a platform on bent legs starts from its equilibrium under zero control. All others start
     from rest (None), which the chunk's program evaluates.
@@ -175,15 +167,15 @@ def _equilibria(
     usable = [state or solved for state in states]
     if not values:
         usable, reasons = usable * CHUNK, dict.fromkeys(range(CHUNK), reasons[0]) if reasons else {}
-    pairs = [Start(state.record, state.state.history) for state in usable]
+    pairs = [(state.record, state.state.history) for state in usable]
     start = jax.tree.map(lambda *leaves: np.stack([np.asarray(leaf) for leaf in leaves]), *pairs)
     return start, np.array([int(state.result) for state in usable]), reasons
 
 
 def _failed(
-    plan: Plan, system: System, task: TimeIntegration, controls: Any, columns: dict[str, Any], k: int
+    plan: Plan, system: System, task: TimeIntegration, controls: Any, stored: dict[str, np.ndarray]
 ) -> str:
-    """Return the reason of a failed case, empty after recovery if that is wanted; write its rows.
+    """Return the reason of a failed case, empty after recovery if that is wanted; write into its stored rows.
 
     Neither the recovery nor the pieces of the run depend on times.
     """
@@ -194,10 +186,10 @@ def _failed(
         rows, _, cause = run_one(task, system, controls, (at.state.history, at.control), watch=None)
         record, rows = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (at.record, rows))
         for name, column in _stored(system, record, rows, plan.sweep.store).items():
-            columns[name][k] = np.asarray(column[0])
+            stored[name][...] = np.asarray(column[0])
         if not cause:
             return ""
-    step = int(np.argmax(columns["result"][k] < 0))
-    code = Result(int(columns["result"][k, step]))
+    step = int(np.argmax(stored["result"] < 0))
+    code = Result(int(stored["result"][step]))
     cause = cause or likely_cause(code, system, plan.settings, controls[step - 1])
     return f"step {step} (t = {step * plan.sweep.dt:g} s): {code.message}. {cause}".strip()

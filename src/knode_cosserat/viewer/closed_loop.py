@@ -23,7 +23,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.control import Controller, LoopLog, Plant, Status, constant
+from knode_cosserat.control import Controller, LoopLog, Plant, constant
+from knode_cosserat.control.commands import Status
 from knode_cosserat.control.loop import Loop, Period, estimated, joined
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPositions
@@ -134,44 +135,6 @@ class Moment:
     reason: str
 
 
-class LoopRecord:
-    """Last periods of a loop, which can be exported as one file."""
-
-    def __init__(self, facts: LoopFacts, most: int = MOST_PERIODS):
-        self.facts = facts
-        self.moments: deque[Moment] = deque(maxlen=most)
-
-    def scene(self, title: str) -> dict[str, Any]:
-        """Return the page's scene of the record.
-
-        Raises:
-            ValueError: no period has passed.
-        """
-        moments = list(self.moments)
-        if not moments:
-            raise ValueError("no period has passed; there is nothing to export")
-        motions = {
-            name: joined([moment.shapes[name] for moment in moments], [moment.time for moment in moments])
-            for name in moments[0].shapes
-        }
-        numbers = np.array([moment.numbers for moment in moments])
-        place, size = self.facts.columns["target"]
-        first, target = next(iter(motions.values())), numbers[0, place : place + size]
-        # the tip's coordinates in the place of free ones
-        target = np.where(np.isfinite(target), target, np.asarray(first.tip_position)[0])
-        shown = scene(motions, title, target)
-        rows = kept(np.shape(first.y), first.system.z_layout.size)[1]
-        shown["tracks"] = for_loop(shown["tracks"])
-        shown["loop"] = self.facts.for_page() | {
-            "rows": encoded_array(numbers[rows], "f4"), "reasons": [moments[k].reason for k in rows],
-        }  # fmt: skip
-        return shown
-
-    def page(self, title: str) -> str:
-        """Return the record as one self-contained HTML page."""
-        return document(self.scene(title))
-
-
 def shapes(plant: Plant, controller: Controller) -> dict[str, Trajectory]:
     """Return the shapes of a period by name, each a trajectory of one row: the robot and its estimate.
 
@@ -192,7 +155,7 @@ def shapes(plant: Plant, controller: Controller) -> dict[str, Trajectory]:
     )
 
 
-def for_loop(tracks: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def _for_loop(tracks: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Mark the second track as an overlay of the first."""
     return [shape | {"overlay": k > 0} for k, shape in enumerate(tracks)]
 
@@ -201,7 +164,7 @@ def for_loop(tracks: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 class FollowedTarget:
-    """Closed loop whose reference is one position, with the record of its last periods.
+    """Closed loop whose reference is one position, with the moments of its last periods.
 
     One page at a time moves it; all its computations take place in one thread.
     """
@@ -231,13 +194,39 @@ class FollowedTarget:
         self.active: LoopSession | None = None
         self.restart()
         self.shapes = shapes(plant, self.loop.controller)
-        self.tracks = for_loop([track(state, name) for name, state in self.shapes.items()])
+        self.tracks = _for_loop([track(state, name) for name, state in self.shapes.items()])
         self.names = [list(shape["arrays"]) for shape in self.tracks]
 
     def restart(self) -> None:
         """Start the plant, the controller and the record again; the target stays."""
         self.loop = Loop(self.first.copied(), self.plant, constant(self.position.tolist()), MOST_PERIODS)
-        self.record = LoopRecord(self.facts)
+        self.moments: deque[Moment] = deque(maxlen=MOST_PERIODS)
+
+    def scene(self) -> dict[str, Any]:
+        """Return the page's scene of the run since the last start.
+
+        Raises:
+            ValueError: no period has passed.
+        """
+        moments = list(self.moments)
+        if not moments:
+            raise ValueError("no period has passed; there is nothing to export")
+        motions = {
+            name: joined([moment.shapes[name] for moment in moments], [moment.time for moment in moments])
+            for name in moments[0].shapes
+        }
+        numbers = np.array([moment.numbers for moment in moments])
+        place, size = self.facts.columns["target"]
+        first, target = next(iter(motions.values())), numbers[0, place : place + size]
+        # the tip's coordinates in the place of free ones
+        target = np.where(np.isfinite(target), target, np.asarray(first.tip_position)[0])
+        shown = scene(motions, self.title, target)
+        rows = kept(np.shape(first.y), first.system.z_layout.size)[1]
+        shown["tracks"] = _for_loop(shown["tracks"])
+        shown["loop"] = self.facts.for_page() | {
+            "rows": encoded_array(numbers[rows], "f4"), "reasons": [moments[k].reason for k in rows],
+        }  # fmt: skip
+        return shown
 
     def checked(self, target: Any) -> Float[np.ndarray, "3"]:
         """Return a target from a page's message; None stands for a free coordinate (NaN).
@@ -274,7 +263,7 @@ class FollowedTarget:
         row: Period = loop.period(note)
         numbers = self.facts.row(row, loop.missed, deviations)
         moment = Moment(row.time, drawn, numbers, row.command.reason)
-        self.record.moments.append(moment)
+        self.moments.append(moment)
         return moment
 
 
@@ -401,8 +390,7 @@ class LoopSession(PageSession):
             await self.connection.send(json.dumps(message))
 
     def _exported(self) -> dict[str, str]:
-        page = self.followed.record.page(self.followed.title)
-        return {"name": "run.html", "type": "text/html", "text": page}
+        return {"name": "run.html", "type": "text/html", "text": document(self.followed.scene())}
 
     def _log(self) -> dict[str, str]:
         with tempfile.TemporaryDirectory() as folder:
@@ -457,10 +445,10 @@ def control_live(
     finally:
         gc.unfreeze()
         followed.thread.shutdown()
-    if not followed.record.moments:
+    if not followed.moments:
         return None
     if export is not None:
-        write_page(followed.record.page(followed.title), Path(export))
+        write_page(document(followed.scene()), Path(export))
     return followed.loop.log()
 
 

@@ -21,9 +21,9 @@ import json
 import reprlib
 import sys
 import threading
-from collections.abc import Callable, Coroutine, Iterator, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from time import perf_counter
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -174,16 +174,11 @@ WORKERS = 4
 #: largest estimated error of a drawn shape, as a part of the length; above `COARSE_SHARE` it is drawn faded
 MOST_ERROR = 0.2
 
-
-class Solved(NamedTuple):
-    """End of a solve: a message for the page, the stepper after it, and True if there is no solution."""
-
-    message: bytes | str
-    stepper: Stepper
-    stuck: bool
+#: end of a solve: a message for the page, the stepper after it, and True if there is no solution
+Solved = tuple[bytes | str, Stepper, bool]
 
 
-class Stop:
+class _Stop:
     """Stop function of a solve. Its first call, at the start of a recovery, waits for other recoveries.
 
     So the program of a recovery is compiled once, not at the same time in several threads.
@@ -254,8 +249,8 @@ class Session(PageSession):
                 if solved is None:  # dropped: a newer control or a reset is already waiting
                     self.wanted.set()
                     continue
-                self.stepper, stuck = solved.stepper, solved.stuck
-                await self.connection.send(solved.message)
+                message, self.stepper, stuck = solved
+                await self.connection.send(message)
                 if over:
                     end = self._next_end(end, loop.time())
                 elif stuck or self.paused:
@@ -266,7 +261,7 @@ class Session(PageSession):
     async def _solved(self, worker: concurrent.futures.Executor, over: bool) -> Solved | None:
         """Solve in a thread under the current control; None if a newer control or a reset replaced it."""
         loop, sequence = asyncio.get_running_loop(), self.sequence
-        stop, began, told = Stop(self.recovering), loop.time(), False
+        stop, began, told = _Stop(self.recovering), loop.time(), False
         task = loop.run_in_executor(worker, self.attempt, self.control, sequence, over, stop)
         try:
             while not (await asyncio.wait({task}, timeout=CHECK))[0]:
@@ -274,7 +269,7 @@ class Session(PageSession):
                 if self.cancelled:
                     text = "Cancelled: the last solved shape is shown. Move a slider to go on."
                     message = json.dumps({"unsolved": text, "sequence": sequence})
-                    return Solved(message, self.stepper, True)
+                    return message, self.stepper, True
                 if self.begin_anew or (late and self.sequence != sequence):
                     return None
                 if late and not told:
@@ -285,7 +280,7 @@ class Session(PageSession):
             stop.set()
             task.cancel()
 
-    def attempt(self, control: np.ndarray, sequence: int, over: bool, stop: Stop | None = None) -> Solved:
+    def attempt(self, control: np.ndarray, sequence: int, over: bool, stop: _Stop | None = None) -> Solved:
         """Take the step if it is over, and solve the current one, on a copy of the stepper."""
         began = perf_counter()
         stepper = self.stepper
@@ -300,12 +295,12 @@ class Session(PageSession):
         except (SimulationError, ValueError) as error:
             reason = error.result.message if isinstance(error, SimulationError) else str(error)
             text = f"Not solved: {reason}. The last solved shape is shown; move a slider back."
-            return Solved(json.dumps({"unsolved": text, "sequence": sequence}), stepper, True)
+            return json.dumps({"unsolved": text, "sequence": sequence}), stepper, True
         finally:
             if stop is not None:
                 stop.release()
         self.spent = 1000.0 * (perf_counter() - began)
-        return Solved(self.frame(preview, sequence), stepper, False)
+        return self.frame(preview, sequence), stepper, False
 
     def frame(self, shape: Trajectory, sequence: int) -> bytes:
         """Return a shape for the page: head, then the row.
@@ -331,7 +326,8 @@ def _require_accurate(row: Trajectory) -> None:
 
 #: default time step (s)
 USUAL = 0.05
-#: time after which a waiting thread gets its turn (s); 5 ms is Python's default
+#: time after which a waiting thread gets its turn (s), so that a solve takes turns with the server; 5 ms is
+#: Python's default
 SWITCH = 5e-4
 
 
@@ -368,29 +364,18 @@ def view_live(
     checked_port(port)
     if not isinstance(robot, System):
         raise ValueError(f"robot is a {type(robot).__name__}; allowed is one robot")
-    stepper = resting_stepper(robot, usual_step(robot) if dt is None else dt, space)
+    # in equilibrium under the sliders' initial controls: nothing moves by itself
+    still = equilibrium(robot, [slider["start"] for slider in sliders(robot)], space=space)
+    stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space, initial=still)
     page = live_page(stepper, title, target)
-    with prompt_threads():
-        asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
-
-
-def resting_stepper(robot: System, dt: float, space: str = "lobatto2") -> Stepper:
-    """Return the robot in equilibrium under the sliders' initial controls: nothing moves by itself."""
-    start = [slider["start"] for slider in sliders(robot)]
-    return Stepper(robot, dt, space=space, initial=equilibrium(robot, start, space=space))
-
-
-@contextlib.contextmanager
-def prompt_threads() -> Iterator[None]:
-    """Let threads wait for each other for less time: a solve takes turns with the server ten times or so."""
-    before = sys.getswitchinterval()
+    interval = sys.getswitchinterval()
     gc.collect()
     gc.freeze()  # a collection of everything that is loaded takes 0.1 to 0.3 s
     sys.setswitchinterval(SWITCH)
     try:
-        yield
+        asyncio.run(serve_page(page, lambda connection: Session(stepper, connection), port, open_browser))
     finally:
-        sys.setswitchinterval(before)
+        sys.setswitchinterval(interval)
         gc.unfreeze()
 
 

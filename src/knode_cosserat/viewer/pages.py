@@ -19,18 +19,14 @@ from typing import Any
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.viewer.scene import Given, Point, scene
 
+#: folder of this package
+HERE = Path(__file__).parent
 #: names under which modules import each other, and their files
 MODULES = {
     "three": "vendor/three.module.min.js",
     "orbit-controls": "vendor/OrbitControls.js",
-    **{
-        f"viewer/{name}": f"page/{name}.js"
-        for name in (
-            "app", "capture", "colours", "data", "hover", "legend", "link", "live", "loop", "panels", "plots",
-            "readouts", "robot", "stage", "target", "triad", "tube", "units", "views",
-        )
-    },
-}  # fmt: skip
+    **{f"viewer/{file.stem}": f"page/{file.name}" for file in sorted((HERE / "page").glob("*.js"))},
+}
 #: security policy of the page: no network access, except to its own server in the live mode
 _POLICY = (
     "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:; "
@@ -86,7 +82,7 @@ def for_script(value: Any) -> str:
 
 
 def _text(file: str) -> str:
-    return (Path(__file__).parent / file).read_text(encoding="utf-8")
+    return (HERE / file).read_text(encoding="utf-8")
 
 
 def _data_url(file: str) -> str:
