@@ -44,9 +44,7 @@ def bill_of_materials(robot: str | Path) -> tuple[Item, ...]:
     values = _values(load_dimensions(robot))
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
         rows = [[cell.format_map(values) for cell in row] for row in list(csv.reader(file))[1:]]
-    return tuple(
-        Item(part, int(count), specification, source) for part, count, specification, source in rows
-    )
+    return tuple(Item(part, int(count), specification, source) for part, count, specification, source in rows)
 
 
 def materials_table(items: Sequence[Item]) -> str:
