@@ -249,7 +249,7 @@ def place_parts(part: PartDimensions) -> list[tuple[str, Any]]:
 
 def _drive(part: PartDimensions, made: dict[str, Any], motor: Any) -> list[tuple[str, Any]]:
     """Return the bodies of one tendon below the plate, in its frame: x radial, y tangential, z up."""
-    cad, face = library(), part.face_distance
+    cad, face = library(), part.spool.face_distance
     start, top = face + part.bracket.face, -part.mount.height
     foot = top - part.cell.thickness
     axis = (part.bracket.axis[0], foot + part.bracket.axis[1])
