@@ -235,7 +235,7 @@ def loop(settings: Any) -> Product:
 
 def dds(settings: Any) -> Product:
     """Measure the latency of DDS between two processes; with real-time priority where it is allowed."""
-    from knode_cosserat_hardware.middleware.loopback import measure_loopback
+    from benchmarks.dds_latency import measure_loopback
 
     try:
         found = measure_loopback(settings["messages"], real_time=True)
