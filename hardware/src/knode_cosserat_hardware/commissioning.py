@@ -44,17 +44,6 @@ class Machine:
     driver: Driver
     silence: Callable[[float], Any]
 
-    def wait(self, seconds: float) -> None:
-        """Wait (s), with the robot's watchdog fed."""
-        wait = getattr(self.driver, "wait", None)
-        if wait is not None:
-            wait(seconds)
-            return
-        end = time.monotonic() + seconds
-        while (rest := end - time.monotonic()) > 0.0:
-            self.driver.read()
-            time.sleep(min(0.02, rest))
-
     def tensions(self, count: int = 20) -> Float[np.ndarray, "count c"]:
         """Return the measured tensions of some readings (N)."""
         return np.array([self.driver.read().tension for _ in range(count)])
@@ -63,7 +52,7 @@ class Machine:
         """Command tensions (N) for a time (s)."""
         for _ in range(max(1, round(seconds / 0.02))):
             self.driver.command(tension)
-            self.wait(0.02)
+            self.driver.wait(0.02)
 
 
 class CheckError(HardwareError):
@@ -119,13 +108,13 @@ def measure_directions(machine: Machine) -> dict[str, Any]:
         while count < JOGS:
             count += 1
             driver.jog(tendon, DRIVE)
-            machine.wait(0.25)
+            driver.wait(0.25)
             rise = machine.tensions(5).mean(axis=0) - before
             if np.max(np.abs(rise)) > RISE:
                 break
         for _ in range(count):
             driver.jog(tendon, -DRIVE)
-            machine.wait(0.25)
+            driver.wait(0.25)
         values["rise"].append(round(float(rise[tendon]), 3))
         values["jogs"].append(count)
         strongest = int(np.argmax(np.abs(rise)))
@@ -148,7 +137,7 @@ def measure_stop(machine: Machine) -> dict[str, Any]:
     driver.arm()
     machine.hold(np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
     driver.stop()
-    machine.wait(1.0)
+    driver.wait(1.0)
     reading = driver.read()
     values = {"fault": reading.fault, "tension": _rounded(reading.tension), "unit": "N"}
     if reading.state is not DriverState.FAULT:
@@ -168,7 +157,7 @@ def measure_watchdog(machine: Machine) -> dict[str, Any]:
     machine.hold(np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
     machine.silence(SILENCE)
     # readings from before the silence may still wait
-    machine.wait(0.1)
+    driver.wait(0.1)
     reading = driver.read()
     values = {"state": reading.state.value, "fault": reading.fault, "silence": SILENCE, "unit": "s"}
     if reading.state is DriverState.ARMED:
@@ -198,7 +187,7 @@ def measure_tracking(machine: Machine) -> dict[str, Any]:
                 values,
             )
     driver.disarm()
-    machine.wait(0.7)
+    driver.wait(0.7)
     return values
 
 
@@ -215,14 +204,14 @@ def measure_over_tension(machine: Machine) -> dict[str, Any]:
         jogs, reading = 0, driver.read()
         while jogs < 2 * JOGS and not reading.fault:
             driver.jog(0, DRIVE)
-            machine.wait(0.25)
+            driver.wait(0.25)
             reading = driver.read()
             jogs += 1
         values |= {"fault": reading.fault, "jogs": jogs}
         if not reading.fault.startswith("over-tension"):
             raise CheckError("a tension above the board's limit was no fault; do not use this robot", values)
     finally:
-        machine.wait(0.7)
+        driver.wait(0.7)
         if driver.state is DriverState.FAULT:
             driver.reset()
         board.set_setting("limit", usual)
@@ -235,7 +224,7 @@ def measure_latency(machine: Machine) -> dict[str, Any]:
     driver.arm()
     machine.hold(np.full(driver.tendon_count, driver.limits.low), 1.0)
     driver.disarm()
-    machine.wait(0.7)
+    driver.wait(0.7)
     median, p99, count = driver.latency
     if not count:
         raise NotImplementedError("this robot does not acknowledge commands")
@@ -310,12 +299,6 @@ class Person:
     consent: Callable[[str], bool]
 
 
-def silence_of(driver: Driver) -> Callable[[float], Any]:
-    """Return a function that passes a time (s) without a sign of life to a robot."""
-    found: Callable[[float], Any] = getattr(driver, "advance", time.sleep)
-    return found
-
-
 class Commissioning:
     """Commissioning of a connected robot, step by step, with a report file.
 
@@ -339,7 +322,8 @@ class Commissioning:
         silence: Callable[[float], Any] | None = None, steps: Sequence[CheckStep] = CHECKLIST,
     ):  # fmt: skip
         self.path, self.robot, self.person, self.steps = Path(path), robot, person, tuple(steps)
-        self._machine = Machine(driver, silence_of(driver) if silence is None else silence)
+        advance: Callable[[float], Any] = getattr(driver, "advance", time.sleep)
+        self._machine = Machine(driver, silence or advance)
         #: results of steps by name
         self.results: dict[str, dict[str, Any]] = self._resumed()
 

@@ -90,6 +90,38 @@ class Driver(abc.ABC):
     limits: Limits
     #: number of tendons
     tendon_count: int
+    _latencies: LatencyWindow
+    _fault = ""
+
+    @property
+    def fault(self) -> str:
+        """Latched fault with its tendon, counted from 1, such as "over-tension:3"; empty without one."""
+        return self._fault
+
+    @property
+    def latency(self) -> Latency:
+        """Latency of the last commands; NaN before the first."""
+        return self._latencies.summary()
+
+    def now(self) -> float:
+        """Return the time on the robot's clock (s)."""
+        return time.monotonic()
+
+    def wait(self, seconds: float) -> None:
+        """Wait (s), with the robot's watchdog fed.
+
+        Raises:
+            HardwareError: the connection is lost.
+        """
+        end = time.monotonic() + seconds
+        while (rest := end - time.monotonic()) > 0.1:
+            time.sleep(0.1)
+            self.read()
+        time.sleep(max(rest, 0.0))
+
+    def _require_no_fault(self) -> None:
+        if self.fault:
+            raise HardwareError(fault_message(self.fault))
 
     @property
     @abc.abstractmethod
@@ -171,11 +203,6 @@ class Driver(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Disarm and close the connection. Never raises."""
-
-    @property
-    @abc.abstractmethod
-    def latency(self) -> Latency:
-        """Latency of the last commands; NaN before the first."""
 
     def __enter__(self) -> Self:
         self.connect()

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -39,7 +37,7 @@ class HardwarePlant(Plant):
         dt: period (s).
         size: number of measured numbers; the last three are the tip's position (m).
         region: region of the tip; None: not checked.
-        clock: the driver's clock (s); None: `driver.now`, or the monotonic clock.
+        clock: the driver's clock (s); None: `driver.now`.
         emergency: emergency stop that is checked in each period.
 
     Raises:
@@ -56,8 +54,7 @@ class HardwarePlant(Plant):
         self.driver, self.dt = driver, float(dt)
         self._source: Source | None = source
         self._size, self._region, self._emergency = size, region, emergency
-        self._clock: Callable[[], float] = getattr(driver, "now", time.monotonic) if clock is None else clock
-        self._wait: Callable[[float], Any] = getattr(driver, "wait", time.sleep)
+        self._clock: Callable[[], float] = driver.now if clock is None else clock
         #: number of commands that the driver's limits reduced
         self.reduced = 0
         #: readings during the loop, at most one a period
@@ -143,7 +140,7 @@ class HardwarePlant(Plant):
             return
         rest = self._begin + self._count * self.dt - self._clock()
         if rest > 0.0:
-            self._wait(rest)
+            self.driver.wait(rest)
         elif -rest > TOLERANCE * self.dt:
             self.missed += 1
             self._begin -= rest
@@ -157,7 +154,7 @@ class HardwarePlant(Plant):
         if self.driver.state is DriverState.FAULT:
             # before the fault is read: a board that restarted sends no readings
             self.driver.stop()
-            fault = getattr(self.driver, "fault", "") or self.driver.read().fault
+            fault = self.driver.fault or self.driver.read().fault
             raise HardwareError(fault_message(fault))
 
 

@@ -491,10 +491,6 @@ class SerialBoard(Driver):
     def _board_state(self, link: BoardLink) -> str:
         return link.telemetry.state if link.telemetry else ""
 
-    def _require_no_fault(self) -> None:
-        if self.fault:
-            raise HardwareError(fault_message(self.fault))
-
     def _expect(
         self, link: BoardLink, condition: Callable[[], bool], timeout: float, problem: str, check: bool = True
     ) -> bool:

@@ -22,12 +22,10 @@ from knode_cosserat_hardware.driver import (
     Driver,
     DriverState,
     HardwareError,
-    Latency,
     LatencyWindow,
     Limits,
     Reading,
     TensionLimiter,
-    fault_message,
 )
 from knode_cosserat_hardware.lines import GRAM_FORCE
 
@@ -208,16 +206,6 @@ class SimulatedRobot(TrueShape, Driver):
             return DriverState.FAULT
         return DriverState.ARMED if self._armed else DriverState.READY
 
-    @property
-    def fault(self) -> str:
-        """Latched fault with its tendon, counted from 1; empty without one."""
-        return self._fault
-
-    @property
-    def latency(self) -> Latency:
-        """Latency of the last commands; NaN before the first."""
-        return self._latencies.summary()
-
     def now(self) -> float:
         """Return the time on the robot's clock (s): monotonic in real time, else simulated."""
         return time.monotonic() if self.real_time else self._count * STEP
@@ -306,8 +294,7 @@ class SimulatedRobot(TrueShape, Driver):
     def command(self, tension: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
         """Set the wanted tensions (N), and return them within the limits."""
         self._touch()
-        if self._fault:
-            raise HardwareError(fault_message(self._fault))
+        self._require_no_fault()
         if not self._armed:
             raise HardwareError("the robot is not armed; call arm() before command()")
         self._wanted = self._limiter.reduced(tension, self.now())
@@ -390,8 +377,7 @@ class SimulatedRobot(TrueShape, Driver):
 
     def _ready(self, purpose: str) -> None:
         self._touch()
-        if self._fault:
-            raise HardwareError(fault_message(self._fault))
+        self._require_no_fault()
         if self._armed:
             raise HardwareError(f"{purpose} needs a robot that is not armed; call disarm() first")
 

@@ -7,7 +7,6 @@ import dataclasses
 import errno
 import os
 import struct
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -218,7 +217,6 @@ def teleoperate(
     Raises:
         HardwareError: the robot has a fault, or the device is lost; the robot was stopped.
     """
-    wait: Callable[[float], Any] = getattr(driver, "wait", time.sleep)
     count = 0
     try:
         driver.arm()
@@ -230,7 +228,7 @@ def teleoperate(
             if shown is not None:
                 shown(wish, list(sent), reading)
             count += 1
-            wait(dt)
+            driver.wait(dt)
     except HardwareError:
         emergency.stop("an error")
         raise
