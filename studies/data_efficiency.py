@@ -25,9 +25,17 @@ from knode_cosserat.trajectory import Trajectory
 from studies import runner, simulation
 from studies.comparisons import NoKnowledge, compared, linear_predictor
 from studies.methods import METHODS, LearnedSystems
-from studies.report import Report, as_json, write_figures, write_texts
+from studies.report import (
+    MEASURES,
+    Report,
+    as_json,
+    in_words,
+    markdown_table,
+    spreads,
+    write_figures,
+    write_texts,
+)
 from studies.runner import Job, Product
-from studies.tables import MEASURES, in_words, markdown_table, spreads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

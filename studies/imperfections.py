@@ -27,9 +27,8 @@ from knode_cosserat.trajectory import Trajectory
 from studies import runner, truths
 from studies.comparisons import compared
 from studies.methods import METHODS
-from studies.report import Report, as_json, write_figures, write_texts
+from studies.report import MEASURES, Report, as_json, markdown_table, write_figures, write_texts
 from studies.runner import Job, Product, StudyError
-from studies.tables import MEASURES, markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -23,9 +23,8 @@ from knode_cosserat.trajectory import Trajectory
 from studies import figures, runner
 from studies.comparisons import compared
 from studies.methods import METHODS
-from studies.report import Report, as_json, write_figures, write_texts
+from studies.report import Cell, Published, Report, as_csv, as_json, as_markdown, write_figures, write_texts
 from studies.runner import Job, Product
-from studies.tables import Cell, Published, as_csv, as_markdown
 
 ROBOT = "delrin-tendon-robot"
 #: time step (s)

@@ -23,9 +23,8 @@ from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.virtual import record_virtual
 from knode_cosserat.solvers.result import SimulationError
-from studies.report import Report, as_json, write_texts
+from studies.report import Report, as_json, markdown_table, write_texts
 from studies.runner import Job, Product, run
-from studies.tables import markdown_table
 
 #: signals of the held-out recordings
 UNSEEN = {"sine_2p0": "sine:2.0", "rand_1": "random:1"}

@@ -10,20 +10,24 @@ import pytest
 
 from knode_cosserat.recordings.findings import RecordingError
 from studies import beam
-from studies.beam_model import (
+from studies.beam import (
     NOMINAL,
+    THRESHOLD,
     Beam,
     Numerics,
     beam_rod,
+    find_release,
     held_beam,
     identify_beam,
+    load_of,
     marker_rmse,
     predict_markers,
+    read_beam,
     shear_factor,
     step_count,
+    tip_drop,
     torsion_constant,
 )
-from studies.beam_recordings import THRESHOLD, find_release, load_of, read_beam, tip_drop
 from tests.commands import run_study
 
 FOLDER = Path(__file__).parents[1] / "files" / "beam"
