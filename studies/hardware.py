@@ -341,7 +341,7 @@ def _trial(rig: _Rig, controller: Controller, kind: str) -> dict[str, Any]:
     """Close the loop, cause a fault, and recover; an empty kind is a loop without a fault."""
     robot, board, offset = rig.robot, rig.board, rig.robot.cells.offset.copy()
     after, tendon = float(rig.random.uniform(EARLIEST, LATEST)), int(rig.random.integers(0, 4))
-    plant = HardwarePlant(board, rig.measured, DT, clock=lambda: robot.time)
+    plant = HardwarePlant(board, rig.measured, DT)
     robot.plan(robot.time + after, kind or NOISE_BURST, lambda: rig.cause(kind, tendon) if kind else None)
     log: LoopLog | None
     try:
@@ -553,7 +553,7 @@ def loop(settings: Any) -> Product:
     length = float(robot.robot.length)
     errors, unsafe, failed, missing_rows = {}, 0, 0, 0
     for name, path in {"circle": circle(0.1, period=4.0), "eight": figure_eight(0.1, period=6.0)}.items():
-        plant = HardwarePlant(board, lambda: measured_tip(robot, random), DT, clock=lambda: robot.time)
+        plant = HardwarePlant(board, lambda: measured_tip(robot, random), DT)
         try:
             log = run_loop(controller, plant, path, settings["seconds"])
         except HardwareError as error:

@@ -314,7 +314,8 @@ def test_wrong_wiring_is_found(tmp_path):
 def test_a_robot_without_a_watchdog_fails(tmp_path):
     with SimulatedRobot(ROD, machine=MachineParameters(noise=0.0, offset=0.0)) as robot:
         step = [each for each in CHECKLIST if each.name == "watchdog"]
-        report, _ = commissioned(robot, tmp_path / "a.json", steps=step, silence=robot.wait)
+        robot.advance = robot.wait
+        report, _ = commissioned(robot, tmp_path / "a.json", steps=step)
         assert "still armed after 1 s without its host" in report["steps"][0]["reason"]
         assert robot.state is DriverState.FAULT
 

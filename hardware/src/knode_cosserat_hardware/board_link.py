@@ -58,6 +58,10 @@ class Transport(abc.ABC):
     def now(self) -> float:
         """Return the time (s) on a clock that never goes back."""
 
+    def advance(self, seconds: float) -> None:
+        """Let time pass (s) without reading."""
+        time.sleep(seconds)
+
     @abc.abstractmethod
     def close(self) -> None:
         """Close the connection. Never raises."""

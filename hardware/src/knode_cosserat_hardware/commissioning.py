@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,27 +31,16 @@ TEST, RELATIVE, ABSOLUTE = 2.0, 0.1, 0.3
 SILENCE, LATENCY = 1.0, 0.06
 
 
-@dataclasses.dataclass(frozen=True)
-class Machine:
-    """Connected robot, and time on its clock.
+def _tensions(driver: Driver, count: int = 20) -> Float[np.ndarray, "count c"]:
+    """Return the measured tensions of some readings (N)."""
+    return np.array([driver.read().tension for _ in range(count)])
 
-    Attributes:
-        driver: the driver.
-        silence: passes a time (s) without a sign of life to the robot.
-    """
 
-    driver: Driver
-    silence: Callable[[float], Any]
-
-    def tensions(self, count: int = 20) -> Float[np.ndarray, "count c"]:
-        """Return the measured tensions of some readings (N)."""
-        return np.array([self.driver.read().tension for _ in range(count)])
-
-    def hold(self, tension: Float[np.ndarray, " c"], seconds: float) -> None:
-        """Command tensions (N) for a time (s)."""
-        for _ in range(max(1, round(seconds / 0.02))):
-            self.driver.command(tension)
-            self.driver.wait(0.02)
+def _hold(driver: Driver, tension: Float[np.ndarray, " c"], seconds: float) -> None:
+    """Command tensions (N) for a time (s)."""
+    for _ in range(max(1, round(seconds / 0.02))):
+        driver.command(tension)
+        driver.wait(0.02)
 
 
 class CheckError(HardwareError):
@@ -80,12 +68,12 @@ class CheckStep:
     name: str
     text: str
     motion: str = ""
-    measure: Callable[[Machine], dict[str, Any]] | None = None
+    measure: Callable[[Driver], dict[str, Any]] | None = None
 
 
-def measure_noise(machine: Machine) -> dict[str, Any]:
+def measure_noise(driver: Driver) -> dict[str, Any]:
     """Measure offset and noise of each load cell at rest (N)."""
-    tension = machine.tensions(100)
+    tension = _tensions(driver, 100)
     offset, noise = tension.mean(axis=0), tension.std(axis=0)
     values = {"offset": _rounded(offset), "noise": _rounded(noise), "unit": "N"}
     for name, found, limit in (("noise", noise, NOISE), ("offset", np.abs(offset), OFFSET)):
@@ -98,18 +86,17 @@ def measure_noise(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_directions(machine: Machine) -> dict[str, Any]:
+def measure_directions(driver: Driver) -> dict[str, Any]:
     """Reel in with each motor until its load cell reacts, and reel out again."""
     values: dict[str, Any] = {"rise": [], "jogs": [], "unit": "N"}
-    driver = machine.driver
     for tendon in range(driver.tendon_count):
-        before = machine.tensions(10).mean(axis=0)
+        before = _tensions(driver, 10).mean(axis=0)
         count = 0
         while count < JOGS:
             count += 1
             driver.jog(tendon, DRIVE)
             driver.wait(0.25)
-            rise = machine.tensions(5).mean(axis=0) - before
+            rise = _tensions(driver, 5).mean(axis=0) - before
             if np.max(np.abs(rise)) > RISE:
                 break
         for _ in range(count):
@@ -131,11 +118,10 @@ def measure_directions(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_stop(machine: Machine) -> dict[str, Any]:
+def measure_stop(driver: Driver) -> dict[str, Any]:
     """Stop the armed robot; it must have the fault `stopped`, and release."""
-    driver = machine.driver
     driver.arm()
-    machine.hold(np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
+    _hold(driver, np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
     driver.stop()
     driver.wait(1.0)
     reading = driver.read()
@@ -150,12 +136,11 @@ def measure_stop(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_watchdog(machine: Machine) -> dict[str, Any]:
+def measure_watchdog(driver: Driver) -> dict[str, Any]:
     """Send nothing to the armed robot for a second; it must stop by itself."""
-    driver = machine.driver
     driver.arm()
-    machine.hold(np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
-    machine.silence(SILENCE)
+    _hold(driver, np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
+    driver.advance(SILENCE)
     # readings from before the silence may still wait
     driver.wait(0.1)
     reading = driver.read()
@@ -168,16 +153,16 @@ def measure_watchdog(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_tracking(machine: Machine) -> dict[str, Any]:
+def measure_tracking(driver: Driver) -> dict[str, Any]:
     """Tension each tendon in turn; the measured tension must follow."""
-    driver, test = machine.driver, _test(machine.driver)
+    test = _test(driver)
     values: dict[str, Any] = {"commanded": test, "measured": [], "unit": "N"}
     driver.arm()
     for tendon in range(driver.tendon_count):
         wanted = np.full(driver.tendon_count, max(driver.limits.low, 0.1 * test))
         wanted[tendon] = test
-        machine.hold(wanted, 1.0)
-        measured = machine.tensions(10).mean(axis=0)
+        _hold(driver, wanted, 1.0)
+        measured = _tensions(driver, 10).mean(axis=0)
         values["measured"].append(round(float(measured[tendon]), 3))
         if abs(measured[tendon] - test) > RELATIVE * test + ABSOLUTE:
             driver.disarm()
@@ -191,9 +176,9 @@ def measure_tracking(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_over_tension(machine: Machine) -> dict[str, Any]:
+def measure_over_tension(driver: Driver) -> dict[str, Any]:
     """Lower the board's limit of tension, and exceed it by jogs; the board must stop and release."""
-    driver, test = machine.driver, _test(machine.driver)
+    test = _test(driver)
     board: Any = driver
     if not hasattr(driver, "set_setting"):
         raise NotImplementedError("this robot has no setting of its over-tension limit")
@@ -218,11 +203,10 @@ def measure_over_tension(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_latency(machine: Machine) -> dict[str, Any]:
+def measure_latency(driver: Driver) -> dict[str, Any]:
     """Send 50 commands at the low limit, and report the latency (s)."""
-    driver = machine.driver
     driver.arm()
-    machine.hold(np.full(driver.tendon_count, driver.limits.low), 1.0)
+    _hold(driver, np.full(driver.tendon_count, driver.limits.low), 1.0)
     driver.disarm()
     driver.wait(0.7)
     median, p99, count = driver.latency
@@ -310,7 +294,6 @@ class Commissioning:
         path: report file (.json).
         robot: name of the robot in the report, such as its port.
         person: the person in charge.
-        silence: passes a time (s) without a sign of life to the robot.
         steps: the checklist.
 
     Raises:
@@ -319,11 +302,10 @@ class Commissioning:
 
     def __init__(
         self, driver: Driver, path: str | Path, robot: str, person: Person, *,
-        silence: Callable[[float], Any] | None = None, steps: Sequence[CheckStep] = CHECKLIST,
+        steps: Sequence[CheckStep] = CHECKLIST,
     ):  # fmt: skip
         self.path, self.robot, self.person, self.steps = Path(path), robot, person, tuple(steps)
-        advance: Callable[[float], Any] = getattr(driver, "advance", time.sleep)
-        self._machine = Machine(driver, silence or advance)
+        self._driver = driver
         #: results of steps by name
         self.results: dict[str, dict[str, Any]] = self._resumed()
 
@@ -360,7 +342,7 @@ class Commissioning:
         """Return the report as plain values."""
         return {
             "format": FORMAT, "robot": self.robot, "package": package_version(), "complete": self.is_complete,
-            "limits": dataclasses.asdict(self._machine.driver.limits),
+            "limits": dataclasses.asdict(self._driver.limits),
             "steps": [
                 {"name": step.name, "text": step.text} | self.results[step.name]
                 for step in self.steps
@@ -374,12 +356,12 @@ class Commissioning:
             return {"result": {True: "confirmed", False: "failed", None: "not confirmed"}[answer]}
         if step.motion and not self.person.consent(f"{step.name}: {step.motion}"):
             return {"result": "skipped"}
-        driver = self._machine.driver
+        driver = self._driver
         try:
             if not step.motion:
-                return {"result": "passed", "values": step.measure(self._machine)}
+                return {"result": "passed", "values": step.measure(driver)}
             with EmergencyStop(driver) as emergency:
-                values = step.measure(self._machine)
+                values = step.measure(driver)
                 if driver.state is DriverState.ARMED:
                     driver.disarm()
                 emergency.check()

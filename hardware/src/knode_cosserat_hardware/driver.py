@@ -119,6 +119,10 @@ class Driver(abc.ABC):
             self.read()
         time.sleep(max(rest, 0.0))
 
+    def advance(self, seconds: float) -> None:
+        """Let time pass (s) without a sign of life to the robot: armed, its watchdog reacts."""
+        time.sleep(seconds)
+
     def _require_no_fault(self) -> None:
         if self.fault:
             raise HardwareError(fault_message(self.fault))

@@ -542,6 +542,10 @@ class EmulatedPort(Transport):
         """Return the simulated time (s)."""
         return self.robot.time
 
+    def advance(self, seconds: float) -> None:
+        """Move the robot on by some time (s)."""
+        self.robot.advance(seconds)
+
     def close(self) -> None:
         """Close the port."""
         self._is_open = False

@@ -37,7 +37,6 @@ class HardwarePlant(Plant):
         dt: period (s).
         size: number of measured numbers; the last three are the tip's position (m).
         region: region of the tip; None: not checked.
-        clock: the driver's clock (s); None: `driver.now`.
         emergency: emergency stop that is checked in each period.
 
     Raises:
@@ -46,15 +45,14 @@ class HardwarePlant(Plant):
 
     def __init__(
         self, driver: Driver, source: Source | None, dt: float, *, size: int = 3,
-        region: SafeRegion | None = None, clock: Callable[[], float] | None = None,
-        emergency: EmergencyStop | None = None,
+        region: SafeRegion | None = None, emergency: EmergencyStop | None = None,
     ):  # fmt: skip
         if not 0.0 < dt < math.inf:
             raise HardwareError(f"dt must be a positive number of seconds (got {dt!r})")
         self.driver, self.dt = driver, float(dt)
         self._source: Source | None = source
         self._size, self._region, self._emergency = size, region, emergency
-        self._clock: Callable[[], float] = driver.now if clock is None else clock
+        self._clock = driver.now
         #: number of commands that the driver's limits reduced
         self.reduced = 0
         #: readings during the loop, at most one a period

@@ -316,12 +316,17 @@ class SerialBoard(Driver):
         link.close()
 
     def wait(self, seconds: float) -> None:
-        """Wait (s) while the board's watchdog is fed.
-
-        Raises:
-            HardwareError: the connection is lost.
-        """
+        """Wait (s) while the board's watchdog is fed."""
         self._connected().until(lambda: None, seconds)
+
+    def now(self) -> float:
+        """Return the time on the transport's clock (s)."""
+        return self._port.now() if isinstance(self._port, Transport) else super().now()
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass (s) without a sign of life to the board."""
+        if self._link is not None:
+            self._link.transport.advance(seconds)
 
     # motion
 

@@ -211,11 +211,7 @@ class SimulatedRobot(TrueShape, Driver):
         return time.monotonic() if self.real_time else self._count * STEP
 
     def wait(self, seconds: float) -> None:
-        """Wait (s), with the watchdog fed.
-
-        Raises:
-            HardwareError: the robot is not connected.
-        """
+        """Wait (s), with the watchdog fed."""
         end = self.now() + seconds
         self._touch()
         while (rest := end - self.now()) > 1e-9:

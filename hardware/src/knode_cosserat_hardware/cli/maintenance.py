@@ -316,7 +316,7 @@ def commission(
 
     with connected(machine, yes) as driver:
         who = Person(person or getpass.getuser(), confirm, consent)
-        work = Commissioning(driver, report, machine.name, who, silence=machine.silence)
+        work = Commissioning(driver, report, machine.name, who)
         found = work.run(show)
     failed = [step["name"] for step in found["steps"] if step["result"] == "failed"]
     lines.append("complete" if found["complete"] else "not complete")

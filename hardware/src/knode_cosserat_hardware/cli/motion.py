@@ -86,13 +86,13 @@ def record(
         names = _body_names(machine, poses)
         config = _recording_config(count, names, machine)
         driver = stack.enter_context(connected(machine, yes, motion))
-        recorder = Recorder(out, config, clock=HostClock(machine.clock))
+        recorder = Recorder(out, config, clock=HostClock(machine.driver.now))
         config.save(out.with_suffix(".yaml"))
         reduced = 0
         try:
             with recorder, emergency_stop(driver) as emergency:
                 driver.arm()
-                begin = machine.clock()
+                begin = machine.driver.now()
                 for k, row in enumerate(rows):
                     emergency.check()
                     sent = driver.command(row)
@@ -134,7 +134,7 @@ def _tension_rows(controls: str, seconds: float | None, dt: float | None, count:
 def _read_until(end: float, machine: OpenedDriver, recorder: Any, poses: Any) -> None:
     """Record readings and poses until a time (s)."""
     true = machine.poses
-    while machine.clock() < end - 1e-9:
+    while machine.driver.now() < end - 1e-9:
         reading = machine.driver.read()
         recorder.add_reading(reading)
         if poses is not None:
@@ -144,7 +144,7 @@ def _read_until(end: float, machine: OpenedDriver, recorder: Any, poses: Any) ->
             from knode_cosserat_hardware.middleware.mocap import PoseFrame
 
             found = true((1.0,))
-            recorder.add_poses(PoseFrame(machine.clock(), found[:, :3], found[:, 3:]))
+            recorder.add_poses(PoseFrame(machine.driver.now(), found[:, :3], found[:, 3:]))
 
 
 def _body_names(machine: OpenedDriver, poses: Any) -> list[str]:
@@ -295,9 +295,7 @@ def _closed_loop(
     driver = machine.driver
     region = None if radius is None else SafeRegion(radius=radius)
     with emergency_stop(driver) as emergency:
-        plant = HardwarePlant(
-            driver, source, controller.dt, region=region, clock=machine.clock, emergency=emergency
-        )
+        plant = HardwarePlant(driver, source, controller.dt, region=region, emergency=emergency)
         log = run_loop(controller, plant, reference, seconds)
         driver.disarm()
     return log, plant
@@ -376,7 +374,7 @@ def steer(
             if others is not None and not emergency.has_keys:
                 raise ValueError("the keyboard needs a terminal; give --device /dev/input/js0 for a gamepad")
             count = teleoperate(
-                driver, inputs, mapping if window is None else window, emergency,
+                driver, inputs, mapping if window is None else None, emergency,
                 seconds=float("inf") if seconds is None else seconds, shown=shown,
             )  # fmt: skip
     facts = {"commands": count, "tension": [round(float(value), 4) for value in last[0]]}
