@@ -1,4 +1,11 @@
-"""Study of a real silicone beam: identified from training recordings, tested on held-out ones."""
+"""Study of a real silicone beam: identified from training recordings, tested on held-out ones.
+
+The beam is clamped, held by hand and released. Recordings are CSV files of motion-capture markers: columns
+`time_s` and `mK_x_m`, `mK_y_m`, `mK_z_m`, markers 0 to 2 on the tip and 3 to 5 on the base; x points up, z
+along the beam. A file's name states the load: `…load52…` for 52 g at the tip, `…gravity…` for none. In the
+model the held beam is the equilibrium under a vertical force of the hand at the tip that reproduces the
+measured height of the tip. At the release this force vanishes.
+"""
 
 from __future__ import annotations
 
@@ -245,11 +252,6 @@ def beam_rod(beam: Beam, load: float, nodes: int) -> ViscoelasticRod:
     )  # fmt: skip
 
 
-def held_deflection(beam: Beam, recording: BeamRecording) -> float:
-    """Return the height (m) of the held tip over that of the unloaded beam."""
-    return 0.0 if beam.level is None else tip_height(recording) - beam.level
-
-
 def tip_height(recording: BeamRecording) -> float:
     """Return the height (m) of the held end face over the mean of the base's markers."""
     return float(np.mean(recording.held[:, 0] - MARKERS[:, 0]) - np.mean(recording.base[:, 0]))
@@ -295,7 +297,7 @@ def predict_markers(
     The prediction is put on the recording's clock where both tips have dropped by `THRESHOLD`.
     """
     rod = beam_rod(beam, recording.load, numerics.nodes)
-    held = held_beam(rod, recording.load, held_deflection(beam, recording))
+    held = held_beam(rod, recording.load, 0.0 if beam.level is None else tip_height(recording) - beam.level)
     motion = simulate(
         rod, np.zeros((steps, 1)), numerics.dt, time=TIME, start="paper", initial=held, on_failure="return"
     )
@@ -326,23 +328,11 @@ LOST = 100.0
 STEP, TOLERANCE = 1e-3, 3e-3
 
 
-class IdentifiedBeam(NamedTuple):
-    """Identified beam, and the number of evaluations."""
-
-    beam: Beam
-    #: predictions of all training recordings for one set of numbers
-    evaluations: int
-
-
-def errors(predicted: Float[np.ndarray, "T 3 3"], recording: BeamRecording) -> Float[np.ndarray, "T 3"]:
-    """Return the distances (m) between predicted and measured tip markers after the release, row by row."""
-    released = np.isfinite(predicted).all(axis=(1, 2))
-    return np.asarray(np.linalg.norm((predicted - recording.tip)[released], axis=2))
-
-
 def marker_rmse(predicted: Float[np.ndarray, "T 3 3"], recording: BeamRecording) -> float:
     """Return the root mean square (m) of the distances over rows after the release and tip markers."""
-    return float(np.sqrt(np.nanmean(errors(predicted, recording) ** 2)))
+    released = np.isfinite(predicted).all(axis=(1, 2))
+    distances = np.linalg.norm((predicted - recording.tip)[released], axis=2)
+    return float(np.sqrt(np.nanmean(distances**2)))
 
 
 def identify_beam(
@@ -350,7 +340,7 @@ def identify_beam(
     steps: int,
     numerics: Numerics = DEFAULT,
     progress: Callable[[str], None] = lambda line: None,
-) -> IdentifiedBeam:
+) -> Beam:
     """Return the beam whose parameters fit the training recordings best.
 
     Each recording has the same weight, independent of its number of rows.
@@ -374,7 +364,7 @@ def identify_beam(
     found = scipy.optimize.least_squares(
         residuals, np.zeros(len(names)), jacobian, bounds=(-most, most), xtol=TOLERANCE, ftol=TOLERANCE
     )
-    return IdentifiedBeam(_moved(start, found.x), calls)
+    return _moved(start, found.x)
 
 
 def _moved(start: Beam, x: Float[np.ndarray, " k"]) -> Beam:
@@ -473,15 +463,15 @@ def rerun(
     if not names:
         raise RecordingError("--train names no recording; at least one is needed")
     steps = step_count(recordings, numerics.dt)
-    found = identify_beam([by_name[name] for name in names], steps, numerics, tell)
-    beams = {"nominal": NOMINAL, "identified": found.beam}
+    beam = identify_beam([by_name[name] for name in names], steps, numerics, tell)
+    beams = {"nominal": NOMINAL, "identified": beam}
     predictions = {
         each.name: {method: predict_markers(beam, each, steps, numerics) for method, beam in beams.items()}
         for each in recordings
     }
     cells = _cells(recordings, names, predictions)
     out.mkdir(parents=True, exist_ok=True)
-    texts = {"beam.md": as_markdown(cells, found.beam), "beam.json": as_json(cells)}
+    texts = {"beam.md": as_markdown(cells, beam), "beam.json": as_json(cells)}
     figure = drops(recordings, predictions, names)
     return Report(cells, write_texts(out, texts), write_figures(out, {"beam": figure}))
 

@@ -1,4 +1,8 @@
-"""Study of closed-loop control: tracking, adaptation, observers, faults and times, with their limits."""
+"""Study of closed-loop control: tracking, adaptation, observers, faults and times, with their limits.
+
+One controller with default settings serves all cases. It adapts Young's modulus and a mass at the tip, so
+that the cases also show what adaptation costs where nothing is wrong.
+"""
 
 from __future__ import annotations
 
@@ -139,9 +143,9 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     """Run the study, and write control.json, control.md and tracking.json; interrupted runs are continued.
 
     Args:
-        out: the folder.
+        out: the folder; an earlier run in it is continued.
         quick: fewer and shorter runs.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
     """
     facts = run(jobs(quick), out, **how)
     cells = [cell for name, found in facts.items() if name.startswith("tracking-") for cell in found["cells"]]

@@ -80,9 +80,9 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     matplotlib. Interrupted runs are continued.
 
     Args:
-        out: the folder.
+        out: the folder; an earlier run in it is continued.
         quick: shorter trainings and sweeps, and no stand-in.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         TaskError: Gymnasium is missing.

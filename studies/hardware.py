@@ -404,9 +404,9 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     """Run the study, and write hardware.json and hardware.md; interrupted runs are continued.
 
     Args:
-        out: the folder.
+        out: the folder; an earlier run in it is continued.
         quick: shorter runs.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         HardwareError: the tools to build the firmware are missing.

@@ -241,7 +241,7 @@ def rerun(out: Path, *, seeds: Sequence[int], names: Sequence[str] | None = None
         out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         names: some of `IMPERFECTIONS`; all by default.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         StudyError: see `runner.run`.

@@ -1,4 +1,7 @@
-"""Output of every study: a table as text, its cells as JSON, and figures."""
+"""Output of every study: tables as text, cells as JSON, and figures; the paper's result table.
+
+A cell that could not be computed has a reason in place of values, and is shown with it.
+"""
 
 from __future__ import annotations
 
@@ -15,7 +18,6 @@ from knode_cosserat._files.writing import replacing
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
 
 #: the two metrics: key in a cell, and title
 MEASURES = {"tip_dtw": "Tip DTW [m]", "pose_mse": "Pose MSE [1e-3]"}

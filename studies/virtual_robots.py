@@ -43,9 +43,9 @@ def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
     """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
-        out: the folder.
+        out: the folder; an earlier run in it is continued.
         seeds: one for each robot.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
     """
     facts = list(run(jobs(seeds), out, **how).values())
     texts = {"virtual_robots.md": as_markdown(facts), "virtual_robots.json": as_json(facts)}

@@ -131,7 +131,7 @@ def test_the_held_out_recording_is_predicted(recordings):
     train = [each for each in recordings if each.name != HELD_OUT]
     steps = step_count(recordings, COARSE.dt)
     [held_out] = [each for each in recordings if each.name == HELD_OUT]
-    found = identify_beam(train, steps, COARSE).beam
+    found = identify_beam(train, steps, COARSE)
     assert 2.2e5 < found.youngs_modulus < 3.0e5 and 0.0 < found.tilt < 0.15
     rmse = {
         name: marker_rmse(predict_markers(each, held_out, steps, COARSE), held_out)
