@@ -22,6 +22,7 @@ from knode_cosserat_hardware.can_robot import (
 )
 from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat_hardware.motor_robot import MotorReel
+from tests.hardware.waiting import eventually
 
 can = pytest.importorskip("can")
 NODES = (3, 5, 7, 9)
@@ -125,13 +126,6 @@ def bus(request):
 
 def driver(fake, limits=FAST, reel=REEL):
     return CanRobot(fake.channel, NODES, limits, reel, interface="virtual", gear_ratio=GEAR)
-
-
-def eventually(condition, timeout=5.0):
-    end = time.monotonic() + timeout
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
 
 
 # messages

@@ -16,6 +16,7 @@ from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion, StoppedError
 from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
+from tests.hardware.waiting import eventually
 
 pytestmark = pytest.mark.slow
 
@@ -30,13 +31,6 @@ class Stops:
 
     def stop(self):
         self.count += 1
-
-
-def eventually(condition):
-    end = time.monotonic() + 5.0
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
 
 
 # emergency stop

@@ -14,6 +14,7 @@ from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.serial_board import SerialBoard
 from tests.hardware.fake_board import FakeBoard
+from tests.hardware.waiting import eventually
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for
@@ -28,13 +29,6 @@ def board():
 
 def driver(fake, limits=FAST, **options):
     return SerialBoard(fake.port, limits, **{"host_timeout": 1.0, **options})
-
-
-def eventually(condition, timeout=5.0):
-    end = time.monotonic() + timeout
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
 
 
 def verbs(fake):
