@@ -239,6 +239,8 @@ def run(
     for path in (out, recording):
         require_writable(path)
     from knode_cosserat import control as kcc
+    from knode_cosserat_hardware.plant import HardwarePlant
+    from knode_cosserat_hardware.safety import SafeRegion
 
     system = load_system(model)
     machine = opened(port, robot, None if robot else system)
@@ -253,11 +255,13 @@ def run(
     wanted = parsed_reference(reference)
     controller = kcc.controller_named(method, system, dt, limits)
     motion = f"the tip follows {reference} for {seconds:g} s, tensions up to {np.max(limits.high):.3g} N"
+    region = None if radius is None else SafeRegion(radius=radius)
     with motion_capture(machine, capture) as poses, connected(machine, yes, motion) as driver:
-        with _kept_log(out):
-            log, plant = _closed_loop(
-                machine, controller, wanted, seconds, tip_source(machine, poses), radius
-            )
+        with _kept_log(out), emergency_stop(driver) as emergency:
+            source = tip_source(machine, poses)
+            plant = HardwarePlant(driver, source, controller.dt, region=region, emergency=emergency)
+            log = kcc.run_loop(controller, plant, wanted, seconds)
+            driver.disarm()
         latency = driver.latency
     if out is not None:
         log.to_csv(out)
@@ -282,23 +286,6 @@ def _control_limits(driver: Driver, high: str | None, lag: float) -> Any:
     if np.max(most) > limits.high:
         raise ValueError(f"--high is {high}; the robot allows {limits.high:g} N")
     return ControlLimits(limits.low, most, limits.rate, lag=lag)
-
-
-def _closed_loop(
-    machine: OpenedDriver, controller: Any, reference: Any, seconds: float, source: Any, radius: float | None
-) -> tuple[Any, Any]:
-    """Return the log of a loop and its plant."""
-    from knode_cosserat.control import run_loop
-    from knode_cosserat_hardware.plant import HardwarePlant
-    from knode_cosserat_hardware.safety import SafeRegion
-
-    driver = machine.driver
-    region = None if radius is None else SafeRegion(radius=radius)
-    with emergency_stop(driver) as emergency:
-        plant = HardwarePlant(driver, source, controller.dt, region=region, emergency=emergency)
-        log = run_loop(controller, plant, reference, seconds)
-        driver.disarm()
-    return log, plant
 
 
 @contextlib.contextmanager
