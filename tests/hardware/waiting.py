@@ -4,11 +4,11 @@ import time
 
 
 def eventually(condition, timeout=5.0):
-    """Return the condition as soon as it is true, or after a time (s)."""
+    """Return the value of a condition as soon as it is true, or after a time (s)."""
     end = time.monotonic() + timeout
-    while not condition() and time.monotonic() < end:
+    while not (value := condition()) and time.monotonic() < end:
         time.sleep(0.005)
-    return condition()
+    return value
 
 
 def wait_for(condition, timeout=60.0):
