@@ -8,7 +8,6 @@ import time
 import numpy as np
 import pytest
 
-from knode_cosserat_hardware.board_link import SerialTransport
 from knode_cosserat_hardware.driver import FAULTS, DriverState, HardwareError, Limits, fault_message
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
@@ -105,12 +104,6 @@ def test_a_port_that_is_not_there_or_in_use(board):
         SerialBoard("/dev/ttyNothing").connect()
     with driver(board), pytest.raises(HardwareError, match="another program uses this port"):
         driver(board).connect()
-
-
-def test_without_pyserial_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "serial", None)
-    with pytest.raises(HardwareError, match=r"pip install knode-cosserat-hardware"):
-        SerialTransport("/dev/ttyACM0")
 
 
 # the paper's board

@@ -44,7 +44,8 @@ class MessageEncoder:
         config: topics, order and units of the messages.
 
     Raises:
-        RecordingError: the configuration has motors in place of tensions.
+        RecordingError: the configuration has motors in place of tensions; from all methods: a wrong number of
+            tensions or bodies.
         ImportError: rosbags is not installed.
     """
 
@@ -68,11 +69,6 @@ class MessageEncoder:
         #: topics of all messages
         self.topics = [BagTopic(stream.topic, message_type(stream, 1)) for stream in streams]
 
-    @property
-    def command_topic(self) -> str | None:
-        """Topic of commands; None without commands."""
-        return self.config.command.topic if self.config.command else None
-
     def poses(
         self, stamp: int, position: Float[np.ndarray, "bodies 3"], quaternion: Float[np.ndarray, "bodies 4"]
     ) -> list[Encoded]:
@@ -82,9 +78,6 @@ class MessageEncoder:
             stamp: time of the measurement (ns since 1970).
             position: positions (m), in the order of `bodies`.
             quaternion: orientations, scalar first.
-
-        Raises:
-            RecordingError: the number of bodies is wrong.
         """
         scale = POSITION_UNITS[self.config.position_unit]
         values = np.concatenate([np.asarray(position) / scale, np.asarray(quaternion)], axis=1)
@@ -99,19 +92,13 @@ class MessageEncoder:
         """Return the message of measured tensions (N).
 
         There is none if one is not finite, as without a measurement, or without a topic for tensions.
-
-        Raises:
-            RecordingError: the number of tensions is wrong.
         """
         return self._tensions("tension", stamp, tension) if np.all(np.isfinite(tension)) else []
 
     def command(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
         """Return the message of commanded tensions (N); none if the configuration has no topic for it.
 
-        Text commands in grams-force are rounded to whole numbers.
-
-        Raises:
-            RecordingError: the number of tensions is wrong, or one is not finite.
+        Text commands in grams-force are rounded to whole numbers; one that is not finite is an error.
         """
         return self._tensions("command", stamp, tension)
 
@@ -251,7 +238,8 @@ class Recorder:
     A thread writes to the disk, so that no call waits for it. While it records, the file is `run.bag.active`,
     which `load_recording` reads too; at the end it is renamed. A killed process loses what was added in the
     last `interval`, and what is being written. On a full disk the file keeps everything up to the last
-    complete chunk, and the next call raises an error.
+    complete chunk, and the next call raises a `HardwareError`. Values of a wrong number raise a
+    `RecordingError`.
 
     Args:
         path: the bag; its name ends in .bag. An existing file is never replaced.
@@ -314,30 +302,15 @@ class Recorder:
             raise HardwareError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def add_reading(self, reading: Reading) -> None:
-        """Add the measured tensions of a reading; one without a measurement (NaN) has no message.
-
-        Raises:
-            HardwareError: an earlier message could not be written.
-            RecordingError: the number of tensions is wrong.
-        """
+        """Add the measured tensions of a reading; one without a measurement (NaN) has no message."""
         self._add(self.encoder.tension(self.clock.stamp(reading.time), reading.tension))
 
     def add_poses(self, frame: PoseFrame) -> None:
-        """Add the poses of all bodies in the order of `encoder.bodies`; a lost body (NaN) has no message.
-
-        Raises:
-            HardwareError: an earlier message could not be written.
-            RecordingError: the number of bodies is wrong.
-        """
+        """Add the poses of all bodies in the order of `encoder.bodies`; a lost body (NaN) has no message."""
         self._add(self.encoder.poses(self.clock.stamp(frame.time), frame.position, frame.quaternion))
 
     def add_command(self, tension: Float[np.ndarray, " c"], time: float | None = None) -> None:
-        """Add commanded tensions (N), at a time (s, monotonic); now if None.
-
-        Raises:
-            HardwareError: an earlier message could not be written.
-            RecordingError: the number of tensions is wrong, or one is not finite.
-        """
+        """Add commanded tensions (N), all finite, at a time (s, monotonic); now if None."""
         self._add(self.encoder.command(self.clock.stamp(self.clock.now() if time is None else time), tension))
 
     def close(self) -> None:
