@@ -19,7 +19,7 @@ import time
 import tty
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -189,15 +189,6 @@ class Chip:
             self.close()
 
 
-class Fuzzed(NamedTuple):
-    """Result of a fuzzing run."""
-
-    #: frames after which a motor did what its state does not allow
-    unsafe: int
-    #: ticks in which the board was armed
-    armed: int
-
-
 class HostBoard:
     """The board's logic, compiled for this computer with checks for undefined behaviour.
 
@@ -219,11 +210,15 @@ class HostBoard:
         """Run a line of a script, and return what it prints; lines that the board sends begin with `>`."""
         return str(self._library.host_run(self._board, line.encode("latin-1")).decode("latin-1"))
 
-    def fuzz(self, seed: int, frames: int) -> Fuzzed:
-        """Send frames that are random or almost right to a new board, and check its motors after each."""
+    def fuzz(self, seed: int, frames: int) -> tuple[int, int]:
+        """Send frames that are random or almost right to a new board, and check its motors after each.
+
+        Returns:
+            Number of frames after which a motor did what its state does not allow, and of ticks armed.
+        """
         armed = ctypes.c_uint64(0)
         unsafe = self._library.host_fuzz(seed, frames, ctypes.byref(armed))
-        return Fuzzed(int(unsafe), int(armed.value))
+        return int(unsafe), int(armed.value)
 
     def __del__(self) -> None:
         if getattr(self, "_board", None):
