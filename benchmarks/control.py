@@ -43,7 +43,7 @@ def costs() -> dict[str, Any]:
     from knode_cosserat.estimation.online import Spread, errors_of
     from knode_cosserat.solvers.rollout import rollout
     from knode_cosserat.solvers.run import TimeIntegration
-    from studies.control_cases import DT, nominal_robot, predictive
+    from studies.control import DT, nominal_robot, predictive
 
     controller = predictive(nominal_robot())
     observer = controller.observer
@@ -85,7 +85,7 @@ def costs() -> dict[str, Any]:
 
 def table(found: Mapping[str, Any]) -> str:
     """Return the tables in Markdown."""
-    from studies.tables import markdown_table
+    from studies.report import markdown_table
 
     cost = found["costs"]
     rows = [
@@ -100,7 +100,7 @@ def table(found: Mapping[str, Any]) -> str:
 
 def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
     """Return the tracking errors of all controllers; the worst of robots of one kind."""
-    from studies.tables import markdown_table
+    from studies.report import markdown_table
 
     def kind(robot: str) -> str:
         if robot.startswith("stiffness"):
@@ -123,7 +123,7 @@ def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
 
 def checks_table(checks: Sequence[Mapping[str, Any]]) -> str:
     """Return the checks with their limits."""
-    from studies.tables import markdown_table
+    from studies.report import markdown_table
 
     rows = [
         [each["check"], f"{each['value']:.2g}", f"{each['limit']:g}", "met" if each["ok"] else "**missed**"]

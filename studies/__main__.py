@@ -367,8 +367,7 @@ def recordings(
     Files robot.yaml and recording.yaml in BAGDIR are the defaults of --robot and --config. Writes table2.md,
     .json, figures and models. Resumes an earlier run in the same folder.
     """
-    from studies.recordings import METHODS, ROBOT, RecordingsOptions, described_in
-    from studies.recordings_report import rerun
+    from studies.recordings import METHODS, ROBOT, RecordingsOptions, described_in, rerun
 
     chosen = _selected("methods", methods, METHODS)
     names = None if train is None else [name.strip() for each in train for name in each.split(",")]

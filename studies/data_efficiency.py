@@ -16,17 +16,24 @@ from knode_cosserat import controls
 from knode_cosserat.evaluation.comparison import legend_below
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, style
-from knode_cosserat.learning.config import FitConfig, FitError
-from knode_cosserat.learning.states import fit_states
+from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 from studies import runner, simulation
 from studies.comparisons import NoKnowledge, compared, linear_predictor
-from studies.methods import METHODS, LearnedSystems
-from studies.report import Report, as_json, write_figures, write_texts
+from studies.methods import METHODS, LearnedSystems, Method, fitted
+from studies.report import (
+    MEASURES,
+    Report,
+    as_json,
+    in_words,
+    markdown_table,
+    spreads,
+    write_figures,
+    write_texts,
+)
 from studies.runner import Job, Product
-from studies.tables import MEASURES, in_words, markdown_table, spreads
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,30 +42,18 @@ if TYPE_CHECKING:
 ROWS = (5, 10, 20, 30)
 #: the first sine alone, and both
 SINES = (1, 2)
-SEEDS = 3
 
 
 def paper_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> LearnedSystems:
     """Return the paper's network, trained on a system without physics."""
-    return _without_knowledge(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
+    return fitted(NoKnowledge(imperfect), training, FitConfig.paper(seed=tuple(seeds)))
 
 
 def network_alone(imperfect: System, training: Sequence[Trajectory], seeds: Sequence[int]) -> LearnedSystems:
     """Return a standardised, unconstrained network of the paper's size, on a system without physics."""
-    return _without_knowledge(imperfect, training, FitConfig.network(seed=tuple(seeds), hidden=512))
+    return fitted(NoKnowledge(imperfect), training, FitConfig.network(seed=tuple(seeds), hidden=512))
 
 
-def _without_knowledge(
-    imperfect: System, training: Sequence[Trajectory], config: FitConfig
-) -> LearnedSystems:
-    try:
-        models = fit_states(NoKnowledge(imperfect), training, config)
-    except FitError as error:
-        return LearnedSystems(dict.fromkeys(config.seeds, str(error)))
-    return LearnedSystems(dict(zip(config.seeds, models, strict=True)))
-
-
-Method = Callable[[System, Sequence[Trajectory], Sequence[int]], LearnedSystems]
 INFORMED: dict[str, Method] = {name: METHODS[name] for name in ("baseline", "paper", "best")}
 ALONE: dict[str, Method] = {"paper, no knowledge": paper_alone, "network, no knowledge": network_alone}
 LINEAR = "linear (DMDc)"
@@ -162,7 +157,7 @@ def rerun(
         seeds: whole numbers.
         rows: of each sine.
         methods: some of `data_efficiency.ALL`; all by default.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         StudyError: see `runner.run`.

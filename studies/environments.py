@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from benchmarks.sweeps import measure_sweep
 from knode_cosserat import controls
 from knode_cosserat.control import Sensor, run_loop
 from knode_cosserat.control.loop import _COMPILATIONS
@@ -39,11 +40,17 @@ from knode_cosserat.solvers.simulate import simulate
 from studies import stand_in
 from studies.elastica.plant import ElasticaPlant
 from studies.elastica.rod import ElasticaRod
-from studies.environments_sweep import measure_sweep
 from studies.ppo import Policy, PolicyTraining
-from studies.report import Report, as_json, check_row, checks_table, write_figures, write_texts
+from studies.report import (
+    Report,
+    as_json,
+    check_row,
+    checks_table,
+    markdown_table,
+    write_figures,
+    write_texts,
+)
 from studies.runner import Job, Product, run
-from studies.tables import markdown_table
 
 #: episodes at once, and periods, of the rate; a rate is the median of so many rounds
 EPISODES, PERIODS, ROUNDS = 1024, 40, 5
@@ -71,9 +78,9 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     matplotlib. Interrupted runs are continued.
 
     Args:
-        out: the folder.
+        out: the folder; an earlier run in it is continued.
         quick: shorter trainings and sweeps, and no stand-in.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         TaskError: Gymnasium is missing.

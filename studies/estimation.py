@@ -20,8 +20,7 @@ from knode_cosserat.recordings.virtual import Sensors, record_virtual, virtual_r
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
-from studies.report import Report, as_json, write_figures, write_texts
-from studies.tables import markdown_table
+from studies.report import Report, as_json, markdown_table, write_figures, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -27,9 +27,8 @@ from knode_cosserat.trajectory import Trajectory
 from studies import runner, truths
 from studies.comparisons import compared
 from studies.methods import METHODS
-from studies.report import Report, as_json, write_figures, write_texts
+from studies.report import MEASURES, Report, as_json, markdown_table, write_figures, write_texts
 from studies.runner import Job, Product, StudyError
-from studies.tables import MEASURES, markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -242,7 +241,7 @@ def rerun(out: Path, *, seeds: Sequence[int], names: Sequence[str] | None = None
         out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         names: some of `IMPERFECTIONS`; all by default.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         StudyError: see `runner.run`.

@@ -46,15 +46,16 @@ def calibrated(imperfect: System, training: Trajectories, seeds: Sequence[int]) 
 
 def paper(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the paper's network after the paper's training."""
-    return _fitted(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
+    return fitted(imperfect, training, FitConfig.paper(seed=tuple(seeds)))
 
 
 def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
     """Return the best preset's model; seeds resample the data's rows, because the fit is deterministic."""
-    return _fitted(imperfect, training, FitConfig(StructuredOptions(resample=True), seed=tuple(seeds)))
+    return fitted(imperfect, training, FitConfig(StructuredOptions(resample=True), seed=tuple(seeds)))
 
 
-def _fitted(imperfect: System, training: Trajectories, config: FitConfig) -> LearnedSystems:
+def fitted(imperfect: System, training: Trajectories, config: FitConfig) -> LearnedSystems:
+    """Return the models of a configuration, one for each of its seeds."""
     try:
         models = fit_states(imperfect, training, config)
     except FitError as error:

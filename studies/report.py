@@ -1,18 +1,171 @@
-"""Output of every study: a table as text, its cells as JSON, and figures."""
+"""Output of every study: tables as text, cells as JSON, and figures; the paper's result table.
+
+A cell that could not be computed has a reason in place of values, and is shown with it.
+"""
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 import math
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, NotRequired, TypedDict
 
 from knode_cosserat._files.writing import replacing
-from studies.tables import markdown_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+#: the two metrics: key in a cell, and title
+MEASURES = {"tip_dtw": "Tip DTW [m]", "pose_mse": "Pose MSE [1e-3]"}
+
+
+class Cell(TypedDict):
+    """Metrics of one method with one seed in one case; if they are None, `failed` has the reason."""
+
+    imperfection: str
+    control: str
+    method: str
+    seed: int
+    tip_dtw: float | None
+    pose_mse: float | None
+    failed: NotRequired[str]
+
+
+class Published(NamedTuple):
+    """Published tip DTW and pose MSE of a case, and those of one rerun of the paper's method."""
+
+    baseline: tuple[float, float]
+    learned: tuple[float, float]
+    rerun: tuple[float, float]
+
+
+class Spread(NamedTuple):
+    """One metric over the seeds of a method."""
+
+    values: tuple[float, ...]
+    #: reasons of the failed seeds
+    failures: tuple[str, ...]
+
+    @property
+    def mean(self) -> float | None:
+        """Mean over seeds; None without values."""
+        return statistics.fmean(self.values) if self.values else None
+
+    @property
+    def deviation(self) -> float | None:
+        """Standard deviation between seeds; None for fewer than two."""
+        return statistics.stdev(self.values) if len(self.values) > 1 else None
+
+
+Case = tuple[str, str]
+
+
+def spreads(cells: Sequence[Cell], measure: str) -> dict[Case, dict[str, Spread]]:
+    """Return the values of a metric by case and method, in the order of the cells."""
+    found: dict[Case, dict[str, Spread]] = {}
+    for cell in cells:
+        methods = found.setdefault((cell["imperfection"], cell["control"]), {})
+        values, failures = methods.get(cell["method"], Spread((), ()))
+        value = cell[measure]  # type: ignore[literal-required]
+        if value is None:
+            failures = (*failures, cell.get("failed", "no reason given"))
+        else:
+            values = (*values, value)
+        methods[cell["method"]] = Spread(values, failures)
+    return found
+
+
+_COLUMNS = (
+    "imperfection", "control", "measure", "method", "mean", "deviation", "least", "most", "seeds", "failed",
+    "paper_baseline", "paper_knode", "rerun_knode", "ratio_to_paper_knode",
+)  # fmt: skip
+
+
+def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
+    """Return CSV with a line per case, method and metric: mean, deviation, published values and ratio."""
+    file = io.StringIO()
+    writer = csv.writer(file, lineterminator="\n")
+    writer.writerow(_COLUMNS)
+    for k, measure in enumerate(MEASURES):
+        for case, methods in spreads(cells, measure).items():
+            paper = [figures[k] for figures in published[case]] if case in published else [None] * 3
+            for method, spread in methods.items():
+                values, mean = spread.values, spread.mean
+                ends = [min(values), max(values)] if values else [None, None]
+                counts = [len(values) + len(spread.failures), len(spread.failures)]
+                ratio = mean / paper[1] if mean is not None and paper[1] else None
+                writer.writerow(
+                    [*case, measure, method, mean, spread.deviation, *ends, *counts, *paper, ratio]
+                )
+    return file.getvalue()
+
+
+def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], notes: Sequence[str] = ()) -> str:
+    """Return Markdown with one table per metric, with published values beside ours, and the failures."""
+    parts = ["Mean and standard deviation over seeds. Ratios are to the paper's KNODE; less is better."]
+    for k, (measure, title) in enumerate(MEASURES.items()):
+        found = spreads(cells, measure)
+        methods = list(dict.fromkeys(method for by_method in found.values() for method in by_method))
+        heads = ["imperfection", "control", "paper: baseline", "paper: KNODE", "its rerun"]
+        for method in methods:
+            heads += [method] if method == "baseline" else [method, "ratio"]
+        rows = []
+        for case, by_method in found.items():
+            paper = published.get(case)
+            row = [*case, *(f"{figures[k]:.2f}" if paper else "" for figures in paper or [(0.0, 0.0)] * 3)]
+            for method in methods:
+                spread = by_method.get(method, Spread((), ()))
+                row.append(in_words(spread))
+                if method != "baseline":
+                    row.append(ratio_in_words(spread.mean, paper.learned[k] if paper else 0.0))
+            rows.append(row)
+        parts += [f"## {title}", markdown_table(heads, rows)]
+    failures = [
+        f"- {case[0]}, {case[1]}, {method}: {reason}"
+        for case, by_method in spreads(cells, "tip_dtw").items()
+        for method, spread in by_method.items()
+        for reason in spread.failures
+    ]
+    if failures:
+        parts += ["What failed:", "\n".join(failures)]
+    return "\n\n".join([*parts, *notes]) + "\n"
+
+
+def in_words(spread: Spread) -> str:
+    """Return mean, deviation and failures as text: `0.0123 ± 0.0004`, `1.2 (2 of 5 failed)`."""
+    total = len(spread.values) + len(spread.failures)
+    if total == 0:
+        return ""
+    if spread.mean is None:
+        return "failed" if total == 1 else f"failed ({total} of {total})"
+    text = f"{spread.mean:.3g}"
+    if spread.deviation is not None:
+        text += f" ± {spread.deviation:.1g}"
+    return f"{text} ({len(spread.failures)} of {total} failed)" if spread.failures else text
+
+
+def ratio_in_words(value: float | None, published: float) -> str:
+    """Return the ratio of a value to the published one as text; `-` for a published zero."""
+    if value is None or published == 0.0:
+        return "" if value is None else "-"
+    ratio = value / published
+    if not 0.0 < ratio < 0.1:
+        return f"{ratio:.2f}"
+    return f"1/{1.0 / ratio:,.0f}" if ratio > 1e-5 else f"1/{1.0 / ratio:.1e}"
+
+
+def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Return a Markdown table with columns as wide as their widest cells."""
+    widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |"
+        for row in (heads, ["-" * width for width in widths], *rows)
+    ]
+    return "\n".join(lines)
 
 
 class Report(NamedTuple):

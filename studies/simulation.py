@@ -23,9 +23,8 @@ from knode_cosserat.trajectory import Trajectory
 from studies import figures, runner
 from studies.comparisons import compared
 from studies.methods import METHODS
-from studies.report import Report, as_json, write_figures, write_texts
+from studies.report import Cell, Published, Report, as_csv, as_json, as_markdown, write_figures, write_texts
 from studies.runner import Job, Product
-from studies.tables import Cell, Published, as_csv, as_markdown
 
 ROBOT = "delrin-tendon-robot"
 #: time step (s)
@@ -42,7 +41,6 @@ IMPERFECTIONS: dict[str, dict[str, Any]] = {
     "stiffness": {"youngs_modulus": 10e9},
     "length-stiffness": {"length": 0.4, "youngs_modulus": 10e9},
 }
-SEEDS = 5
 
 #: Table I of the paper, and a rerun of the same method with one seed (tip DTW, then pose MSE).
 #: The baseline of self-weight under the step was published from a solve that had not converged; see NOTES.
@@ -157,7 +155,7 @@ def rerun(out: Path, *, seeds: Sequence[int], methods: Sequence[str], **how: Any
         out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         methods: some of those in `methods.METHODS`.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
 
     Raises:
         StudyError: see `runner.run`.

@@ -23,9 +23,8 @@ from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.virtual import record_virtual
 from knode_cosserat.solvers.result import SimulationError
-from studies.report import Report, as_json, write_texts
+from studies.report import Report, as_json, markdown_table, write_texts
 from studies.runner import Job, Product, run
-from studies.tables import markdown_table
 
 #: signals of the held-out recordings
 UNSEEN = {"sine_2p0": "sine:2.0", "rand_1": "random:1"}
@@ -44,9 +43,9 @@ def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
     """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
-        out: the folder.
+        out: the folder; an earlier run in it is continued.
         seeds: one for each robot.
-        how: `workers`, `dask`, `progress` as `runner.run` has them.
+        how: as `runner.run` has it.
     """
     facts = list(run(jobs(seeds), out, **how).values())
     texts = {"virtual_robots.md": as_markdown(facts), "virtual_robots.json": as_json(facts)}

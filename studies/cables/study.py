@@ -27,8 +27,7 @@ from studies.cables.model import DT, CableModel, CableParameters, Grips
 from studies.cables.places import grip_tangents, marker_places
 from studies.cables.recordings import CableData, CableMotion, load_cables
 from studies.cables.rollouts import Rollouts
-from studies.report import Report, as_json, write_figures, write_texts
-from studies.tables import markdown_table
+from studies.report import Report, as_json, markdown_table, write_figures, write_texts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -7,6 +7,7 @@ tendons, drag and material damping, as one compiled function.
 
 from __future__ import annotations
 
+import collections
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,41 +19,22 @@ from elastica.rod.cosserat_rod import (
 from elastica.rod.data_structures import overload_operator_kinematic_numba
 from numba import njit
 
-
-class Rod(NamedTuple):
-    """Arrays of PyElastica's `CosseratRod`: n + 1 nodes, n elements, n - 1 joints; they change in place."""
-
-    position: Any
-    velocity: Any
-    directors: Any
-    omega: Any
-    acceleration: Any
-    alpha: Any
-    mass: Any
-    volume: Any
-    lengths: Any
-    tangents: Any
-    radius: Any
-    rest_lengths: Any
-    joint_lengths: Any
-    dilatation: Any
-    joint_dilatation: Any
-    dilatation_rate: Any
-    sigma: Any
-    kappa: Any
-    rest_sigma: Any
-    rest_kappa: Any
-    shear_matrix: Any
-    bend_matrix: Any
-    inertia: Any
-    inverse_inertia: Any
-    stress: Any
-    couple: Any
-    internal_forces: Any
-    internal_torques: Any
-    forces: Any
-    torques: Any
-    ghosts: Any
+#: arrays of PyElastica's `CosseratRod`, n + 1 nodes, n elements, n - 1 joints, by their names here
+ARRAYS = {
+    "position": "position_collection", "velocity": "velocity_collection", "directors": "director_collection",
+    "omega": "omega_collection", "acceleration": "acceleration_collection", "alpha": "alpha_collection",
+    "joint_lengths": "rest_voronoi_lengths", "joint_dilatation": "voronoi_dilatation",
+    "inertia": "mass_second_moment_of_inertia", "inverse_inertia": "inv_mass_second_moment_of_inertia",
+    "stress": "internal_stress", "couple": "internal_couple", "forces": "external_forces",
+    "torques": "external_torques",
+}  # fmt: skip
+ARRAYS |= {name: name for name in (
+    "mass", "volume", "lengths", "tangents", "radius", "rest_lengths", "dilatation", "dilatation_rate",
+    "sigma", "kappa", "rest_sigma", "rest_kappa", "shear_matrix", "bend_matrix", "internal_forces",
+    "internal_torques",
+)}  # fmt: skip
+#: these arrays, which change in place, and the places of periodic nodes, of which there are none
+Rod: Any = collections.namedtuple("Rod", [*ARRAYS, "ghosts"])  # type: ignore[misc]
 
 
 class Tendons(NamedTuple):
@@ -92,7 +74,7 @@ class Constants(NamedTuple):
 
 
 @njit(cache=True)
-def advance(rod: Rod, tendons: Tendons, numbers: Constants, command: Any, steps: int) -> None:
+def advance(rod: Any, tendons: Tendons, numbers: Constants, command: Any, steps: int) -> None:
     """Move the rod by some time steps under commanded tensions (N)."""
     half = 0.5 * numbers.dt
     for _ in range(steps):
@@ -110,7 +92,7 @@ def advance(rod: Rod, tendons: Tendons, numbers: Constants, command: Any, steps:
 
 
 @njit(cache=True)
-def _internal(rod: Rod) -> None:
+def _internal(rod: Any) -> None:
     """Evaluate the internal forces and torques of PyElastica's rod."""
     _compute_internal_forces(
         rod.position, rod.volume, rod.lengths, rod.tangents, rod.radius, rod.rest_lengths, rod.joint_lengths,
@@ -126,7 +108,7 @@ def _internal(rod: Rod) -> None:
 
 
 @njit(cache=True)
-def _weight_and_drag(rod: Rod, numbers: Constants) -> None:
+def _weight_and_drag(rod: Any, numbers: Constants) -> None:
     """Add weight and drag to the forces on the nodes."""
     count = rod.mass.shape[0]
     for k in range(count):
@@ -140,7 +122,7 @@ def _weight_and_drag(rod: Rod, numbers: Constants) -> None:
 
 
 @njit(cache=True)
-def _clamp(rod: Rod, numbers: Constants) -> None:
+def _clamp(rod: Any, numbers: Constants) -> None:
     """Add the torque of the half element between the clamped end and the middle of the first element.
 
     PyElastica's clamp holds the whole first element, which makes the rod half an element shorter.
@@ -162,7 +144,7 @@ def _clamp(rod: Rod, numbers: Constants) -> None:
 
 
 @njit(cache=True)
-def _pull(rod: Rod, tendons: Tendons, numbers: Constants) -> None:
+def _pull(rod: Any, tendons: Tendons, numbers: Constants) -> None:
     """Add the forces of tendons on the edges of their holes and on their anchors.
 
     A tendon is straight between holes. A hole takes the part exp(-f μ (θ + θ₀)) of its tension, with the
@@ -209,7 +191,7 @@ def _pull(rod: Rod, tendons: Tendons, numbers: Constants) -> None:
 
 
 @njit(cache=True, inline="always")
-def _arm(rod: Rod, k: int, i: int, x: float, y: float) -> float:
+def _arm(rod: Any, k: int, i: int, x: float, y: float) -> float:
     """Return a component, in the global frame, of the place (x, y) in the cross-section of element k."""
     return x * rod.directors[0, i, k] + y * rod.directors[1, i, k]
 
@@ -228,7 +210,7 @@ def _slide(tendons: Tendons, c: int, spans: Any, sliding: float) -> None:
 
 
 @njit(cache=True)
-def _turn(rod: Rod, k: int, force: Any, x: float, y: float) -> None:
+def _turn(rod: Any, k: int, force: Any, x: float, y: float) -> None:
     """Add the torque of a force (global frame) at the place (x, y) of element k."""
     a, b, along = 0.0, 0.0, 0.0
     for i in range(3):
@@ -241,7 +223,7 @@ def _turn(rod: Rod, k: int, force: Any, x: float, y: float) -> None:
 
 
 @njit(cache=True)
-def _accelerate(rod: Rod, numbers: Constants) -> None:
+def _accelerate(rod: Any, numbers: Constants) -> None:
     """Move the velocities by a time step; the material's damping is implicit."""
     _update_accelerations(
         rod.acceleration, rod.internal_forces, rod.forces, rod.mass, rod.alpha, rod.inverse_inertia,
@@ -256,7 +238,7 @@ def _accelerate(rod: Rod, numbers: Constants) -> None:
 
 
 @njit(cache=True)
-def _damp(rod: Rod, numbers: Constants) -> None:
+def _damp(rod: Any, numbers: Constants) -> None:
     """Apply Kelvin-Voigt damping of bending and twisting for a step: backward Euler, Thomas' algorithm.
 
     The relative rates of neighbouring elements are compared in the global frame, where the equations of the

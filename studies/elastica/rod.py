@@ -111,16 +111,8 @@ class ElasticaRod:
             part = at * n - node
             found.mass[node] += (1.0 - part) * mass
             found.mass[node + 1] += part * mass
-        return self._kernel.Rod(
-            found.position_collection, found.velocity_collection, found.director_collection,
-            found.omega_collection, found.acceleration_collection, found.alpha_collection, found.mass,
-            found.volume, found.lengths, found.tangents, found.radius, found.rest_lengths,
-            found.rest_voronoi_lengths, found.dilatation, found.voronoi_dilatation, found.dilatation_rate,
-            found.sigma, found.kappa, found.rest_sigma, found.rest_kappa, found.shear_matrix,
-            found.bend_matrix, found.mass_second_moment_of_inertia, found.inv_mass_second_moment_of_inertia,
-            found.internal_stress, found.internal_couple, found.internal_forces, found.internal_torques,
-            found.external_forces, found.external_torques, np.zeros(0, dtype=np.int32),
-        )  # fmt: skip
+        arrays = [getattr(found, name) for name in self._kernel.ARRAYS.values()]
+        return self._kernel.Rod._make([*arrays, np.zeros(0, dtype=np.int32)])
 
     def _constants(self, dt: float, linear_drag: float, *, sticking: bool = False) -> Any:
         robot, of = self.robot, self.imperfections

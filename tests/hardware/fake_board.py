@@ -14,11 +14,36 @@ from knode_cosserat_hardware.lines import (
     FaultNotice,
     LineSplitter,
     Refusal,
+    Remark,
     Telemetry,
     crc16,
-    encode_message,
     is_newer,
+    sealed,
 )
+
+
+def encode_message(message, framed):
+    """Return the line of a board's message, as a board sends it."""
+    match message:
+        case Telemetry():
+            text = ",".join(map(str, (*message.tension, *message.drive, message.loop_time)))
+            if framed:
+                fault = message.fault or "-"
+                text = f"{message.number or 0} : {message.acknowledged or 0} {message.state} {fault} {text}"
+        case Answer():
+            text = " ".join([str(message.number), "=", message.verb, *message.values])
+        case Refusal():
+            text = f"{message.number} ! {message.reason}" if framed else f"! {message.reason}"
+        case FaultNotice():
+            text = f"0 ! fault {message.fault}" if framed else f"! fault {message.fault}"
+        case Banner():
+            # a banner has no checksum in either mode
+            framed = False
+            text = f"# knode-tension {message.version} protocol {message.protocol} tendons {message.tendons}"
+        case Remark():
+            framed = False
+            text = f"# {message.text}"
+    return (sealed(text) if framed else text).encode("ascii") + b"\n"
 
 
 class FakeBoard:

@@ -1,15 +1,14 @@
-"""Program that moves the emulated robot, and records it twice at once.
+"""Program that moves the emulated robot, and records it, with ROS 1 twice at once.
 
-    python record_emulated.py MOTION OWN.bag OTHER.bag|ros
+    python record_emulated.py MOTION OWN.bag [ros]
 
 The driver's `Recorder` writes one bag. The other is written by `rosbag record`, which listens to the node of
-ROS 1, or by rosbags from the same messages.
+ROS 1.
 """
 
 import contextlib
 import sys
 import time
-from pathlib import Path
 
 import numpy as np
 
@@ -19,7 +18,6 @@ from knode_cosserat_hardware import Limits, Recorder, SerialBoard
 from knode_cosserat_hardware.driver import HostClock
 from knode_cosserat_hardware.emulation import EmulatedPort, EmulatedRobot
 from knode_cosserat_hardware.middleware.mocap import SimulatedCapture
-from knode_cosserat_hardware.recorder import MessageEncoder
 
 #: time between commands (s); time at rest before a motion, and duration of the motion (s)
 DT, REST, SECONDS = 0.05, 1.5, 3.5
@@ -37,47 +35,8 @@ def tensions(motion):
     return np.concatenate([np.full((round(REST / DT), 4), 3.5), moving])
 
 
-class RosbagsWriter:
-    """Bag that rosbags writes, with the methods of the node of ROS 1."""
-
-    def __init__(self, path, clock):
-        from rosbags.rosbag1 import Writer
-
-        from knode_cosserat.recordings.messages import typestore
-
-        self.clock, self.encoder = clock, MessageEncoder(CONFIG)
-        self._writer = Writer(path)
-        self._writer.open()
-        self._connections = {
-            topic.name: self._writer.add_connection(topic.name, topic.type, typestore=typestore(1))
-            for topic in self.encoder.topics
-        }
-
-    def __enter__(self):
-        self._send(self.encoder.simulation(self.clock.stamp(self.clock.now())))
-        return self
-
-    def __exit__(self, *_):
-        self._writer.close()
-
-    def publish(self, reading):
-        self._send(self.encoder.tension(self.clock.stamp(reading.time), reading.tension))
-
-    def publish_poses(self, frame):
-        self._send(self.encoder.poses(self.clock.stamp(frame.time), frame.position, frame.quaternion))
-
-    def publish_command(self, tension, now):
-        self._send(self.encoder.command(self.clock.stamp(now), tension))
-
-    def _send(self, messages):
-        for each in messages:
-            self._writer.write(self._connections[each.topic], self.clock.stamp(self.clock.now()), each.data)
-
-
-def other_recorder(target, board, clock):
-    """The node that `rosbag record` listens to, or a writer of another bag."""
-    if target != "ros":
-        return RosbagsWriter(Path(target), clock)
+def listened_node(board, clock):
+    """The node that `rosbag record` listens to."""
     from knode_cosserat_hardware.middleware.ros1 import ROS1Node
 
     node = ROS1Node(board, config=CONFIG, clock=clock)
@@ -86,7 +45,7 @@ def other_recorder(target, board, clock):
     return node
 
 
-def main(motion, own_path, target):
+def main(motion, own_path, ros=""):
     emulated = EmulatedRobot()
     port = EmulatedPort(emulated)
     with SerialBoard(port, Limits(high=12.0, total=40.0)) as board, contextlib.ExitStack() as stack:
@@ -94,23 +53,26 @@ def main(motion, own_path, target):
         board.tare()
         clock = HostClock(port.now)
         capture = SimulatedCapture(emulated, CONFIG, port.now)
-        other = stack.enter_context(other_recorder(target, board, clock))
+        nodes = [stack.enter_context(listened_node(board, clock))] if ros else []
         own = stack.enter_context(Recorder(own_path, CONFIG, clock=clock))
         board.arm()
         begin = port.now()
         for k, row in enumerate(tensions(motion)):
             sent, now = board.command(row), port.now()
-            other.publish_command(sent, now)
+            for node in nodes:
+                node.publish_command(sent, now)
             own.add_command(sent, now)
             while port.now() < begin + (k + 1) * DT - 1e-9:
                 reading = board.read()
-                other.publish(reading)
+                for node in nodes:
+                    node.publish(reading)
                 own.add_reading(reading)
                 for frame in capture.frames():
-                    other.publish_poses(frame)
+                    for node in nodes:
+                        node.publish_poses(frame)
                     own.add_poses(frame)
         board.disarm()
-        if target == "ros":
+        if nodes:
             time.sleep(0.5)
 
 

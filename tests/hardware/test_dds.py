@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.dds_latency import measure_loopback
 from knode_cosserat_hardware.driver import (
     Driver,
     DriverState,
@@ -28,7 +29,6 @@ pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds: pip install 'kno
 
 from knode_cosserat_hardware.middleware import dds, idl
 from knode_cosserat_hardware.middleware.dds import DDSBridge
-from knode_cosserat_hardware.middleware.loopback import measure_loopback
 
 pytestmark = pytest.mark.slow
 

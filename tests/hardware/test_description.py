@@ -8,21 +8,27 @@ import yaml
 import knode_cosserat as kc
 from knode_cosserat.rods.robot_file import RobotFileError, format_robot, parse_robot
 from knode_cosserat_hardware import Dimensions, HardwareError, Limits, load_hardware
-from knode_cosserat_hardware.description import HardwareDescription, parse_hardware
+from knode_cosserat_hardware.description import HardwareDescription
 from knode_cosserat_hardware.driver import require_limits
 
 TEXT = format_robot(kc.load_robot("delrin-tendon-robot"))
 
 
-def described(section):
-    return parse_hardware(TEXT + yaml.safe_dump({"hardware": section}), "robot.yaml")
+@pytest.fixture
+def described(tmp_path, monkeypatch):
+    """Function that returns the hardware of a robot file with a section."""
+    monkeypatch.chdir(tmp_path)
+
+    def load(section):
+        (tmp_path / "robot.yaml").write_text(TEXT + yaml.safe_dump({"hardware": section}))
+        return load_hardware("robot.yaml")
+
+    return load
 
 
-def test_values_are_read_and_others_have_defaults(tmp_path):
-    path = tmp_path / "robot.yaml"
+def test_values_are_read_and_others_have_defaults(described):
     section = {"tension": {"high": 9.0, "rate": 20.0}, "spool_radius": 0.012, "rib_count": 7}
-    path.write_text(TEXT + yaml.safe_dump({"hardware": section}))
-    found = load_hardware(path)
+    found = described(section)
     assert found.tension == Limits(0.0, 9.0, 20.0, 60.0)
     assert found.dimensions == Dimensions(spool_radius=0.012, rib_count=7)
     assert found.dimensions.rib_diameter == 0.05 and found.dimensions.base_height == 0.0635
@@ -33,8 +39,8 @@ def test_robots_of_the_catalog_have_hardware(name):
     assert isinstance(load_hardware(name), HardwareDescription)
 
 
-def test_no_section_means_defaults():
-    assert parse_hardware(TEXT, "robot.yaml") == described(None) == described({}) == HardwareDescription()
+def test_no_section_means_defaults(described):
+    assert load_hardware("delrin-tendon-robot") == described(None) == described({}) == HardwareDescription()
 
 
 def test_the_robot_is_the_same_with_a_section():
@@ -65,7 +71,7 @@ def test_the_robot_is_the_same_with_a_section():
         ({3: 4}, "the key 3 is unknown"),
     ],
 )
-def test_errors_are_one_line_with_the_file(section, message):
+def test_errors_are_one_line_with_the_file(described, section, message):
     with pytest.raises(RobotFileError, match=message) as caught:
         described(section)
     assert "\n" not in str(caught.value) and str(caught.value).startswith("robot.yaml: hardware")

@@ -19,11 +19,11 @@ from knode_cosserat_hardware.lines import (
     decode_framed,
     decode_plain,
     encode_framed,
-    encode_message,
     encode_plain,
     encode_tensions,
     is_newer,
 )
+from tests.hardware.fake_board import encode_message
 
 numbers = st.integers(0, 65535)
 words = st.text("abcdefghijklmnopqrstuvwxyz0123456789-_.", min_size=1, max_size=12)

@@ -10,8 +10,9 @@ from hypothesis import strategies as st
 
 from knode_cosserat_hardware.board_link import BoardLink, Transport
 from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
-from knode_cosserat_hardware.lines import Answer, Telemetry, decode_framed, encode_message
+from knode_cosserat_hardware.lines import Answer, Telemetry, decode_framed
 from knode_cosserat_hardware.serial_board import SerialBoard
+from tests.hardware.fake_board import encode_message
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for

@@ -25,6 +25,7 @@ from knode_cosserat_hardware.middleware.natnet import (
 )
 from knode_cosserat_hardware.simulated import SimulatedRobot
 from tests.hardware.vrpn_server import VRPNServer
+from tests.hardware.waiting import wait_for
 
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2)]
 #: identity, position, quaternion (scalar last), tracked
@@ -152,13 +153,6 @@ def free_port():
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         return probe.getsockname()[1]
-
-
-def wait_for(condition, timeout=10.0):
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.01)
 
 
 @pytest.fixture

@@ -16,6 +16,7 @@ from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion, StoppedError
 from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
+from tests.hardware.waiting import eventually
 
 pytestmark = pytest.mark.slow
 
@@ -30,13 +31,6 @@ class Stops:
 
     def stop(self):
         self.count += 1
-
-
-def eventually(condition):
-    end = time.monotonic() + 5.0
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
 
 
 # emergency stop
@@ -314,7 +308,8 @@ def test_wrong_wiring_is_found(tmp_path):
 def test_a_robot_without_a_watchdog_fails(tmp_path):
     with SimulatedRobot(ROD, machine=MachineParameters(noise=0.0, offset=0.0)) as robot:
         step = [each for each in CHECKLIST if each.name == "watchdog"]
-        report, _ = commissioned(robot, tmp_path / "a.json", steps=step, silence=robot.wait)
+        robot.advance = robot.wait
+        report, _ = commissioned(robot, tmp_path / "a.json", steps=step)
         assert "still armed after 1 s without its host" in report["steps"][0]["reason"]
         assert robot.state is DriverState.FAULT
 

@@ -1,6 +1,7 @@
 """Recorder: bags equal to those of the writer; kills, full disks, names."""
 
 import errno
+import io
 import os
 import signal
 import subprocess
@@ -11,10 +12,11 @@ import time
 import numpy as np
 import pytest
 
+import knode_cosserat_hardware.recorder as recorder_module
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
 from knode_cosserat_hardware.driver import DriverState, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
-from knode_cosserat_hardware.recorder import BagStream, Recorder, record_robot
+from knode_cosserat_hardware.recorder import Recorder, record_robot
 from tests.recordings.made import PAPER, made
 
 pytest.importorskip("rosbags", reason="bags need rosbags: pip install 'knode-cosserat[ros]'")
@@ -147,24 +149,28 @@ def test_a_kill_loses_one_second_at_most(tmp_path):
         Recorder(path)
 
 
-def filled(monkeypatch, after):
-    """Let writes fail as on a full disk after a number of them, each halfway."""
-    write, count = BagStream._append, [0]
+def filled(monkeypatch, chunks):
+    """Let writes fail as on a full disk after a number of chunks, each halfway."""
+    write = io.FileIO.write
+    sync, synced = recorder_module._WholeFile.sync, [0]
 
-    def limited(stream, data):
-        count[0] += 1
-        if count[0] > after:
-            os.write(stream._file.fileno(), data[: len(data) // 2])
-            stream._file.truncate(stream._end)
-            stream._file.seek(stream._end)
+    def counted(file):
+        synced[0] += 1
+        sync(file)
+
+    def limited(file, data):
+        if synced[0] >= chunks:
+            write(file, bytes(data[: len(data) // 2]))
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        write(stream, data)
+        while data:
+            data = data[write(file, data) :]
 
-    monkeypatch.setattr(BagStream, "_append", limited)
+    monkeypatch.setattr(recorder_module._WholeFile, "sync", counted)
+    monkeypatch.setattr(recorder_module._WholeFile, "write", limited)
 
 
 def test_a_full_disk_is_one_error_and_keeps_what_was_written(tmp_path, monkeypatch):
-    filled(monkeypatch, after=3)
+    filled(monkeypatch, chunks=2)
     recorder = Recorder(tmp_path / "run.bag", interval=0.02)
     reading = Reading(time.monotonic(), np.full(4, 5.0), np.zeros(4), DriverState.ARMED)
     frame = PoseFrame(0.0, np.tile([0.0, 0.0, 0.5], (5, 1)), np.tile([1.0, 0, 0, 0], (5, 1)))
@@ -212,7 +218,7 @@ def test_a_disk_that_is_really_full(tmp_path):
 
 
 def test_an_error_at_the_end_is_raised_by_close(tmp_path, monkeypatch):
-    filled(monkeypatch, after=1)
+    filled(monkeypatch, chunks=0)
     recorder = Recorder(tmp_path / "run.bag", interval=10.0)
     recorder.add_command(np.full(4, 5.0))
     with pytest.raises(HardwareError, match="No space left"):
@@ -222,7 +228,7 @@ def test_an_error_at_the_end_is_raised_by_close(tmp_path, monkeypatch):
 
 
 def test_an_error_in_the_block_is_not_hidden(tmp_path, monkeypatch):
-    filled(monkeypatch, after=1)
+    filled(monkeypatch, chunks=0)
 
     def record():
         with Recorder(tmp_path / "run.bag", interval=10.0) as recorder:

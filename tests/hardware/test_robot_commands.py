@@ -103,7 +103,7 @@ def test_words_of_drivers():
     assert opened.driver.reel.directions == (1, -1) and opened.driver.reel.radius == 0.01
     opened = open_driver("simulated?noise=0,fault=slack:2,after=0.1", HardwareDescription(), lambda: ROD)
     with opened.driver as driver:
-        opened.silence(0.2)
+        opened.driver.advance(0.2)
         assert driver.fault == "slack:2" and opened.poses((1.0,)).shape == (1, 7)
     assert "tares" in open_driver("COM3", HardwareDescription(), lambda: ROD).connecting_moves
     with pytest.raises(HardwareError, match="must be a number"):

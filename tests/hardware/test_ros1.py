@@ -15,6 +15,7 @@ import pytest
 from knode_cosserat.recordings import load_recording
 from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.middleware import ros1
+from tests.hardware.waiting import wait_for
 
 MISSING = [name for name in ("rosmaster", "rosbag") if shutil.which(name) is None]
 HAS_ROSPY = any(os.path.isdir(os.path.join(each, "rospy")) for each in [*sys.path, str(ros1.DEBIAN)])
@@ -94,13 +95,6 @@ def ros(tmp_path):
 def listens(port):
     with socket.socket() as probe:
         return probe.connect_ex(("127.0.0.1", port)) == 0
-
-
-def wait_for(condition, timeout=60.0):
-    end = time.monotonic() + timeout
-    while not condition():
-        assert time.monotonic() < end, "waited too long"
-        time.sleep(0.05)
 
 
 class RosBag:

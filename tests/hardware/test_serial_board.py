@@ -8,12 +8,12 @@ import time
 import numpy as np
 import pytest
 
-from knode_cosserat_hardware.board_link import SerialTransport
 from knode_cosserat_hardware.driver import FAULTS, DriverState, HardwareError, Limits, fault_message
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.serial_board import SerialBoard
 from tests.hardware.fake_board import FakeBoard
+from tests.hardware.waiting import eventually
 
 pytest.importorskip("serial")
 #: no rate limit that a test would wait for
@@ -28,13 +28,6 @@ def board():
 
 def driver(fake, limits=FAST, **options):
     return SerialBoard(fake.port, limits, **{"host_timeout": 1.0, **options})
-
-
-def eventually(condition, timeout=5.0):
-    end = time.monotonic() + timeout
-    while not condition() and time.monotonic() < end:
-        time.sleep(0.005)
-    return condition()
 
 
 def verbs(fake):
@@ -111,12 +104,6 @@ def test_a_port_that_is_not_there_or_in_use(board):
         SerialBoard("/dev/ttyNothing").connect()
     with driver(board), pytest.raises(HardwareError, match="another program uses this port"):
         driver(board).connect()
-
-
-def test_without_pyserial_the_error_says_what_to_install(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "serial", None)
-    with pytest.raises(HardwareError, match=r"pip install knode-cosserat-hardware"):
-        SerialTransport("/dev/ttyACM0")
 
 
 # the paper's board

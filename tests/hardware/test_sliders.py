@@ -56,7 +56,7 @@ def test_sliders_set_tensions_and_readings_are_shown(window):
             window.show(wish, sent, reading)
             texts.append((window._state["text"], window._readings[0]["text"], sent[0], reading.tension[0]))
 
-        teleoperate(robot, window, window, emergency, seconds=1.2, shown=show)
+        teleoperate(robot, window, None, emergency, seconds=1.2, shown=show)
         assert robot.tip()[0] > 0.02
     state, shown, sent, measured = texts[-1]
     assert state == "armed" and shown == f"measured\n{measured:.2f} N" and sent == pytest.approx(4.0)
@@ -79,7 +79,7 @@ def test_each_way_to_stop_stops_the_robot(window, way):
                 window._root.tk.call(*window._root.protocol("WM_DELETE_WINDOW").split())
 
         with pytest.raises(HardwareError, match=r"(pressed|closed).*; the robot was stopped"):
-            teleoperate(robot, window, window, emergency, seconds=1.0, shown=act)
+            teleoperate(robot, window, None, emergency, seconds=1.0, shown=act)
         assert robot.state is DriverState.FAULT and robot.fault == "stopped:0"
 
 

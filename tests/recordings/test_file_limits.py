@@ -11,7 +11,7 @@ from knode_cosserat._files import csv_rows, parquet_file
 from knode_cosserat.recordings import content, load, recording
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.formats import parquet
-from studies.beam_recordings import read_beam
+from studies.beam import read_beam
 from studies.cables import pickles
 from studies.cables import recordings as cables
 from tests.limits import assert_limited, limited

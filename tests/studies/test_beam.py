@@ -10,20 +10,24 @@ import pytest
 
 from knode_cosserat.recordings.findings import RecordingError
 from studies import beam
-from studies.beam_model import (
+from studies.beam import (
     NOMINAL,
+    THRESHOLD,
     Beam,
     Numerics,
     beam_rod,
+    find_release,
     held_beam,
     identify_beam,
+    load_of,
     marker_rmse,
     predict_markers,
+    read_beam,
     shear_factor,
     step_count,
+    tip_drop,
     torsion_constant,
 )
-from studies.beam_recordings import THRESHOLD, find_release, load_of, read_beam, tip_drop
 from tests.commands import run_study
 
 FOLDER = Path(__file__).parents[1] / "files" / "beam"
@@ -127,7 +131,7 @@ def test_the_held_out_recording_is_predicted(recordings):
     train = [each for each in recordings if each.name != HELD_OUT]
     steps = step_count(recordings, COARSE.dt)
     [held_out] = [each for each in recordings if each.name == HELD_OUT]
-    found = identify_beam(train, steps, COARSE).beam
+    found = identify_beam(train, steps, COARSE)
     assert 2.2e5 < found.youngs_modulus < 3.0e5 and 0.0 < found.tilt < 0.15
     rmse = {
         name: marker_rmse(predict_markers(each, held_out, steps, COARSE), held_out)

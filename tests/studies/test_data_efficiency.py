@@ -14,6 +14,7 @@ from knode_cosserat.solvers.settings import Settings
 from studies import comparisons, data_efficiency, simulation
 from studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
 from studies.data_efficiency import as_markdown, figure, rerun
+from studies.methods import fitted
 
 pydmd = pytest.mark.skipif(importlib.util.find_spec("pydmd") is None, reason="needs PyDMD")
 matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")
@@ -98,7 +99,7 @@ def test_what_knows_nothing_does_not_see_the_imperfection():
     config = kc.FitConfig.paper(seed=(0,))
     config = type(config)(config.residual, type(config.segments)(epochs=3, nodes=(3, 5, 7, 9)), seed=(0,))
     models = [
-        data_efficiency._without_knowledge(knowledge, training, config).systems[0]
+        fitted(NoKnowledge(knowledge), training, config).systems[0]
         for knowledge in (ROBOT, ROBOT.replace(youngs_modulus=10e9, gravity=(0.0, 0.0, 0.0)))
     ]
     assert all(isinstance(model, KNODE) and isinstance(model.knowledge, NoKnowledge) for model in models)

@@ -7,7 +7,7 @@ import pytest
 
 from knode_cosserat_hardware.emulation import missing
 from studies import hardware
-from studies.hardware_rig import Cable
+from studies.hardware import Cable
 from studies.runner import Job, Product
 
 FACTS = {
@@ -37,7 +37,7 @@ def test_each_figure_has_a_limit():
 
 
 def test_quick_runs_have_each_fault():
-    from studies.hardware_faults import KINDS, NOISE_BURST
+    from studies.hardware import KINDS, NOISE_BURST
 
     by_key = {job.key: job.settings for job in hardware.jobs(quick=True)}
     assert by_key["loop-faults"]["runs"] >= len((*KINDS, NOISE_BURST))
@@ -66,7 +66,7 @@ def test_a_burst_of_bit_errors_ends():
 @pytest.mark.campaign
 @pytest.mark.skipif(bool(missing()), reason=f"the firmware cannot be built here: {missing()}")
 def test_faults_within_the_closed_loop_are_caught_and_recovered_from():
-    from studies.hardware_faults import loop_faults
+    from studies.hardware import loop_faults
 
     facts = loop_faults({"runs": 8}).facts
     assert facts["missed"] == facts["dead"] == facts["unsafe"] == 0, facts["trials"]

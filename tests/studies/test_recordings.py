@@ -17,7 +17,7 @@ from knode_cosserat.rods.tendons import TendonFriction
 from knode_cosserat.solvers.result import Result, SimulationError
 from studies import recordings as study
 from studies.__main__ import app
-from studies.recordings_report import repetitions, table_of
+from studies.recordings import repetitions, table_of
 from studies.runner import StudyError
 
 PAPER = RecordingConfig.paper_robot()
@@ -176,12 +176,12 @@ def test_a_model_that_fails_is_reported_soon(folder, monkeypatch, solved):
         if len(given) > solved:
             raise SimulationError(1, DT, 1.0, Result.NO_CONVERGENCE, "")
 
-    def nothing_learned(knowledge, *_):
+    def nothing_learned(method, knowledge, *_):
         return study.TrainedSystems({0: kc.KNODE(knowledge, Nothing())})
 
     monkeypatch.setattr(study, "predict", failing)
     monkeypatch.setattr(study, "compared", lambda *_, **__: study.Evaluation(0.0, 0.0, 0.0))
-    monkeypatch.setitem(study.METHODS, "baseline", nothing_learned)
+    monkeypatch.setattr(study, "trained", nothing_learned)
     paths = study.recordings_in(folder)
     train, _ = study.recording_split(list(paths), ["sine_1p0"])
     jobs = study.jobs(paths, train, ["baseline"], study.RecordingsOptions(seconds=3.0))

@@ -15,8 +15,8 @@ import knode_cosserat as kc
 from knode_cosserat.learning.knode import load_model
 from studies import methods, simulation
 from studies.__main__ import app
+from studies.report import MEASURES, spreads
 from studies.simulation import cells_of, rerun
-from studies.tables import MEASURES, spreads
 
 KEYS = {"imperfection", "control", "method", "seed", "tip_dtw", "pose_mse"}
 TABLES = ("table1.json", "table1.csv", "table1.md")

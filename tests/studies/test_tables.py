@@ -4,7 +4,7 @@ import statistics
 
 import pytest
 
-from studies.tables import (
+from studies.report import (
     Cell,
     Published,
     Spread,

@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from knode_cosserat_hardware.dynamixel import DynamixelRobot
     from knode_cosserat_hardware.middleware.commands import CommandGate
     from knode_cosserat_hardware.middleware.dds import DDSBridge
-    from knode_cosserat_hardware.middleware.loopback import LoopbackLatency, measure_loopback
     from knode_cosserat_hardware.middleware.mocap import VRPN, MotionCapture, PoseFrame, SimulatedCapture
     from knode_cosserat_hardware.middleware.natnet import NatNet, NatNetAddress
     from knode_cosserat_hardware.middleware.ros1 import ROS1Node
@@ -58,7 +57,6 @@ __all__ = [
     "Latency",
     "Limits",
     "LoadCellFit",
-    "LoopbackLatency",
     "MachineParameters",
     "MotionCapture",
     "MotorReel",
@@ -81,7 +79,6 @@ __all__ = [
     "Transport",
     "fit_load_cell",
     "load_hardware",
-    "measure_loopback",
     "open_driver",
     "record_robot",
     "teleoperate",
@@ -100,7 +97,6 @@ make_lazy(
         "knode_cosserat_hardware.dynamixel": "DynamixelRobot",
         "knode_cosserat_hardware.middleware.commands": "CommandGate",
         "knode_cosserat_hardware.middleware.dds": "DDSBridge",
-        "knode_cosserat_hardware.middleware.loopback": "LoopbackLatency measure_loopback",
         "knode_cosserat_hardware.middleware.mocap": "MotionCapture PoseFrame SimulatedCapture VRPN",
         "knode_cosserat_hardware.middleware.natnet": "NatNet NatNetAddress",
         "knode_cosserat_hardware.middleware.ros1": "ROS1Node",

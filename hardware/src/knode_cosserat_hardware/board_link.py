@@ -9,7 +9,10 @@ import threading
 import time
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
+
+import serial
+from serial.tools.list_ports import comports
 
 from knode_cosserat_hardware.driver import HardwareError, LatencyWindow
 from knode_cosserat_hardware.lines import (
@@ -58,6 +61,10 @@ class Transport(abc.ABC):
     def now(self) -> float:
         """Return the time (s) on a clock that never goes back."""
 
+    def advance(self, seconds: float) -> None:
+        """Let time pass (s) without reading."""
+        time.sleep(seconds)
+
     @abc.abstractmethod
     def close(self) -> None:
         """Close the connection. Never raises."""
@@ -71,13 +78,12 @@ class SerialTransport(Transport):
         baud: bits per second.
 
     Raises:
-        HardwareError: pyserial is not installed, or the port cannot be opened.
+        HardwareError: the port cannot be opened.
     """
 
     real_time = True
 
     def __init__(self, port: str, baud: int = 115200):
-        serial = _pyserial()
         self.name = port
         try:
             self._port = serial.serial_for_url(port, baudrate=baud, write_timeout=1.0, exclusive=True)
@@ -119,20 +125,10 @@ class SerialTransport(Transport):
         )
 
 
-def _pyserial() -> Any:
-    try:
-        import serial
-    except ImportError:
-        raise HardwareError(
-            "serial ports need pyserial; install it with: pip install knode-cosserat-hardware"
-        ) from None
-    return serial
-
-
 def _refusal(port: str, error: Exception) -> str:
     """Return the error message for a port that cannot be opened."""
     text = str(error).lower()
-    ports = _ports()
+    ports = sorted(port.device for port in comports())[:10]
     found = f"ports here: {', '.join(ports)}" if ports else "no serial ports are here"
     if "permission" in text or "access is denied" in text:
         fix = "on Linux add yourself to the group dialout (sudo usermod -aG dialout $USER) and log in again"
@@ -142,15 +138,6 @@ def _refusal(port: str, error: Exception) -> str:
     if "no such file" in text or "filenotfound" in text or "could not open" in text:
         return f"{port}: no such serial port; {found}"
     return f"{port}: cannot be opened ({' '.join(str(error).split())[:120]}); {found}"
-
-
-def _ports() -> list[str]:
-    try:
-        from serial.tools.list_ports import comports
-
-        return sorted(port.device for port in comports())[:10]
-    except Exception:
-        return []
 
 
 #: time between lines that feed the board's watchdog (60 ms), and its silence in plain mode (500 ms) (s)

@@ -6,6 +6,7 @@ import dataclasses
 from typing import Any
 
 import numpy as np
+import scipy.stats
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
@@ -92,23 +93,20 @@ def fit_load_cell(weights: ArrayLike, readings: ArrayLike) -> LoadCellFit:
             weights, or readings that do not change.
     """
     weight, reading = _checked(weights, readings)
-    centre = weight.mean()
-    spread = float(np.sum((weight - centre) ** 2))
-    slope = float(np.sum((weight - centre) * reading) / spread)
+    line = scipy.stats.linregress(weight, reading)
+    slope, offset = float(line.slope), float(line.intercept)
     if abs(slope) * np.ptp(weight) < 1e-9 * max(1.0, float(np.max(np.abs(reading)))):
         raise HardwareError("the readings do not change with the weights; check the load cell's wiring")
-    offset = float(reading.mean() - slope * centre)
     error = reading - offset - slope * weight
-    freedom = len(weight) - 2
-    deviation = float(np.sqrt(np.sum(error**2) / freedom)) if freedom else np.nan
-    slope_error = deviation / np.sqrt(spread)
-    offset_error = deviation * np.sqrt(1.0 / len(weight) + centre**2 / spread)
+    # two readings leave nothing to judge the line by
+    slope_error, offset_error = (
+        (float(line.stderr), float(line.intercept_stderr)) if len(weight) > 2 else (np.nan, np.nan)
+    )
     bend, bend_is_significant = _nonlinearity(weight, reading, slope)
     hysteresis = _hysteresis(weight, reading, slope)
-    total = float(np.sum((reading - reading.mean()) ** 2))
     return LoadCellFit(
         weight, reading, 1.0 / slope, offset, slope_error / slope**2, offset_error, error / slope,
-        1.0 - float(np.sum(error**2)) / total, bend, hysteresis,
+        float(line.rvalue) ** 2, bend, hysteresis,
         _warnings(weight, bend if bend_is_significant else 0.0, hysteresis),
     )  # fmt: skip
 

@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
+import can
 import numpy as np
 from jaxtyping import Float
 
@@ -130,7 +131,7 @@ class CanRobot(MotorRobot):
             raise HardwareError(f"gear_ratio must be between 0.01 and 1000 (got {gear_ratio!r})")
         super().__init__(len(self._nodes), limits, reel)
         self.name = f"CAN {channel}"
-        self._options = {"channel": channel, "interface": interface, "bitrate": bitrate}
+        self._options: dict[str, Any] = {"channel": channel, "interface": interface, "bitrate": bitrate}
         self._gear = gear_ratio
         self._bus: Any = None
         self._closed_loop = False
@@ -141,7 +142,6 @@ class CanRobot(MotorRobot):
     # bus
 
     def _open(self) -> None:
-        can = self._python_can()
         try:
             self._bus = can.Bus(**self._options)
         except Exception as error:  # each interface has its own errors
@@ -290,7 +290,6 @@ class CanRobot(MotorRobot):
         self._put(arbitration_id=identifier(node, command), data=data)
 
     def _put(self, **message: Any) -> None:
-        can = self._python_can()
         try:
             self._opened().send(can.Message(is_extended_id=False, **message), timeout=0.1)
         except HardwareError:
@@ -334,12 +333,3 @@ class CanRobot(MotorRobot):
     def _lost(self, error: Exception) -> HardwareError:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         return HardwareError(f"{self.name}: the bus is lost ({reason}); check adapter, cable and terminators")
-
-    def _python_can(self) -> Any:
-        try:
-            import can
-        except ImportError:
-            raise HardwareError(
-                "CAN needs python-can; install it with: pip install knode-cosserat-hardware"
-            ) from None
-        return can

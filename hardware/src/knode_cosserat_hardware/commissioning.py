@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import datetime
 import json
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,38 +31,16 @@ TEST, RELATIVE, ABSOLUTE = 2.0, 0.1, 0.3
 SILENCE, LATENCY = 1.0, 0.06
 
 
-@dataclasses.dataclass(frozen=True)
-class Machine:
-    """Connected robot, and time on its clock.
+def _tensions(driver: Driver, count: int = 20) -> Float[np.ndarray, "count c"]:
+    """Return the measured tensions of some readings (N)."""
+    return np.array([driver.read().tension for _ in range(count)])
 
-    Attributes:
-        driver: the driver.
-        silence: passes a time (s) without a sign of life to the robot.
-    """
 
-    driver: Driver
-    silence: Callable[[float], Any]
-
-    def wait(self, seconds: float) -> None:
-        """Wait (s), with the robot's watchdog fed."""
-        wait = getattr(self.driver, "wait", None)
-        if wait is not None:
-            wait(seconds)
-            return
-        end = time.monotonic() + seconds
-        while (rest := end - time.monotonic()) > 0.0:
-            self.driver.read()
-            time.sleep(min(0.02, rest))
-
-    def tensions(self, count: int = 20) -> Float[np.ndarray, "count c"]:
-        """Return the measured tensions of some readings (N)."""
-        return np.array([self.driver.read().tension for _ in range(count)])
-
-    def hold(self, tension: Float[np.ndarray, " c"], seconds: float) -> None:
-        """Command tensions (N) for a time (s)."""
-        for _ in range(max(1, round(seconds / 0.02))):
-            self.driver.command(tension)
-            self.wait(0.02)
+def _hold(driver: Driver, tension: Float[np.ndarray, " c"], seconds: float) -> None:
+    """Command tensions (N) for a time (s)."""
+    for _ in range(max(1, round(seconds / 0.02))):
+        driver.command(tension)
+        driver.wait(0.02)
 
 
 class CheckError(HardwareError):
@@ -91,12 +68,12 @@ class CheckStep:
     name: str
     text: str
     motion: str = ""
-    measure: Callable[[Machine], dict[str, Any]] | None = None
+    measure: Callable[[Driver], dict[str, Any]] | None = None
 
 
-def measure_noise(machine: Machine) -> dict[str, Any]:
+def measure_noise(driver: Driver) -> dict[str, Any]:
     """Measure offset and noise of each load cell at rest (N)."""
-    tension = machine.tensions(100)
+    tension = _tensions(driver, 100)
     offset, noise = tension.mean(axis=0), tension.std(axis=0)
     values = {"offset": _rounded(offset), "noise": _rounded(noise), "unit": "N"}
     for name, found, limit in (("noise", noise, NOISE), ("offset", np.abs(offset), OFFSET)):
@@ -109,23 +86,22 @@ def measure_noise(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_directions(machine: Machine) -> dict[str, Any]:
+def measure_directions(driver: Driver) -> dict[str, Any]:
     """Reel in with each motor until its load cell reacts, and reel out again."""
     values: dict[str, Any] = {"rise": [], "jogs": [], "unit": "N"}
-    driver = machine.driver
     for tendon in range(driver.tendon_count):
-        before = machine.tensions(10).mean(axis=0)
+        before = _tensions(driver, 10).mean(axis=0)
         count = 0
         while count < JOGS:
             count += 1
             driver.jog(tendon, DRIVE)
-            machine.wait(0.25)
-            rise = machine.tensions(5).mean(axis=0) - before
+            driver.wait(0.25)
+            rise = _tensions(driver, 5).mean(axis=0) - before
             if np.max(np.abs(rise)) > RISE:
                 break
         for _ in range(count):
             driver.jog(tendon, -DRIVE)
-            machine.wait(0.25)
+            driver.wait(0.25)
         values["rise"].append(round(float(rise[tendon]), 3))
         values["jogs"].append(count)
         strongest = int(np.argmax(np.abs(rise)))
@@ -142,13 +118,12 @@ def measure_directions(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_stop(machine: Machine) -> dict[str, Any]:
+def measure_stop(driver: Driver) -> dict[str, Any]:
     """Stop the armed robot; it must have the fault `stopped`, and release."""
-    driver = machine.driver
     driver.arm()
-    machine.hold(np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
+    _hold(driver, np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
     driver.stop()
-    machine.wait(1.0)
+    driver.wait(1.0)
     reading = driver.read()
     values = {"fault": reading.fault, "tension": _rounded(reading.tension), "unit": "N"}
     if reading.state is not DriverState.FAULT:
@@ -161,14 +136,13 @@ def measure_stop(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_watchdog(machine: Machine) -> dict[str, Any]:
+def measure_watchdog(driver: Driver) -> dict[str, Any]:
     """Send nothing to the armed robot for a second; it must stop by itself."""
-    driver = machine.driver
     driver.arm()
-    machine.hold(np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
-    machine.silence(SILENCE)
+    _hold(driver, np.full(driver.tendon_count, _test(driver) / 2.0), 0.5)
+    driver.advance(SILENCE)
     # readings from before the silence may still wait
-    machine.wait(0.1)
+    driver.wait(0.1)
     reading = driver.read()
     values = {"state": reading.state.value, "fault": reading.fault, "silence": SILENCE, "unit": "s"}
     if reading.state is DriverState.ARMED:
@@ -179,16 +153,16 @@ def measure_watchdog(machine: Machine) -> dict[str, Any]:
     return values
 
 
-def measure_tracking(machine: Machine) -> dict[str, Any]:
+def measure_tracking(driver: Driver) -> dict[str, Any]:
     """Tension each tendon in turn; the measured tension must follow."""
-    driver, test = machine.driver, _test(machine.driver)
+    test = _test(driver)
     values: dict[str, Any] = {"commanded": test, "measured": [], "unit": "N"}
     driver.arm()
     for tendon in range(driver.tendon_count):
         wanted = np.full(driver.tendon_count, max(driver.limits.low, 0.1 * test))
         wanted[tendon] = test
-        machine.hold(wanted, 1.0)
-        measured = machine.tensions(10).mean(axis=0)
+        _hold(driver, wanted, 1.0)
+        measured = _tensions(driver, 10).mean(axis=0)
         values["measured"].append(round(float(measured[tendon]), 3))
         if abs(measured[tendon] - test) > RELATIVE * test + ABSOLUTE:
             driver.disarm()
@@ -198,13 +172,13 @@ def measure_tracking(machine: Machine) -> dict[str, Any]:
                 values,
             )
     driver.disarm()
-    machine.wait(0.7)
+    driver.wait(0.7)
     return values
 
 
-def measure_over_tension(machine: Machine) -> dict[str, Any]:
+def measure_over_tension(driver: Driver) -> dict[str, Any]:
     """Lower the board's limit of tension, and exceed it by jogs; the board must stop and release."""
-    driver, test = machine.driver, _test(machine.driver)
+    test = _test(driver)
     board: Any = driver
     if not hasattr(driver, "set_setting"):
         raise NotImplementedError("this robot has no setting of its over-tension limit")
@@ -215,27 +189,26 @@ def measure_over_tension(machine: Machine) -> dict[str, Any]:
         jogs, reading = 0, driver.read()
         while jogs < 2 * JOGS and not reading.fault:
             driver.jog(0, DRIVE)
-            machine.wait(0.25)
+            driver.wait(0.25)
             reading = driver.read()
             jogs += 1
         values |= {"fault": reading.fault, "jogs": jogs}
         if not reading.fault.startswith("over-tension"):
             raise CheckError("a tension above the board's limit was no fault; do not use this robot", values)
     finally:
-        machine.wait(0.7)
+        driver.wait(0.7)
         if driver.state is DriverState.FAULT:
             driver.reset()
         board.set_setting("limit", usual)
     return values
 
 
-def measure_latency(machine: Machine) -> dict[str, Any]:
+def measure_latency(driver: Driver) -> dict[str, Any]:
     """Send 50 commands at the low limit, and report the latency (s)."""
-    driver = machine.driver
     driver.arm()
-    machine.hold(np.full(driver.tendon_count, driver.limits.low), 1.0)
+    _hold(driver, np.full(driver.tendon_count, driver.limits.low), 1.0)
     driver.disarm()
-    machine.wait(0.7)
+    driver.wait(0.7)
     median, p99, count = driver.latency
     if not count:
         raise NotImplementedError("this robot does not acknowledge commands")
@@ -310,12 +283,6 @@ class Person:
     consent: Callable[[str], bool]
 
 
-def silence_of(driver: Driver) -> Callable[[float], Any]:
-    """Return a function that passes a time (s) without a sign of life to a robot."""
-    found: Callable[[float], Any] = getattr(driver, "advance", time.sleep)
-    return found
-
-
 class Commissioning:
     """Commissioning of a connected robot, step by step, with a report file.
 
@@ -327,7 +294,6 @@ class Commissioning:
         path: report file (.json).
         robot: name of the robot in the report, such as its port.
         person: the person in charge.
-        silence: passes a time (s) without a sign of life to the robot.
         steps: the checklist.
 
     Raises:
@@ -336,10 +302,10 @@ class Commissioning:
 
     def __init__(
         self, driver: Driver, path: str | Path, robot: str, person: Person, *,
-        silence: Callable[[float], Any] | None = None, steps: Sequence[CheckStep] = CHECKLIST,
+        steps: Sequence[CheckStep] = CHECKLIST,
     ):  # fmt: skip
         self.path, self.robot, self.person, self.steps = Path(path), robot, person, tuple(steps)
-        self._machine = Machine(driver, silence_of(driver) if silence is None else silence)
+        self._driver = driver
         #: results of steps by name
         self.results: dict[str, dict[str, Any]] = self._resumed()
 
@@ -376,7 +342,7 @@ class Commissioning:
         """Return the report as plain values."""
         return {
             "format": FORMAT, "robot": self.robot, "package": package_version(), "complete": self.is_complete,
-            "limits": dataclasses.asdict(self._machine.driver.limits),
+            "limits": dataclasses.asdict(self._driver.limits),
             "steps": [
                 {"name": step.name, "text": step.text} | self.results[step.name]
                 for step in self.steps
@@ -390,12 +356,12 @@ class Commissioning:
             return {"result": {True: "confirmed", False: "failed", None: "not confirmed"}[answer]}
         if step.motion and not self.person.consent(f"{step.name}: {step.motion}"):
             return {"result": "skipped"}
-        driver = self._machine.driver
+        driver = self._driver
         try:
             if not step.motion:
-                return {"result": "passed", "values": step.measure(self._machine)}
+                return {"result": "passed", "values": step.measure(driver)}
             with EmergencyStop(driver) as emergency:
-                values = step.measure(self._machine)
+                values = step.measure(driver)
                 if driver.state is DriverState.ARMED:
                     driver.disarm()
                 emergency.check()

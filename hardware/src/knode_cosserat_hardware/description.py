@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files.yaml_text import did_you_mean, mapping_of, shown
+from knode_cosserat._files.yaml_text import did_you_mean, shown
 from knode_cosserat.rods.robot_file import RobotFileError, file_mapping
 from knode_cosserat_hardware.driver import HardwareError, Limits, require_limits, require_number
 
@@ -100,18 +100,7 @@ def load_hardware(name_or_path: str | Path) -> HardwareDescription:
     Raises:
         RobotFileError: there is no such file, or a key or value of the section is not allowed.
     """
-    source = str(name_or_path)
-    return _described(file_mapping(name_or_path).get("hardware"), source)
-
-
-def parse_hardware(text: str, source: str) -> HardwareDescription:
-    """Return the hardware of a robot file's text; `source` names the file in errors.
-
-    Raises:
-        RobotFileError: a key or value of the section is not allowed.
-        YAMLTextError: the text is not YAML.
-    """
-    return _described(mapping_of(text, "format, kind and parameters").get("hardware"), source)
+    return _described(file_mapping(name_or_path).get("hardware"), str(name_or_path))
 
 
 def _described(section: Any, source: str) -> HardwareDescription:

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import dynamixel_sdk as sdk
 import numpy as np
 from jaxtyping import Float
 
@@ -94,7 +95,6 @@ class DynamixelBus:
         """Open the port; nothing if it is open."""
         if self._port is not None:
             return
-        sdk = self._sdk()
         port = sdk.PortHandler(self._given) if isinstance(self._given, str) else self._given
         try:
             opened = port.openPort() and port.setBaudRate(self._baud)
@@ -137,7 +137,7 @@ class DynamixelBus:
 
     def write_each(self, register: Register, values: Sequence[int]) -> None:
         """Write a value to each motor in one packet, without answers."""
-        writer = self._sdk().GroupSyncWrite(self._open_port(), self._packets, register.address, register.size)
+        writer = sdk.GroupSyncWrite(self._open_port(), self._packets, register.address, register.size)
         for motor, value in zip(self.ids, values, strict=True):
             writer.addParam(motor, register.encoded(value))
         self._tried(lambda: (writer.txPacket(), None), 0)
@@ -153,7 +153,7 @@ class DynamixelBus:
         data = [byte for address in addresses for byte in address.to_bytes(2, "little")]
         for motor in self.ids:
             self._write_bytes(motor, INDIRECT_ADDRESS, data, "Indirect Address")
-        self._reader = self._sdk().GroupSyncRead(self._port, self._packets, INDIRECT_DATA, len(addresses))
+        self._reader = sdk.GroupSyncRead(self._port, self._packets, INDIRECT_DATA, len(addresses))
         for motor in self.ids:
             self._reader.addParam(motor)
 
@@ -218,15 +218,6 @@ class DynamixelBus:
         if self._port is None:
             raise HardwareError(f"{self.name}: the bus is not open; call connect()")
         return self._port
-
-    def _sdk(self) -> Any:
-        try:
-            import dynamixel_sdk
-        except ImportError:
-            raise HardwareError(
-                "Dynamixel motors need dynamixel-sdk; install it with: pip install knode-cosserat-hardware"
-            ) from None
-        return dynamixel_sdk
 
 
 #: units of registers: current (A), velocity (rad/s), position (rad), watchdog (s)

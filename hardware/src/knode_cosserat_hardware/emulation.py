@@ -17,9 +17,9 @@ import subprocess
 import threading
 import time
 import tty
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self, get_args
+from typing import Any, Literal, Self, get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -106,19 +106,16 @@ class Chip:
         """
         folder = built()
         self._library = library = ctypes.CDLL(str(folder / "libemulator.so"))
-        library.emulator_open.restype = ctypes.c_void_p
-        library.emulator_open.argtypes = [ctypes.c_char_p]
-        library.emulator_run.argtypes = [ctypes.c_void_p, ctypes.c_uint64, ctypes.c_void_p]
-        library.emulator_send.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint32]
-        library.emulator_send.restype = ctypes.c_uint32
-        library.emulator_receive.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint32]
-        library.emulator_receive.restype = ctypes.c_uint32
-        library.emulator_register.argtypes = [ctypes.c_void_p, ctypes.c_uint16]
-        library.emulator_register.restype = ctypes.c_uint8
-        library.emulator_contact.argtypes = [ctypes.c_void_p, ctypes.c_int]
-        library.emulator_eeprom.argtypes = [ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint16, ctypes.c_int]
-        library.emulator_reset.argtypes = [ctypes.c_void_p]
-        library.emulator_close.argtypes = [ctypes.c_void_p]
+        chip, text, size, flag = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int
+        for name, result, arguments in (
+            ("open", chip, [text]), ("run", flag, [chip, ctypes.c_uint64, chip]),
+            ("send", size, [chip, text, size]), ("receive", size, [chip, text, size]),
+            ("register", ctypes.c_uint8, [chip, ctypes.c_uint16]), ("contact", flag, [chip, flag]),
+            ("eeprom", flag, [chip, text, ctypes.c_uint16, flag]), ("reset", flag, [chip]),
+            ("close", flag, [chip]),
+        ):  # fmt: skip
+            function = getattr(library, f"emulator_{name}")
+            function.restype, function.argtypes = result, arguments
         path = folder / "tension.elf" if program is None else program
         self._chip = library.emulator_open(str(path).encode())
         if not self._chip:
@@ -192,15 +189,6 @@ class Chip:
             self.close()
 
 
-class Fuzzed(NamedTuple):
-    """Result of a fuzzing run."""
-
-    #: frames after which a motor did what its state does not allow
-    unsafe: int
-    #: ticks in which the board was armed
-    armed: int
-
-
 class HostBoard:
     """The board's logic, compiled for this computer with checks for undefined behaviour.
 
@@ -222,38 +210,19 @@ class HostBoard:
         """Run a line of a script, and return what it prints; lines that the board sends begin with `>`."""
         return str(self._library.host_run(self._board, line.encode("latin-1")).decode("latin-1"))
 
-    def fuzz(self, seed: int, frames: int) -> Fuzzed:
-        """Send frames that are random or almost right to a new board, and check its motors after each."""
+    def fuzz(self, seed: int, frames: int) -> tuple[int, int]:
+        """Send frames that are random or almost right to a new board, and check its motors after each.
+
+        Returns:
+            Number of frames after which a motor did what its state does not allow, and of ticks armed.
+        """
         armed = ctypes.c_uint64(0)
         unsafe = self._library.host_fuzz(seed, frames, ctypes.byref(armed))
-        return Fuzzed(int(unsafe), int(armed.value))
+        return int(unsafe), int(armed.value)
 
     def __del__(self) -> None:
         if getattr(self, "_board", None):
             self._library.host_close(self._board)
-
-
-def run_on_chip(lines: Iterable[str]) -> list[str]:
-    """Return what each line of a script prints on the emulated chip, with its 16-bit integers."""
-    chip = Chip(built() / "vectors.elf")
-    printed, pending = [], _until_dot(chip, "")[1]
-    for line in lines:
-        chip.send(line.encode("latin-1") + b"\n")
-        found, pending = _until_dot(chip, pending)
-        printed.append(found)
-    chip.close()
-    return printed
-
-
-def _until_dot(chip: Chip, text: str) -> tuple[str, str]:
-    """Return the chip's output until a line with a dot, and the rest."""
-    for _ in range(20_000):
-        text += chip.received().decode("latin-1")
-        head, dot, rest = ("\n" + text).partition("\n.\n")
-        if dot:
-            return head[1:] + ("\n" if head[1:] else ""), rest
-        chip.run(CLOCK // 1000)
-    raise HardwareError("the chip does not answer in 20 s")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -541,6 +510,10 @@ class EmulatedPort(Transport):
     def now(self) -> float:
         """Return the simulated time (s)."""
         return self.robot.time
+
+    def advance(self, seconds: float) -> None:
+        """Move the robot on by some time (s)."""
+        self.robot.advance(seconds)
 
     def close(self) -> None:
         """Close the port."""

@@ -119,34 +119,11 @@ def encode_framed(number: int, verb: str, *arguments: int | str) -> bytes:
         )
     if not 0 <= number < NUMBERS:
         raise HardwareError(f"a line's number must be between 0 and 65535 (got {number})")
-    return encode_plain(_sealed(" ".join([str(number), *words])))
+    return encode_plain(sealed(" ".join([str(number), *words])))
 
 
-def encode_message(message: Message, framed: bool) -> bytes:
-    """Return the line of a board's message, as a board sends it."""
-    match message:
-        case Telemetry():
-            text = ",".join(map(str, (*message.tension, *message.drive, message.loop_time)))
-            if framed:
-                fault = message.fault or "-"
-                text = f"{message.number or 0} : {message.acknowledged or 0} {message.state} {fault} {text}"
-        case Answer():
-            text = " ".join([str(message.number), "=", message.verb, *message.values])
-        case Refusal():
-            text = f"{message.number} ! {message.reason}" if framed else f"! {message.reason}"
-        case FaultNotice():
-            text = f"0 ! fault {message.fault}" if framed else f"! fault {message.fault}"
-        case Banner():
-            # a banner has no checksum in either mode
-            framed = False
-            text = f"# knode-tension {message.version} protocol {message.protocol} tendons {message.tendons}"
-        case Remark():
-            framed = False
-            text = f"# {message.text}"
-    return (_sealed(text) if framed else text).encode("ascii") + b"\n"
-
-
-def _sealed(text: str) -> str:
+def sealed(text: str) -> str:
+    """Return a line with its checksum."""
     return f"{text}*{crc16(text.encode('ascii')):04X}"
 
 

@@ -18,13 +18,11 @@ from knode_cosserat_hardware.driver import (
     Driver,
     DriverState,
     HardwareError,
-    Latency,
     LatencyWindow,
     Limits,
     Reading,
     TensionLimiter,
     checked_tensions,
-    fault_message,
 )
 
 #: age of a reading at which a command takes a new one first (s)
@@ -109,10 +107,10 @@ class MotorRobot(Driver):
         self._measured_high = self.reel.measured_high or 1.5 * self.limits.high
         self._lock = threading.RLock()
         self._state = DriverState.DISCONNECTED
-        self._fault = ""
         self._zero = np.zeros(count)
         self._sampled = -math.inf
         self._write_time: float | None = None
+        # times of a command's and the next reading's transfer, without the program's time between them
         self._latencies = LatencyWindow()
 
     # the bus; all raise HardwareError if motors do not answer
@@ -151,16 +149,6 @@ class MotorRobot(Driver):
     def state(self) -> DriverState:
         """State of the robot at the last reading."""
         return self._state
-
-    @property
-    def fault(self) -> str:
-        """Latched fault with its motor, counted from 1, such as "overload:2"; empty without one."""
-        return self._fault
-
-    @property
-    def latency(self) -> Latency:
-        """Times of a command's and the next reading's transfer, without the program's time between them."""
-        return self._latencies.summary()
 
     def connect(self) -> None:
         """Open the bus and set up the motors."""
@@ -348,8 +336,7 @@ class MotorRobot(Driver):
     def _require(self) -> None:
         if self._state is DriverState.DISCONNECTED:
             raise HardwareError("the robot is not connected; call connect(), or check the cable")
-        if self._fault:
-            raise HardwareError(fault_message(self._fault))
+        self._require_no_fault()
 
     def _require_ready(self, purpose: str) -> None:
         self._require()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -12,9 +11,10 @@ from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat_hardware.description import HardwareDescription
-from knode_cosserat_hardware.driver import Driver, HardwareError
+from knode_cosserat_hardware.driver import Driver, HardwareError, Limits
 from knode_cosserat_hardware.motor_robot import MotorReel
 
 #: words before the address, and options of each
@@ -33,9 +33,7 @@ class OpenedDriver:
         driver: the driver.
         name: name for messages and reports.
         connecting_moves: what moves when the driver connects; empty if nothing does.
-        clock: the driver's clock (s).
         poses: returns true positions (m) and quaternions at fractions of the length; None on real robots.
-        silence: passes a time (s) without a sign of life.
         simulated: True if the robot is simulated or emulated.
         prepare: called with the driver after it has connected; None: nothing is to do.
         base_height: height of the base's motion-capture body above the rod's clamped end (m).
@@ -44,9 +42,7 @@ class OpenedDriver:
     driver: Driver
     name: str
     connecting_moves: str = ""
-    clock: Callable[[], float] = time.monotonic
     poses: Callable[[Sequence[float]], Float[np.ndarray, "M 7"]] | None = None
-    silence: Callable[[float], Any] = time.sleep
     simulated: bool = False
     prepare: Callable[[Driver], Any] | None = None
     base_height: float = 0.0
@@ -79,12 +75,42 @@ def open_driver(port: str, hardware: HardwareDescription, robot: Callable[[], Sy
             f"dynamixel:PORT?ids=1,2 or can:CHANNEL?ids=1,2{did_you_mean(address, list(KINDS))}"
         )
     options = _options(port, text, KINDS[kind])
-    makers = {
-        "simulated": _simulated, "emulated": _emulated, "serial": _serial,
-        "dynamixel": _dynamixel, "can": _can,
-    }  # fmt: skip
-    opened = makers[kind](address, options, hardware, robot)
-    return dataclasses.replace(opened, base_height=hardware.dimensions.base_height)
+    limits, base_height = hardware.tension, hardware.dimensions.base_height
+    match kind:
+        case "simulated":
+            from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
+
+            machine = MachineParameters(noise=_number(options, "noise", MachineParameters.noise))
+            is_real_time = bool(_number(options, "real_time", 0.0))
+            simulated = SimulatedRobot(robot(), limits, machine=machine, real_time=is_real_time)
+            if "fault" in options:
+                simulated.inject(options["fault"], after=max(_number(options, "after", 1.0), 1e-6))
+            opened = OpenedDriver(simulated, "simulated", poses=simulated.poses, simulated=True)
+        case "emulated":
+            opened = _emulated(limits, robot())
+        case "serial":
+            from knode_cosserat_hardware.serial_board import SerialBoard
+
+            board = SerialBoard(address, limits, protocol=int(_number(options, "protocol", 2.0)))
+            moves = "opening the port resets the board, and the board tares: all reels move in and out"
+            opened = OpenedDriver(board, address, moves)
+        case "dynamixel":
+            from knode_cosserat_hardware.dynamixel import DynamixelRobot
+
+            ids, reel, baud = _ids(options), _reel(options, hardware), int(_number(options, "baud", 1e6))
+            driver: Driver = DynamixelRobot(address, ids, limits, reel, baud=baud)
+            opened = OpenedDriver(driver, f"dynamixel:{address}")
+        case _:
+            from knode_cosserat_hardware.can_robot import CanRobot
+
+            driver = CanRobot(
+                address, _ids(options), limits, _reel(options, hardware),
+                interface=options.get("interface", "socketcan"),
+                gear_ratio=_number(options, "gear_ratio", 1.0),
+                bitrate=int(_number(options, "bitrate", 1e6)),
+            )  # fmt: skip
+            opened = OpenedDriver(driver, f"can:{address}")
+    return dataclasses.replace(opened, base_height=base_height)
 
 
 def _options(port: str, text: str, known: tuple[str, ...]) -> dict[str, str]:
@@ -122,37 +148,16 @@ def _ids(options: dict[str, str]) -> list[int]:
     return [int(number) for number in numbers]
 
 
-def _simulated(
-    address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any
-) -> OpenedDriver:
-    from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
-
-    machine = MachineParameters(noise=_number(options, "noise", MachineParameters.noise))
-    driver = SimulatedRobot(
-        robot(), hardware.tension, machine=machine, real_time=bool(_number(options, "real_time", 0.0))
-    )
-    if "fault" in options:
-        driver.inject(options["fault"], after=max(_number(options, "after", 1.0), 1e-6))
-    return OpenedDriver(
-        driver, "simulated", clock=driver.now, poses=driver.poses, silence=driver.advance, simulated=True
-    )
-
-
-def _emulated(
-    address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any
-) -> OpenedDriver:
+def _emulated(limits: Limits, robot: System) -> OpenedDriver:
     try:
         from knode_cosserat_hardware.emulation import EmulatedPort, EmulatedRobot
         from knode_cosserat_hardware.serial_board import SerialBoard
     except ImportError as error:
         raise HardwareError(f"the emulated robot is not available here ({error})") from None
-    given = robot()
-    emulated = EmulatedRobot(given) if type(given).__name__ == "RoutedTendonRobot" else EmulatedRobot()
-    port = EmulatedPort(emulated)
+    emulated = EmulatedRobot(robot) if isinstance(robot, RoutedTendonRobot) else EmulatedRobot()
     return OpenedDriver(
-        SerialBoard(port, hardware.tension), "emulated",
-        "the emulated board tares: all reels move in and out", port.now, emulated.poses,
-        emulated.advance, True, _accept_settings,
+        SerialBoard(EmulatedPort(emulated), limits), "emulated",
+        "the emulated board tares: all reels move in and out", emulated.poses, True, _accept_settings,
     )  # fmt: skip
 
 
@@ -163,41 +168,11 @@ def _accept_settings(driver: Driver) -> None:
         driver.tare()
 
 
-def _serial(address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any) -> OpenedDriver:
-    from knode_cosserat_hardware.serial_board import SerialBoard
-
-    driver = SerialBoard(address, hardware.tension, protocol=int(_number(options, "protocol", 2.0)))
-    return OpenedDriver(
-        driver, address, "opening the port resets the board, and the board tares: all reels move in and out"
-    )
-
-
 def _reel(options: dict[str, str], hardware: HardwareDescription) -> MotorReel:
     """Return the motors and reels of a port's options; the reels' radius is that of the robot file."""
     directions = numbers_in(options.get("directions", "1")) or [0.0]
     return MotorReel(
         radius=hardware.dimensions.spool_radius,
         torque_constant=_number(options, "torque_constant", MotorReel.torque_constant),
-        directions=tuple(int(each) for each in directions),
+        directions=tuple(int(direction) for direction in directions),
     )
-
-
-def _dynamixel(
-    address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any
-) -> OpenedDriver:
-    from knode_cosserat_hardware.dynamixel import DynamixelRobot
-
-    baud = int(_number(options, "baud", 1_000_000.0))
-    driver = DynamixelRobot(address, _ids(options), hardware.tension, _reel(options, hardware), baud=baud)
-    return OpenedDriver(driver, f"dynamixel:{address}")
-
-
-def _can(address: str, options: dict[str, str], hardware: HardwareDescription, robot: Any) -> OpenedDriver:
-    from knode_cosserat_hardware.can_robot import CanRobot
-
-    driver = CanRobot(
-        address, _ids(options), hardware.tension, _reel(options, hardware),
-        interface=options.get("interface", "socketcan"), gear_ratio=_number(options, "gear_ratio", 1.0),
-        bitrate=int(_number(options, "bitrate", 1_000_000.0)),
-    )  # fmt: skip
-    return OpenedDriver(driver, f"can:{address}")

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import math
-import time
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -39,7 +37,6 @@ class HardwarePlant(Plant):
         dt: period (s).
         size: number of measured numbers; the last three are the tip's position (m).
         region: region of the tip; None: not checked.
-        clock: the driver's clock (s); None: `driver.now`, or the monotonic clock.
         emergency: emergency stop that is checked in each period.
 
     Raises:
@@ -48,16 +45,14 @@ class HardwarePlant(Plant):
 
     def __init__(
         self, driver: Driver, source: Source | None, dt: float, *, size: int = 3,
-        region: SafeRegion | None = None, clock: Callable[[], float] | None = None,
-        emergency: EmergencyStop | None = None,
+        region: SafeRegion | None = None, emergency: EmergencyStop | None = None,
     ):  # fmt: skip
         if not 0.0 < dt < math.inf:
             raise HardwareError(f"dt must be a positive number of seconds (got {dt!r})")
         self.driver, self.dt = driver, float(dt)
         self._source: Source | None = source
         self._size, self._region, self._emergency = size, region, emergency
-        self._clock: Callable[[], float] = getattr(driver, "now", time.monotonic) if clock is None else clock
-        self._wait: Callable[[float], Any] = getattr(driver, "wait", time.sleep)
+        self._clock = driver.now
         #: number of commands that the driver's limits reduced
         self.reduced = 0
         #: readings during the loop, at most one a period
@@ -143,7 +138,7 @@ class HardwarePlant(Plant):
             return
         rest = self._begin + self._count * self.dt - self._clock()
         if rest > 0.0:
-            self._wait(rest)
+            self.driver.wait(rest)
         elif -rest > TOLERANCE * self.dt:
             self.missed += 1
             self._begin -= rest
@@ -157,7 +152,7 @@ class HardwarePlant(Plant):
         if self.driver.state is DriverState.FAULT:
             # before the fault is read: a board that restarted sends no readings
             self.driver.stop()
-            fault = getattr(self.driver, "fault", "") or self.driver.read().fault
+            fault = self.driver.fault or self.driver.read().fault
             raise HardwareError(fault_message(fault))
 
 

@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
+import io
 import os
-import struct
 import threading
 from collections.abc import Iterable
-from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import Any, NamedTuple, Self
@@ -46,7 +44,8 @@ class MessageEncoder:
         config: topics, order and units of the messages.
 
     Raises:
-        RecordingError: the configuration has motors in place of tensions.
+        RecordingError: the configuration has motors in place of tensions; from all methods: a wrong number of
+            tensions or bodies.
         ImportError: rosbags is not installed.
     """
 
@@ -70,11 +69,6 @@ class MessageEncoder:
         #: topics of all messages
         self.topics = [BagTopic(stream.topic, message_type(stream, 1)) for stream in streams]
 
-    @property
-    def command_topic(self) -> str | None:
-        """Topic of commands; None without commands."""
-        return self.config.command.topic if self.config.command else None
-
     def poses(
         self, stamp: int, position: Float[np.ndarray, "bodies 3"], quaternion: Float[np.ndarray, "bodies 4"]
     ) -> list[Encoded]:
@@ -84,9 +78,6 @@ class MessageEncoder:
             stamp: time of the measurement (ns since 1970).
             position: positions (m), in the order of `bodies`.
             quaternion: orientations, scalar first.
-
-        Raises:
-            RecordingError: the number of bodies is wrong.
         """
         scale = POSITION_UNITS[self.config.position_unit]
         values = np.concatenate([np.asarray(position) / scale, np.asarray(quaternion)], axis=1)
@@ -101,19 +92,13 @@ class MessageEncoder:
         """Return the message of measured tensions (N).
 
         There is none if one is not finite, as without a measurement, or without a topic for tensions.
-
-        Raises:
-            RecordingError: the number of tensions is wrong.
         """
         return self._tensions("tension", stamp, tension) if np.all(np.isfinite(tension)) else []
 
     def command(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
         """Return the message of commanded tensions (N); none if the configuration has no topic for it.
 
-        Text commands in grams-force are rounded to whole numbers.
-
-        Raises:
-            RecordingError: the number of tensions is wrong, or one is not finite.
+        Text commands in grams-force are rounded to whole numbers; one that is not finite is an error.
         """
         return self._tensions("command", stamp, tension)
 
@@ -142,15 +127,6 @@ class MessageEncoder:
         return Encoded(stream.topic, self._encode[stream.topic](stamp, 0, values))
 
 
-VERSION = b"#ROSBAG V2.0\n"
-#: record types
-MESSAGE, BAG, INDEX, CHUNK, CHUNK_INFO, CONNECTION = 0x02, 0x03, 0x04, 0x05, 0x06, 0x07
-#: size of the bag's first record (bytes), which is written again at the end
-FIRST_SIZE = 4096
-_long = struct.Struct("<I").pack
-_longer = struct.Struct("<Q").pack
-
-
 class BagMessage(NamedTuple):
     """Encoded message with its recording time (ns since 1970)."""
 
@@ -159,12 +135,24 @@ class BagMessage(NamedTuple):
     data: bytes
 
 
-@dataclasses.dataclass
-class _Chunk:
-    position: int
-    start: int
-    end: int
-    counts: dict[int, int]
+class _WholeFile(io.FileIO):
+    """File without a buffer, which a full disk would leave behind; writes are whole."""
+
+    def write(self, data: Any) -> int:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[super().write(rest) :]
+        return len(data)
+
+    def sync(self) -> None:
+        os.fsync(self.fileno())
+
+    def close(self) -> None:
+        try:
+            if not self.closed:
+                self.sync()
+        finally:
+            super().close()
 
 
 class BagStream:
@@ -181,38 +169,25 @@ class BagStream:
 
     def __init__(self, path: Path, topics: Iterable[BagTopic]):
         store = typestore(1)
-        self.path = path
-        self._numbers: dict[str, int] = {}
-        records = []
-        for topic in topics:
-            number = self._numbers.setdefault(topic.name, len(self._numbers))
-            definition, digest = store.generate_msgdef(topic.type)
-            fields = {
-                "topic": topic.name.encode(),
-                "type": topic.type.replace("/msg/", "/").encode(),
-                "md5sum": digest.encode(),
-                "message_definition": definition.encode(),
-            }
-            header = {"conn": _long(number), "topic": topic.name.encode()}
-            records.append(_record(CONNECTION, header, _fields(fields)))
-        self._connections = b"".join(records)
-        self._chunks: list[_Chunk] = []
-        # unbuffered: a failed write leaves no bytes that a later flush would write
-        self._file = path.open("xb", buffering=0)
-        #: end of the last complete chunk (bytes)
-        self._end = 0
+        from rosbags.rosbag1 import Writer
+
+        if path.exists():
+            raise FileExistsError(path)
+        self._bag = bag = Writer(path)
+        # a chunk ends where `write` says
+        bag.chunk_threshold = 1 << 40
+        bag.open()
+        assert bag.bio is not None
         try:
-            self._append(VERSION + self._first(0))
-            self._sync()
+            bag.bio.close()
+            self._file = _WholeFile(path, "r+b")
         except OSError:
-            self._file.close()
             path.unlink(missing_ok=True)
             raise
-
-    @property
-    def size(self) -> int:
-        """Size of the complete part of the file (bytes)."""
-        return self._end
+        bag.bio = self._file
+        #: end of the last complete chunk (bytes)
+        self._end = self._file.seek(0, os.SEEK_END)
+        self._connections = {topic.name: bag.add_connection(*topic, typestore=store) for topic in topics}
 
     def write(self, messages: list[BagMessage]) -> None:
         """Write messages as one chunk, and wait until the disk has it.
@@ -222,26 +197,15 @@ class BagStream:
         """
         if not messages:
             return
-        # the connections are repeated in the first chunk only
-        data, index = BytesIO(b"" if self._chunks else self._connections), dict[int, list[bytes]]()
-        data.seek(0, os.SEEK_END)
         for message in messages:
-            number = self._numbers[message.topic]
-            stamp = _stamp(message.received)
-            index.setdefault(number, []).append(stamp + _long(data.tell()))
-            data.write(_record(MESSAGE, {"conn": _long(number), "time": stamp}, message.data))
-        content = data.getvalue()
-        header = {"compression": b"none", "size": _long(len(content))}
-        parts = [_record(CHUNK, header, content)]
-        for number, entries in index.items():
-            header = {"ver": _long(1), "conn": _long(number), "count": _long(len(entries))}
-            parts.append(_record(INDEX, header, b"".join(entries)))
-        times = [message.received for message in messages]
-        counts = {number: len(entries) for number, entries in index.items()}
-        chunk = _Chunk(self._end, min(times), max(times), counts)
-        self._append(b"".join(parts))
-        self._chunks.append(chunk)
-        self._sync()
+            self._bag.write(self._connections[message.topic], message.received, message.data)
+        try:
+            self._bag.write_chunk(self._bag.chunks[-1])
+        except OSError:
+            self._file.truncate(self._end)
+            raise
+        self._end = self._file.tell()
+        self._file.sync()
 
     def finish(self) -> None:
         """Write the index at the file's end, and close it.
@@ -249,71 +213,16 @@ class BagStream:
         Raises:
             OSError: the disk is full, for example; the file has no index then.
         """
-        if self._file.closed:
-            return
         try:
-            position = self._end
-            parts = [self._connections]
-            for chunk in self._chunks:
-                header = {
-                    "ver": _long(1),
-                    "chunk_pos": _longer(chunk.position),
-                    "start_time": _stamp(chunk.start),
-                    "end_time": _stamp(chunk.end),
-                    "count": _long(len(chunk.counts)),
-                }
-                counts = b"".join(_long(number) + _long(count) for number, count in chunk.counts.items())
-                parts.append(_record(CHUNK_INFO, header, counts))
-            self._append(b"".join(parts))
-            self._sync()
-            self._file.seek(len(VERSION))
-            self._file.write(self._first(position))
-            self._sync()
-        finally:
-            self._file.close()
+            self._bag.close()
+        except OSError:
+            self._file.truncate(self._end)
+            raise
 
     def close(self) -> None:
         """Close the file without an index. Never raises."""
-        self._file.close()
-
-    def _first(self, index: int) -> bytes:
-        header = {
-            "index_pos": _longer(index),
-            "conn_count": _long(len(self._numbers)),
-            "chunk_count": _long(len(self._chunks)),
-        }
-        size = len(_record(BAG, header, b""))
-        return _record(BAG, header, b" " * (FIRST_SIZE - size))
-
-    def _append(self, data: bytes) -> None:
-        """Write bytes at the end; after an error the file is cut to its former size."""
-        rest = memoryview(data)
-        try:
-            while rest:
-                rest = rest[self._file.write(rest) :]
-        except OSError:
-            self._file.truncate(self._end)
-            self._file.seek(self._end)
-            raise
-        self._end += len(data)
-
-    def _sync(self) -> None:
-        os.fsync(self._file.fileno())
-
-
-def _record(kind: int, header: dict[str, bytes], data: bytes) -> bytes:
-    fields = _fields({"op": bytes([kind]), **header})
-    return _long(len(fields)) + fields + _long(len(data)) + data
-
-
-def _fields(values: dict[str, bytes]) -> bytes:
-    return b"".join(
-        _long(len(name) + 1 + len(value)) + name.encode() + b"=" + value for name, value in values.items()
-    )
-
-
-def _stamp(time: int) -> bytes:
-    return struct.pack("<II", time // 10**9, time % 10**9)
+        with contextlib.suppress(OSError):
+            self._file.close()
 
 
 #: default time between two writes to the disk (s)
@@ -329,7 +238,8 @@ class Recorder:
     A thread writes to the disk, so that no call waits for it. While it records, the file is `run.bag.active`,
     which `load_recording` reads too; at the end it is renamed. A killed process loses what was added in the
     last `interval`, and what is being written. On a full disk the file keeps everything up to the last
-    complete chunk, and the next call raises an error.
+    complete chunk, and the next call raises a `HardwareError`. Values of a wrong number raise a
+    `RecordingError`.
 
     Args:
         path: the bag; its name ends in .bag. An existing file is never replaced.
@@ -392,30 +302,15 @@ class Recorder:
             raise HardwareError(f"{self.path}: cannot be written: {error.strerror}") from None
 
     def add_reading(self, reading: Reading) -> None:
-        """Add the measured tensions of a reading; one without a measurement (NaN) has no message.
-
-        Raises:
-            HardwareError: an earlier message could not be written.
-            RecordingError: the number of tensions is wrong.
-        """
+        """Add the measured tensions of a reading; one without a measurement (NaN) has no message."""
         self._add(self.encoder.tension(self.clock.stamp(reading.time), reading.tension))
 
     def add_poses(self, frame: PoseFrame) -> None:
-        """Add the poses of all bodies in the order of `encoder.bodies`; a lost body (NaN) has no message.
-
-        Raises:
-            HardwareError: an earlier message could not be written.
-            RecordingError: the number of bodies is wrong.
-        """
+        """Add the poses of all bodies in the order of `encoder.bodies`; a lost body (NaN) has no message."""
         self._add(self.encoder.poses(self.clock.stamp(frame.time), frame.position, frame.quaternion))
 
     def add_command(self, tension: Float[np.ndarray, " c"], time: float | None = None) -> None:
-        """Add commanded tensions (N), at a time (s, monotonic); now if None.
-
-        Raises:
-            HardwareError: an earlier message could not be written.
-            RecordingError: the number of tensions is wrong, or one is not finite.
-        """
+        """Add commanded tensions (N), all finite, at a time (s, monotonic); now if None."""
         self._add(self.encoder.command(self.clock.stamp(self.clock.now() if time is None else time), tension))
 
     def close(self) -> None:

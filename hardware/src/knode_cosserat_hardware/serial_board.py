@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -105,13 +105,6 @@ RUNNING_TIME = 0.5
 FIRST_LINE = 5.0
 
 
-class StartedBoard(NamedTuple):
-    """Number of tendons of a board, and the greatest tension that it accepts (N, None if it states none)."""
-
-    tendons: int
-    high: float | None
-
-
 def find_board(link: BoardLink, timeout: float) -> None:
     """Wait (s) for a board's banner or a running one's telemetry: a boot loader would take other lines."""
     opened = link.transport.now()
@@ -123,7 +116,7 @@ def find_board(link: BoardLink, timeout: float) -> None:
     link.until(is_there, min(FIRST_LINE, timeout))
 
 
-def negotiate(link: BoardLink, protocol: int, tendons: int, timeout: float) -> StartedBoard:
+def negotiate(link: BoardLink, protocol: int, tendons: int, timeout: float) -> tuple[int, float | None]:
     """Choose framed or plain lines, and wait (s) until a framed board has tared or has a fault.
 
     Args:
@@ -131,6 +124,9 @@ def negotiate(link: BoardLink, protocol: int, tendons: int, timeout: float) -> S
         protocol: 2, or 1 for plain lines.
         tendons: number of tendons of a plain board.
         timeout: longest wait for the end of taring (s).
+
+    Returns:
+        The board's number of tendons, and the greatest tension that it accepts (N; None if it states none).
     """
     offered = link.banner.protocol if link.banner else protocol
     answer = None
@@ -139,10 +135,23 @@ def negotiate(link: BoardLink, protocol: int, tendons: int, timeout: float) -> S
             if answer := link.hello(2, 0.5):
                 break
     if answer is None:
-        return _start_plain(link, tendons)
+        if link.until(lambda: link.telemetry, 1.0) is None:
+            raise HardwareError(
+                f"{link.transport.name}: no answer; check that this is the board's port, its power, "
+                "and that 115200 baud is its speed"
+            )
+        link.mode = "plain"
+        _require_tendons(link, tendons)
+        return tendons, None
     with link.lock:
         link.mode, link.telemetry = "framed", None
-    started = _stated(link, answer.values)
+    try:
+        # `2 knode-tension 1.0.0 TENDONS RATE LIMIT`
+        tendons, high = int(answer.values[3]), int(answer.values[5]) * GRAM_FORCE
+    except (IndexError, ValueError):
+        raise HardwareError(
+            f"{link.transport.name}: the answer to hello is not understood ({' '.join(answer.values)[:60]})"
+        ) from None
     # taring moves the motors; the link feeds the watchdog meanwhile
     settled = ("ready", "armed", "fault")
     if not link.until(lambda: link.telemetry and link.telemetry.state in settled, timeout):
@@ -150,37 +159,17 @@ def negotiate(link: BoardLink, protocol: int, tendons: int, timeout: float) -> S
             f"{link.transport.name}: the board was not ready in {timeout:g} s; check the tendons, "
             "or turn off the setting tare_on_start"
         )
-    return _checked(link, started)
+    _require_tendons(link, tendons)
+    return tendons, high
 
 
-def _start_plain(link: BoardLink, tendons: int) -> StartedBoard:
-    if link.until(lambda: link.telemetry, 1.0) is None:
-        raise HardwareError(
-            f"{link.transport.name}: no answer; check that this is the board's port, its power, "
-            "and that 115200 baud is its speed"
-        )
-    link.mode = "plain"
-    return _checked(link, StartedBoard(tendons, None))
-
-
-def _stated(link: BoardLink, values: tuple[str, ...]) -> StartedBoard:
-    """Return what the answer to hello states: `2 knode-tension 1.0.0 TENDONS RATE LIMIT`."""
-    try:
-        return StartedBoard(int(values[3]), int(values[5]) * GRAM_FORCE)
-    except (IndexError, ValueError):
-        raise HardwareError(
-            f"{link.transport.name}: the answer to hello is not understood ({' '.join(values)[:60]})"
-        ) from None
-
-
-def _checked(link: BoardLink, started: StartedBoard) -> StartedBoard:
+def _require_tendons(link: BoardLink, tendons: int) -> None:
     count = len(link.telemetry.tension) if link.telemetry else 0
-    if count != started.tendons:
+    if count != tendons:
         raise HardwareError(
-            f"{link.transport.name}: the board sends {count} tensions (expected {started.tendons}); "
+            f"{link.transport.name}: the board sends {count} tensions (expected {tendons}); "
             "give the right tendon_count"
         )
-    return started
 
 
 #: age of telemetry at which a command is refused (s): 25 lines were lost
@@ -295,12 +284,12 @@ class SerialBoard(Driver):
             raise
 
     def _negotiate(self, link: BoardLink) -> None:
-        started = negotiate(link, self._protocol, self.tendon_count, self._start_timeout)
+        tendons, high = negotiate(link, self._protocol, self.tendon_count, self._start_timeout)
         limits = self.limits
-        if started.high is not None and started.high < limits.high:
-            limits = dataclasses.replace(limits, high=started.high)
-        self._limiter = TensionLimiter(limits, started.tendons)
-        self.limits, self.tendon_count = limits, started.tendons
+        if high is not None and high < limits.high:
+            limits = dataclasses.replace(limits, high=high)
+        self._limiter = TensionLimiter(limits, tendons)
+        self.limits, self.tendon_count = limits, tendons
 
     def close(self) -> None:
         """Release the tendons and close the port. Never raises."""
@@ -316,12 +305,17 @@ class SerialBoard(Driver):
         link.close()
 
     def wait(self, seconds: float) -> None:
-        """Wait (s) while the board's watchdog is fed.
-
-        Raises:
-            HardwareError: the connection is lost.
-        """
+        """Wait (s) while the board's watchdog is fed."""
         self._connected().until(lambda: None, seconds)
+
+    def now(self) -> float:
+        """Return the time on the transport's clock (s)."""
+        return self._port.now() if isinstance(self._port, Transport) else super().now()
+
+    def advance(self, seconds: float) -> None:
+        """Let time pass (s) without a sign of life to the board."""
+        if self._link is not None:
+            self._link.transport.advance(seconds)
 
     # motion
 
@@ -490,10 +484,6 @@ class SerialBoard(Driver):
 
     def _board_state(self, link: BoardLink) -> str:
         return link.telemetry.state if link.telemetry else ""
-
-    def _require_no_fault(self) -> None:
-        if self.fault:
-            raise HardwareError(fault_message(self.fault))
 
     def _expect(
         self, link: BoardLink, condition: Callable[[], bool], timeout: float, problem: str, check: bool = True

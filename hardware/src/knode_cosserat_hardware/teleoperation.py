@@ -7,7 +7,6 @@ import dataclasses
 import errno
 import os
 import struct
-import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, Protocol
@@ -47,13 +46,6 @@ class InputDevice(Protocol):
 
     def close(self) -> None:
         """Close the device."""
-
-
-class WishMap(Protocol):
-    """Map from a device's wishes to tensions: `TensionMap` for a `Wish`, a `SliderWindow` for its own."""
-
-    def tensions(self, wish: Any) -> Float[np.ndarray, " c"]:
-        """Return the tensions (N) of a wish."""
 
 
 class Gamepad:
@@ -197,7 +189,7 @@ class TensionMap:
 def teleoperate(
     driver: Driver,
     device: InputDevice,
-    mapping: WishMap,
+    mapping: TensionMap | None,
     emergency: EmergencyStop,
     *,
     seconds: float = np.inf,
@@ -209,7 +201,7 @@ def teleoperate(
     Args:
         driver: a connected driver; it is armed, and disarmed at the end.
         device: gamepad, keyboard or window of sliders.
-        mapping: map from wishes to tensions.
+        mapping: map from wishes to tensions; None for sliders, whose wishes are tensions.
         emergency: emergency stop around it.
         seconds: duration (s).
         dt: time between commands (s).
@@ -218,19 +210,18 @@ def teleoperate(
     Raises:
         HardwareError: the robot has a fault, or the device is lost; the robot was stopped.
     """
-    wait: Callable[[float], Any] = getattr(driver, "wait", time.sleep)
     count = 0
     try:
         driver.arm()
         while count * dt < seconds:
             emergency.check()
             wish = device.wish()
-            sent = driver.command(mapping.tensions(wish))
+            sent = driver.command(wish if mapping is None else mapping.tensions(wish))
             reading = driver.read()
             if shown is not None:
                 shown(wish, list(sent), reading)
             count += 1
-            wait(dt)
+            driver.wait(dt)
     except HardwareError:
         emergency.stop("an error")
         raise
@@ -247,11 +238,11 @@ HEIGHT = 260
 class SliderWindow:
     """Window of sliders for `teleoperate`. Space, Escape and closing the window stop the robot too.
 
-    Its map from wishes to tensions is itself: a wish is the tensions (N) of the sliders.
+    A wish is the tensions (N) of the sliders.
 
         window = SliderWindow(driver.tendon_count, 0.2, 5.0)
         with EmergencyStop(driver) as emergency, contextlib.closing(window):
-            teleoperate(driver, window, window, emergency, shown=window.show)
+            teleoperate(driver, window, None, emergency, shown=window.show)
 
     All calls must come from the main thread.
 
@@ -325,10 +316,6 @@ class SliderWindow:
         if self._stopped:
             raise HardwareError(f"{self._stopped}; the robot was stopped")
         return np.clip([float(scale.get()) for scale in self._scales], self.low, self.high)
-
-    def tensions(self, wish: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
-        """Return the tensions of a wish: they are the same."""
-        return np.asarray(wish, dtype=float)
 
     def show(self, wish: Any, sent: Any, reading: Reading) -> None:
         """Show the state and the measured tensions of a reading."""

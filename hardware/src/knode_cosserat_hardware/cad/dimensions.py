@@ -6,6 +6,7 @@ import dataclasses
 import itertools
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -97,6 +98,11 @@ class Spool:
     def centre(self) -> float:
         """Distance from the hub's end to the middle of the drum."""
         return self.hub_length + self.flange_thickness + self.width / 2.0
+
+    @property
+    def face_distance(self) -> float:
+        """Distance along the motor's axis from the tendon to the bracket's face."""
+        return PLAY + self.centre
 
 
 @dataclasses.dataclass(frozen=True)
@@ -213,189 +219,6 @@ class Bracket:
 DEAD_TURNS = 3
 #: tolerance of comparisons (mm)
 EPSILON = 1e-9
-
-
-def _require(is_met: bool, message: str) -> None:
-    if not is_met:
-        raise PartError(message)
-
-
-def _metres(length: float) -> str:
-    """Return a length in mm as text in m, as it is written in robot files."""
-    return f"{length / 1e3:.4g}"
-
-
-def _gap(points: tuple[tuple[float, float], ...]) -> float:
-    """Return the least distance of two points."""
-    return min((math.dist(a, b) for a, b in itertools.combinations(points, 2)), default=math.inf)
-
-
-def require_tendons(rib: Rib, rod_radius: float) -> None:
-    """Check the walls of a rib between rod, tendons and rim.
-
-    Raises:
-        PartError: a wall is thinner than 1 mm.
-    """
-    hole = rib.tendon_hole / 2.0
-    least = 2.0 * (rib.tendon_radius + hole + MIN_WALL)
-    _require(
-        2.0 * rib.outer_radius >= least - EPSILON,
-        f"hardware.rib_diameter must be at least {_metres(least)} m, for walls of {MIN_WALL:g} mm around the "
-        f"tendons' holes (got {_metres(2.0 * rib.outer_radius)}); or reduce tendon_offset",
-    )
-    least = rib.hub_radius + hole + MIN_WALL
-    _require(
-        rib.tendon_radius >= least - EPSILON,
-        f"tendon_offset must be at least {_metres(least)} m, for a hub around the rod of radius "
-        f"{_metres(rod_radius)} m (got {_metres(rib.tendon_radius)})",
-    )
-    least = rib.tendon_hole + MIN_WALL
-    _require(
-        _gap(rib.tendon_holes) >= least - EPSILON,
-        f"tendon_angles must keep holes {_metres(least)} m apart (got {_metres(_gap(rib.tendon_holes))}); "
-        f"tendons must not share a hole",
-    )
-
-
-def require_ribs(rib: Rib, heights: tuple[float, ...], length: float) -> None:
-    """Check that the ribs are on the rod and do not touch each other.
-
-    Raises:
-        PartError: ribs overlap, or one is not on the rod.
-    """
-    for below, height in itertools.pairwise((0.0, *heights)):
-        _require(
-            height <= length + EPSILON and height - rib.hub_height >= below + MIN_WALL - EPSILON,
-            f"ribs must be at least {_metres(rib.hub_height + MIN_WALL)} m apart, above the base and below "
-            f"the tip at {_metres(length)} m (got {_metres(below)} and {_metres(height)}); use fewer ribs",
-        )
-
-
-def capacity(spool: Spool) -> float:
-    """Return the length of tendon that fits on a spool in one layer (mm)."""
-    turns = math.floor(spool.width / TENDON + EPSILON) - DEAD_TURNS
-    return max(turns, 0) * 2.0 * math.pi * (spool.drum_radius + TENDON / 2.0)
-
-
-def require_spool(spool: Spool, given: Dimensions, travel: float) -> None:
-    """Check a spool's walls and its capacity.
-
-    Raises:
-        PartError: a wall is too thin, or the tendon's travel does not fit on it.
-    """
-    least = spool.bore / 2.0 + MIN_WALL + TENDON / 2.0
-    _require(
-        spool.drum_radius - spool.bore / 2.0 >= MIN_WALL - EPSILON,
-        f"hardware.spool_radius must be at least {_metres(least)} m for the shaft "
-        f"(got {given.spool_radius:g})",
-    )
-    least = spool.tie_hole + 2.0 * MIN_WALL
-    _require(
-        1e3 * given.flange_height >= least - EPSILON,
-        f"hardware.flange_height must be at least {_metres(least)} m, for the hole that ties the tendon "
-        f"(got {given.flange_height:g})",
-    )
-    _require(
-        capacity(spool) >= travel - EPSILON,
-        f"hardware.spool_width must hold {_metres(travel)} m of tendon in one layer (got room for "
-        f"{_metres(capacity(spool))} m); use a wider spool or a larger spool_radius",
-    )
-    _require(
-        spool.across_flat - spool.bore / 2.0 >= MIN_WALL / 2.0 and spool.hub_length <= SHAFT_LENGTH,
-        f"hardware.shaft_diameter must be at least 0.002 m (got {given.shaft_diameter:g})",
-    )
-
-
-def require_base(base: Base) -> None:
-    """Check the base's walls, socket and mounting holes.
-
-    Raises:
-        PartError: a wall is thinner than allowed, or holes touch.
-    """
-    least = base.rod_hole / 2.0 + 4.0 + base.passage / 2.0 + 0.5
-    _require(
-        base.column_radius - base.rod_hole / 2.0 >= 4.0 - EPSILON,
-        f"tendon_offset must be at least {_metres(least)} m, for the base's column between the tendons "
-        f"(got {_metres(base.tendon_radius)})",
-    )
-    _require(
-        base.screw_depths[1] >= base.screw_depths[0] + 6.0 - EPSILON,
-        f"hardware.base_height must be at least 0.033 m, for the rod's socket (got {_metres(base.height)})",
-    )
-    least = 2.0 * (base.tendon_radius + base.eyelet / 2.0 + MIN_WALL)
-    _require(
-        2.0 * base.top_radius >= least - EPSILON,
-        f"hardware.rib_diameter must be at least {_metres(least)} m: the base's top has this diameter and "
-        f"leads the tendons (got {_metres(2.0 * base.top_radius)})",
-    )
-    _require(
-        _gap(base.eyelets) >= base.passage + MIN_WALL,
-        f"tendon_angles must keep the base's passages {_metres(base.passage + MIN_WALL)} m apart "
-        f"(got {_metres(_gap(base.eyelets))})",
-    )
-    rim = max(base.mount_radius + base.mount_hole / 2.0, base.tendon_radius + base.passage / 2.0) + MIN_WALL
-    _require(
-        base.flange_radius >= rim - EPSILON,
-        f"hardware.base_diameter must be at least {_metres(2.0 * rim)} m, for its holes "
-        f"(got {_metres(2.0 * base.flange_radius)})",
-    )
-    _require_mount_holes(base)
-
-
-def _require_mount_holes(base: Base) -> None:
-    holes, head = base.mount_holes, 2.0 * base.mount_hole
-    near = min(math.dist(a, b) for a in holes for b in base.eyelets)
-    apart = near >= (base.mount_hole + base.passage) / 2.0 + MIN_WALL
-    _require(
-        apart
-        and _gap(holes) >= base.mount_hole + MIN_WALL
-        and base.mount_radius >= base.column_radius + head / 2.0,
-        f"hardware.mount_diameter must keep the mounting holes clear of the tendons, the column and each "
-        f"other (got {_metres(2.0 * base.mount_radius)}); change mount_diameter or mount_hole_count",
-    )
-
-
-def require_plate(plate: Plate, base: Base, outlines: list[tuple[np.ndarray, np.ndarray]]) -> None:
-    """Check that motors, spools, legs and screws below the plate do not touch.
-
-    Args:
-        plate: the motor plate.
-        base: the base that stands on it.
-        outlines: corners of each tendon's spool, and of its motor with the load cell.
-
-    Raises:
-        PartError: two of them overlap.
-    """
-    for (k, first), (j, second) in itertools.combinations(enumerate(outlines), 2):
-        touch = any(_overlap(a, b) for a in first for b in second)
-        _require(
-            not touch,
-            f"tendon_offset must be larger: motors {k + 1} and {j + 1} overlap below the plate "
-            f"(got {_metres(base.tendon_radius)} m); or use a smaller motor or spool, or even tendon_angles",
-        )
-    for hole in plate.leg_holes:
-        leg = np.asarray(hole) + 5.0 * np.asarray(on_circle(math.sqrt(2.0), tuple(_SQUARE)))
-        _require(
-            not any(_overlap(leg, part) for pair in outlines for part in pair),
-            f"tendon_angles must leave room for legs between the motors (got a plate of radius "
-            f"{_metres(plate.radius)} m); use even angles or a smaller motor_diameter",
-        )
-
-
-_SQUARE = [math.pi * (0.25 + 0.5 * k) for k in range(4)]
-
-
-def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
-    """True if two convex outlines overlap: no edge of either separates them."""
-    for outline in (a, b):
-        edges = np.roll(outline, -1, axis=0) - outline
-        normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
-        along_a, along_b = a @ normals.T, b @ normals.T
-        if np.any((along_a.max(0) <= along_b.min(0)) | (along_b.max(0) <= along_a.min(0))):
-            return False
-    return True
-
-
 #: over-tension limit of the board: 2300 grams-force (N)
 BOARD_LIMIT = 2300 * GRAM_FORCE
 #: thicknesses of aluminium bar in stock (mm)
@@ -404,33 +227,21 @@ STOCK = (1.5, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 ALUMINIUM, MAX_STRAIN = 69000.0, 1.0e-3
 #: angle by which the robot may bend to either side (rad), and length of tendon in reserve (mm)
 BEND, RESERVE = math.pi, 20.0
+#: outlines of a tendon's spool, and of its motor with the load cell: corners in the robot's frame
+Outlines = tuple[np.ndarray, np.ndarray]
 
 
 @dataclasses.dataclass(frozen=True)
 class PartDimensions:
-    """Dimensions of all parts of a robot, in mm and rad; z = 0 is the rod's clamped end.
+    """Dimensions of all parts of a robot, in mm and rad; z = 0 is the rod's clamped end."""
 
-    Attributes:
-        rod_length: length of the rod above its clamped end.
-        rod_radius: radius of the rod.
-        angles: angles of the tendons around the rod.
-        tendon_radius: distance of the tendons from the rod's axis.
-        rib_heights: heights of the upper faces of the ribs' disks.
-        rib: dimensions of a rib.
-        spool: dimensions of a spool.
-        base: dimensions of the base.
-        plate: dimensions of the motor plate.
-        cell: dimensions of a load cell.
-        mount: dimensions of a load-cell mount.
-        bracket: dimensions of a motor bracket.
-        motor_radius: radius of the motors.
-        marker_diameter: diameter of the motion-capture markers.
-    """
-
+    #: length of the rod above its clamped end, and its radius
     rod_length: float
     rod_radius: float
+    #: angles of the tendons around the rod, and their distance from its axis
     angles: tuple[float, ...]
     tendon_radius: float
+    #: heights of the upper faces of the ribs' disks
     rib_heights: tuple[float, ...]
     rib: Rib
     spool: Spool
@@ -440,17 +251,13 @@ class PartDimensions:
     mount: Mount
     bracket: Bracket
     motor_radius: float
+    #: diameter of the motion-capture markers
     marker_diameter: float
 
     @property
     def axis_depth(self) -> float:
         """Depth of the motors' axes below the plate."""
         return self.mount.height + self.cell.thickness - self.bracket.axis[1]
-
-    @property
-    def face_distance(self) -> float:
-        """Distance along the motor's axis from the tendon to the bracket's face."""
-        return PLAY + self.spool.centre
 
     @property
     def leg_length(self) -> float:
@@ -461,7 +268,7 @@ class PartDimensions:
     @property
     def travel(self) -> float:
         """Length of tendon that a spool takes in or gives out if the rod bends by half a turn either way."""
-        return 2.0 * self.tendon_radius * BEND + RESERVE
+        return _travel(self.tendon_radius)
 
     @property
     def rod_stock(self) -> float:
@@ -490,32 +297,45 @@ def part_dimensions(robot: System, hardware: HardwareDescription | None = None) 
         PartError: parts of this robot cannot be made.
     """
     hardware = HardwareDescription() if hardware is None else hardware
-    given = hardware.dimensions
+    sizes = hardware.dimensions
     length, radius, offset, angles = _tendons(robot)
-    rib = _rib(given, radius, offset, angles)
-    heights = _rib_heights(robot, given, length)
-    require_tendons(rib, radius)
-    require_ribs(rib, heights, length)
-    spool = _spool(given)
-    require_spool(spool, given, 2.0 * offset * BEND + RESERVE)
-    base = _base(given, rib)
-    require_base(base)
-    motor_radius = 500.0 * given.motor_diameter
-    cell = _cell(max(hardware.tension.high, BOARD_LIMIT), PLAY + spool.centre)
-    bracket = _bracket(1e3 * given.spool_radius, motor_radius, cell)
-    depth = cell.thickness - bracket.axis[1]
-    mount = Mount(
-        cell.end,
-        cell.width,
-        max(2.0 * HEAD, spool.flange_radius + 2.0 - depth),
-        (cell.end / 4, 0.75 * cell.end),
-    )
-    plate = _plate(base, spool, cell, bracket)
-    require_plate(plate, base, _rectangles(base, spool, cell, bracket))
+    rib = _rib(sizes, radius, offset, angles)
+    heights = _rib_heights(robot, sizes, length, rib.hub_height)
+    spool = _spool(sizes, _travel(offset))
+    base = _base(sizes, rib)
+    cell = _cell(max(hardware.tension.high, BOARD_LIMIT), spool.face_distance)
+    bracket = _bracket(1e3 * sizes.spool_radius, 500.0 * sizes.motor_diameter, cell)
+    height = max(2.0 * HEAD, spool.flange_radius + 2.0 - (cell.thickness - bracket.axis[1]))
+    mount = Mount(cell.end, cell.width, height, (cell.end / 4, 0.75 * cell.end))
     return PartDimensions(
-        length, radius, angles, offset, heights, rib, spool, base, plate, cell, mount, bracket,
-        motor_radius, 1e3 * given.marker_diameter,
+        length, radius, angles, offset, heights, rib, spool, base, _plate(base, spool, cell, bracket), cell,
+        mount, bracket, bracket.motor_radius, 1e3 * sizes.marker_diameter,
     )  # fmt: skip
+
+
+def _require(is_met: Any, message: str) -> None:
+    if not is_met:
+        raise PartError(message)
+
+
+def _require_least(name: str, value: float, least: float, reason: str, fix: str = "") -> None:
+    """Check that a length (mm), which robot files have in m under this name, is large enough."""
+    message = f"{name} must be at least {_metres(least)} m, {reason} (got {_metres(value)})"
+    _require(value >= least - EPSILON, f"{message}; {fix}" if fix else message)
+
+
+def _metres(length: float) -> str:
+    """Return a length in mm as text in m, as it is written in robot files."""
+    return f"{length / 1e3:.4g}"
+
+
+def _gap(points: Points) -> float:
+    """Return the least distance of two points."""
+    return min((math.dist(a, b) for a, b in itertools.combinations(points, 2)), default=math.inf)
+
+
+def _travel(tendon_radius: float) -> float:
+    return 2.0 * tendon_radius * BEND + RESERVE
 
 
 def _tendons(robot: System) -> tuple[float, float, float, tuple[float, ...]]:
@@ -528,82 +348,129 @@ def _tendons(robot: System) -> tuple[float, float, float, tuple[float, ...]]:
             f"with tendon_offset and tendon_angles (got {type(robot).__name__})"
         )
     around = tuple(float(angle) for angle in np.asarray(angles))
-    if len(around) != 4:
-        raise PartError(f"tendon_angles must have 4 angles: the board drives 4 motors (got {len(around)})")
+    _require(
+        len(around) == 4, f"tendon_angles must have 4 angles: the board drives 4 motors (got {len(around)})"
+    )
     length, radius = float(np.asarray(robot.length)), float(np.asarray(getattr(robot, "radius", np.nan)))
     return 1e3 * length, 1e3 * radius, 1e3 * float(np.asarray(offset)), around
 
 
-def _rib_heights(robot: System, given: Dimensions, length: float) -> tuple[float, ...]:
-    """Return the positions of ribs: those of attached masses, or equal distances up to the tip (mm)."""
-    at = [
-        float(np.asarray(load.at))
-        for load in getattr(robot, "loads", ())
-        if getattr(load, "kind", "") == "attached-mass"
-    ]
-    fractions = sorted(at) or [(k + 1) / given.rib_count for k in range(given.rib_count)]
-    return tuple(length * fraction for fraction in fractions)
-
-
-def _rib(given: Dimensions, radius: float, offset: float, angles: tuple[float, ...]) -> Rib:
-    rod_hole = 2.0 * radius + 1e3 * given.rod_clearance
-    outer, thickness, hole = 500 * given.rib_diameter, 1e3 * given.rib_thickness, 1e3 * given.hole_diameter
+def _rib(sizes: Dimensions, radius: float, offset: float, angles: tuple[float, ...]) -> Rib:
+    rod_hole = 2.0 * radius + 1e3 * sizes.rod_clearance
+    outer, thickness, hole = 500 * sizes.rib_diameter, 1e3 * sizes.rib_thickness, 1e3 * sizes.hole_diameter
     hub = rod_hole / 2.0 + 3.0
     window = (hub + 1.0, outer - max(2.5, 2.0 * MIN_WALL))
-    return Rib(
-        outer_radius=outer,
-        thickness=thickness,
-        rod_hole=rod_hole,
-        hub_radius=hub,
-        hub_height=thickness + 5.0,
-        tendon_hole=hole,
-        tendon_radius=offset,
-        angles=angles,
-        spoke_width=max(6.0, hole + 4.0 * MIN_WALL),
-        window=window if window[1] - window[0] >= 4.0 else None,
+    rib = Rib(
+        outer_radius=outer, thickness=thickness, rod_hole=rod_hole, hub_radius=hub,
+        hub_height=thickness + 5.0, tendon_hole=hole, tendon_radius=offset, angles=angles,
+        spoke_width=max(6.0, hole + 4.0 * MIN_WALL), window=window if window[1] - window[0] >= 4.0 else None,
+    )  # fmt: skip
+    _require_least(
+        "hardware.rib_diameter", 2.0 * outer, 2.0 * (offset + hole / 2.0 + MIN_WALL),
+        f"for walls of {MIN_WALL:g} mm around the tendons' holes", "or reduce tendon_offset",
+    )  # fmt: skip
+    _require_least(
+        "tendon_offset", offset, hub + hole / 2.0 + MIN_WALL,
+        f"for a hub around the rod of radius {_metres(radius)} m",
+    )  # fmt: skip
+    least, gap = hole + MIN_WALL, _gap(rib.tendon_holes)
+    _require(
+        gap >= least - EPSILON,
+        f"tendon_angles must keep holes {_metres(least)} m apart (got {_metres(gap)}); "
+        "tendons must not share a hole",
     )
+    return rib
 
 
-def _spool(given: Dimensions) -> Spool:
-    radius, bore = 1e3 * given.spool_radius, 1e3 * given.shaft_diameter + SHAFT_FIT
-    return Spool(
-        drum_radius=radius - TENDON / 2.0,
-        width=1e3 * given.spool_width,
-        flange_radius=radius + 1e3 * given.flange_height,
-        flange_thickness=1.5,
-        hub_radius=bore / 2.0 + 3.5,
-        hub_length=6.0,
-        bore=bore,
-        across_flat=bore - SHAFT_CUT,
-        tie_hole=2.0 * TENDON + 0.2,
+def _rib_heights(robot: System, sizes: Dimensions, length: float, hub: float) -> tuple[float, ...]:
+    """Return the positions of ribs: those of attached masses, or equal distances up to the tip (mm)."""
+    masses = [load for load in getattr(robot, "loads", ()) if getattr(load, "kind", "") == "attached-mass"]
+    fractions = sorted(float(np.asarray(mass.at)) for mass in masses)
+    fractions = fractions or [(k + 1) / sizes.rib_count for k in range(sizes.rib_count)]
+    heights = tuple(length * fraction for fraction in fractions)
+    for below, height in itertools.pairwise((0.0, *heights)):
+        _require(
+            height <= length + EPSILON and height - hub >= below + MIN_WALL - EPSILON,
+            f"ribs must be at least {_metres(hub + MIN_WALL)} m apart, above the base and below "
+            f"the tip at {_metres(length)} m (got {_metres(below)} and {_metres(height)}); use fewer ribs",
+        )
+    return heights
+
+
+def capacity(spool: Spool) -> float:
+    """Return the length of tendon that fits on a spool in one layer (mm)."""
+    turns = math.floor(spool.width / TENDON + EPSILON) - DEAD_TURNS
+    return max(turns, 0) * 2.0 * math.pi * (spool.drum_radius + TENDON / 2.0)
+
+
+def _spool(sizes: Dimensions, travel: float) -> Spool:
+    radius, bore = 1e3 * sizes.spool_radius, 1e3 * sizes.shaft_diameter + SHAFT_FIT
+    spool = Spool(
+        drum_radius=radius - TENDON / 2.0, width=1e3 * sizes.spool_width,
+        flange_radius=radius + 1e3 * sizes.flange_height, flange_thickness=1.5, hub_radius=bore / 2.0 + 3.5,
+        hub_length=6.0, bore=bore, across_flat=bore - SHAFT_CUT, tie_hole=2.0 * TENDON + 0.2,
+    )  # fmt: skip
+    _require_least(
+        "hardware.spool_radius", radius, bore / 2.0 + MIN_WALL + TENDON / 2.0, "for the motor's shaft"
     )
+    _require_least(
+        "hardware.flange_height", 1e3 * sizes.flange_height, spool.tie_hole + 2.0 * MIN_WALL,
+        "for the hole that ties the tendon",
+    )  # fmt: skip
+    _require(
+        capacity(spool) >= travel - EPSILON,
+        f"hardware.spool_width must hold {_metres(travel)} m of tendon in one layer (got room for "
+        f"{_metres(capacity(spool))} m); use a wider spool or a larger spool_radius",
+    )
+    _require(
+        spool.across_flat - bore / 2.0 >= MIN_WALL / 2.0 and spool.hub_length <= SHAFT_LENGTH,
+        f"hardware.shaft_diameter must be at least 0.002 m (got {sizes.shaft_diameter:g})",
+    )
+    return spool
 
 
-def _base(given: Dimensions, rib: Rib) -> Base:
-    height, passage, offset = 1e3 * given.base_height, 4.0, rib.tendon_radius
-    between = sorted(angle % (2.0 * math.pi) for angle in rib.angles)
-    first = (between[0] + between[1]) / 2.0
-    socket = min(40.0, height - 8.0)
-    count = given.mount_hole_count
-    return Base(
-        flange_radius=500.0 * given.base_diameter,
-        flange_thickness=6.0,
-        height=height,
+def _base(sizes: Dimensions, rib: Rib) -> Base:
+    height, passage, offset = 1e3 * sizes.base_height, 4.0, rib.tendon_radius
+    around = sorted(angle % (2.0 * math.pi) for angle in rib.angles)
+    first = (around[0] + around[1]) / 2.0
+    socket, count = min(40.0, height - 8.0), sizes.mount_hole_count
+    base = Base(
+        flange_radius=500.0 * sizes.base_diameter, flange_thickness=6.0, height=height,
         column_radius=min(rib.rod_hole / 2.0 + 7.0, offset - passage / 2.0 - 0.5),
-        top_radius=rib.outer_radius,
-        top_thickness=8.0,
-        rod_hole=rib.rod_hole,
-        socket_depth=socket,
-        eyelet=SLEEVE,
-        passage=passage,
-        tendon_radius=offset,
-        angles=rib.angles,
-        mount_radius=500.0 * given.mount_diameter,
-        mount_hole=1e3 * given.mount_hole_diameter,
+        top_radius=rib.outer_radius, top_thickness=8.0, rod_hole=rib.rod_hole, socket_depth=socket,
+        eyelet=SLEEVE, passage=passage, tendon_radius=offset, angles=rib.angles,
+        mount_radius=500.0 * sizes.mount_diameter, mount_hole=1e3 * sizes.mount_hole_diameter,
         mount_angles=tuple(first + 2.0 * math.pi * k / count for k in range(count)),
-        screw_depths=(13.0, socket - 6.0),
-        screw_angle=first,
+        screw_depths=(13.0, socket - 6.0), screw_angle=first,
+    )  # fmt: skip
+    least = base.rod_hole / 2.0 + 4.0 + passage / 2.0 + 0.5
+    _require_least("tendon_offset", offset, least, "for the base's column between the tendons")
+    _require(
+        base.screw_depths[1] >= base.screw_depths[0] + 6.0 - EPSILON,
+        f"hardware.base_height must be at least 0.033 m, for the rod's socket (got {_metres(height)})",
     )
+    _require_least(
+        "hardware.rib_diameter", 2.0 * base.top_radius, 2.0 * (offset + base.eyelet / 2.0 + MIN_WALL),
+        "the diameter of the base's top, which leads the tendons",
+    )  # fmt: skip
+    gap = _gap(base.eyelets)
+    _require(
+        gap >= passage + MIN_WALL,
+        f"tendon_angles must keep the base's passages {_metres(passage + MIN_WALL)} m apart "
+        f"(got {_metres(gap)})",
+    )
+    rim = max(base.mount_radius + base.mount_hole / 2.0, offset + passage / 2.0) + MIN_WALL
+    _require_least("hardware.base_diameter", 2.0 * base.flange_radius, 2.0 * rim, "for its holes")
+    holes = base.mount_holes
+    _require(
+        min(math.dist(a, b) for a in holes for b in base.eyelets)
+        >= (base.mount_hole + passage) / 2.0 + MIN_WALL
+        and _gap(holes) >= base.mount_hole + MIN_WALL
+        and base.mount_radius >= base.column_radius + base.mount_hole,
+        f"hardware.mount_diameter must keep the mounting holes clear of the tendons, the column and each "
+        f"other (got {_metres(2.0 * base.mount_radius)}); change mount_diameter or mount_hole_count",
+    )
+    return base
 
 
 def _cell(force: float, face: float) -> Cell:
@@ -627,65 +494,74 @@ def _bracket(spool_radius: float, motor_radius: float, cell: Cell) -> Bracket:
     return Bracket(
         left=min(-cell.width / 2.0, spool_radius - half),
         right=spool_radius + max(motor_radius + 0.5, half) + gusset,
-        face=face,
-        foot=foot,
-        foot_length=face + cell.end,
-        height=foot + gap + 2.0 * motor_radius + 1.5,
-        axis=(spool_radius, -(foot + gap + motor_radius)),
-        foot_holes=tuple(face + y for y in cell.holes[:2]),
-        motor_radius=motor_radius,
-        gusset=gusset,
-    )
+        face=face, foot=foot, foot_length=face + cell.end, height=foot + gap + 2.0 * motor_radius + 1.5,
+        axis=(spool_radius, -(foot + gap + motor_radius)), foot_holes=tuple(face + y for y in cell.holes[:2]),
+        motor_radius=motor_radius, gusset=gusset,
+    )  # fmt: skip
 
 
-def placed(x: float, y: float, angle: float, base: Base) -> tuple[float, float]:
+def _placed(x: float, y: float, angle: float, base: Base) -> tuple[float, float]:
     """Return a point of a tendon's frame (x radial from the tendon, y tangential) in the robot's frame."""
     cos, sin = math.cos(angle), math.sin(angle)
     radial = base.tendon_radius + x
     return radial * cos - y * sin, radial * sin + y * cos
 
 
-def _corners(angle: float, base: Base, low: tuple[float, float], high: tuple[float, float]) -> np.ndarray:
-    at = [(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])]
-    return np.array([placed(x, y, angle, base) for x, y in at])
-
-
-def _rectangles(
-    base: Base, spool: Spool, cell: Cell, bracket: Bracket
-) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return the outlines below the plate of each tendon's spool and of its motor with the load cell."""
-    face, axis = PLAY + spool.centre, bracket.axis[0]
-    left = min(bracket.left, axis - bracket.motor_radius)
-    far = face + bracket.face + max(cell.length, MOTOR_LENGTH)
-    return [
-        (
-            _corners(
-                angle, base, (axis - spool.flange_radius, face - PLAY - spool.length),
-                (axis + spool.flange_radius, face),
-            ),
-            _corners(angle, base, (left, face), (bracket.right, far)),
-        )
-        for angle in base.angles
-    ]  # fmt: skip
+def _outlines(base: Base, spool: Spool, cell: Cell, bracket: Bracket) -> list[Outlines]:
+    """Return the outlines below the plate for each tendon."""
+    face, axis = spool.face_distance, bracket.axis[0]
+    left, far = min(bracket.left, axis - bracket.motor_radius), max(cell.length, MOTOR_LENGTH)
+    boxes = (
+        (axis - spool.flange_radius, face - PLAY - spool.length, axis + spool.flange_radius, face),
+        (left, face, bracket.right, face + bracket.face + far),
+    )
+    found = []
+    for angle in base.angles:
+        corners = [[(a, b), (c, b), (c, d), (a, d)] for a, b, c, d in boxes]
+        first, second = (np.array([_placed(x, y, angle, base) for x, y in box]) for box in corners)
+        found.append((first, second))
+    return found
 
 
 def _plate(base: Base, spool: Spool, cell: Cell, bracket: Bracket) -> Plate:
-    outlines = np.concatenate([part for pair in _rectangles(base, spool, cell, bracket) for part in pair])
-    radius = max(float(np.linalg.norm(outlines, axis=1).max()) + 5.0, base.flange_radius + 10.0)
-    radius = 5.0 * math.ceil(radius / 5.0)
-    start = PLAY + spool.centre + bracket.face
+    outlines = _outlines(base, spool, cell, bracket)
+    reach = max(float(np.linalg.norm(part, axis=1).max()) for pair in outlines for part in pair)
+    radius = 5.0 * math.ceil(max(reach + 5.0, base.flange_radius + 10.0) / 5.0)
+    start = spool.face_distance + bracket.face
     around = sorted(angle % (2.0 * math.pi) for angle in base.angles)
     turns = np.diff([*around, around[0] + 2.0 * math.pi])
     middle = tuple(float(angle + turn / 2.0) for angle, turn in zip(around, turns, strict=True))
-    return Plate(
-        radius=radius,
-        thickness=6.0,
-        passages=on_circle(base.tendon_radius, base.angles),
-        passage=base.passage,
-        mount_holes=base.mount_holes,
-        mount_hole=base.mount_hole,
+    plate = Plate(
+        radius=radius, thickness=6.0, passages=base.eyelets, passage=base.passage,
+        mount_holes=base.mount_holes, mount_hole=base.mount_hole,
         cell_holes=tuple(
-            placed(0.0, start + y, angle, base) for angle in base.angles for y in cell.holes[2:]
+            _placed(0.0, start + y, angle, base) for angle in base.angles for y in cell.holes[2:]
         ),
         leg_holes=on_circle(radius - 9.0, middle),
-    )
+    )  # fmt: skip
+    for (k, first), (j, second) in itertools.combinations(enumerate(outlines), 2):
+        _require(
+            not any(_overlap(a, b) for a in first for b in second),
+            f"tendon_offset must be larger: motors {k + 1} and {j + 1} overlap below the plate "
+            f"(got {_metres(base.tendon_radius)} m); or use a smaller motor or spool, or even tendon_angles",
+        )
+    square = on_circle(5.0 * math.sqrt(2.0), tuple(math.pi * (0.25 + 0.5 * k) for k in range(4)))
+    for hole in plate.leg_holes:
+        leg = np.asarray(hole) + np.asarray(square)
+        _require(
+            not any(_overlap(leg, part) for pair in outlines for part in pair),
+            f"tendon_angles must leave room for legs between the motors (got a plate of radius "
+            f"{_metres(radius)} m); use even angles or a smaller motor_diameter",
+        )
+    return plate
+
+
+def _overlap(a: np.ndarray, b: np.ndarray) -> bool:
+    """True if two convex outlines overlap: no edge of either separates them."""
+    for outline in (a, b):
+        edges = np.roll(outline, -1, axis=0) - outline
+        normals = np.stack([-edges[:, 1], edges[:, 0]], axis=1)
+        along_a, along_b = a @ normals.T, b @ normals.T
+        if np.any((along_a.max(0) <= along_b.min(0)) | (along_b.max(0) <= along_a.min(0))):
+            return False
+    return True

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from knode_cosserat_hardware.cad.dimensions import (
     Mount,
     PartDimensions,
     Plate,
+    Points,
     Rib,
     Spool,
     load_dimensions,
@@ -53,14 +53,19 @@ def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> 
     return cad.Pos(*low) * cad.Box(*size, align=(cad.Align.MIN,) * 3)
 
 
+def _holes(diameter: float, low: float, high: float, points: Points = ((0.0, 0.0),)) -> list[Any]:
+    """Return the cylinders of upright holes."""
+    return [cylinder(diameter / 2.0, low, high, point) for point in points]
+
+
 def _radial_hole(diameter: float, reach: float, angle: float, height: float) -> Any:
     """Return a hole's cylinder from the axis outwards."""
     cad = library()
-    pin = cad.Cylinder(diameter / 2.0, reach, align=(cad.Align.CENTER, cad.Align.CENTER, cad.Align.MIN))
-    return cad.Pos(0, 0, height) * cad.Rot(0, 0, math.degrees(angle)) * cad.Rot(0, 90, 0) * pin
+    turned = cad.Rot(0, 0, math.degrees(angle)) * cad.Rot(0, 90, 0)
+    return cad.Pos(0, 0, height) * turned * cylinder(diameter / 2.0, 0.0, reach)
 
 
-def _without(solid: Any, holes: Iterable[Any]) -> Any:
+def _without(solid: Any, *holes: Any) -> Any:
     for hole in holes:
         solid = solid - hole
     return solid
@@ -68,26 +73,21 @@ def _without(solid: Any, holes: Iterable[Any]) -> Any:
 
 def make_rib(rib: Rib) -> Any:
     """Return a rib; z = 0 is the upper face of its disk, the hub is below."""
-    cad = library()
-    disk = cylinder(rib.outer_radius, -rib.thickness, 0.0)
+    cad, low = library(), -rib.thickness
+    disk = cylinder(rib.outer_radius, low, 0.0)
     if rib.window is not None:
         inner, outer = rib.window
-        window = cylinder(outer, -rib.thickness, 0.0) - cylinder(inner, -rib.thickness, 0.0)
+        window = cylinder(outer, low, 0.0) - cylinder(inner, low, 0.0)
         half = rib.spoke_width / 2.0
-        for angle in rib.angles:
-            spoke = block((0.0, -half, -rib.thickness), (outer + 1.0, half, 0.0))
-            window = window - cad.Rot(0, 0, math.degrees(angle)) * spoke
-        disk = disk - window
-    solid = disk + cylinder(rib.hub_radius, -rib.hub_height, 0.0)
-    between = sorted(angle % (2.0 * math.pi) for angle in rib.angles)
+        spoke = block((0.0, -half, low), (outer + 1.0, half, 0.0))
+        disk = disk - _without(window, *(cad.Rot(0, 0, math.degrees(angle)) * spoke for angle in rib.angles))
+    around = sorted(angle % (2.0 * math.pi) for angle in rib.angles)
     height = -(rib.thickness + rib.hub_height) / 2.0
     return _without(
-        solid,
-        [
-            cylinder(rib.rod_hole / 2.0, -rib.hub_height - 1.0, 1.0),
-            *(cylinder(rib.tendon_hole / 2.0, -rib.thickness - 1.0, 1.0, at) for at in rib.tendon_holes),
-            _radial_hole(rib.screw_hole, rib.hub_radius + 1.0, sum(between[:2]) / 2.0, height),
-        ],
+        disk + cylinder(rib.hub_radius, -rib.hub_height, 0.0),
+        *_holes(rib.rod_hole, -rib.hub_height - 1.0, 1.0),
+        *_holes(rib.tendon_hole, low - 1.0, 1.0, rib.tendon_holes),
+        _radial_hole(rib.screw_hole, rib.hub_radius + 1.0, sum(around[:2]) / 2.0, height),
     )
 
 
@@ -100,101 +100,80 @@ def make_spool(spool: Spool) -> Any:
         + cylinder(spool.drum_radius, hub + thick, hub + thick + width)
         + cylinder(spool.flange_radius, hub + thick + width, spool.length)
     )
-    radius = spool.bore / 2.0
-    round_bore = cylinder(radius, -1.0, spool.length + 1.0)
+    radius, tie = spool.bore / 2.0, (spool.drum_radius + spool.flange_radius) / 2.0
     flat = block((spool.across_flat - radius, -radius, -2.0), (2.0 * radius, radius, spool.length + 2.0))
-    tie = (spool.drum_radius + spool.flange_radius) / 2.0
     return _without(
         solid,
-        [
-            round_bore - flat,
-            cylinder(spool.tie_hole / 2.0, hub - 1.0, hub + thick + 0.5, (0.0, tie)),
-            _radial_hole(spool.screw_hole, spool.hub_radius + 1.0, 0.0, hub / 2.0),
-        ],
+        cylinder(radius, -1.0, spool.length + 1.0) - flat,
+        *_holes(spool.tie_hole, hub - 1.0, hub + thick + 0.5, ((0.0, tie),)),
+        _radial_hole(spool.screw_hole, spool.hub_radius + 1.0, 0.0, hub / 2.0),
     )
 
 
 def make_base(base: Base) -> Any:
     """Return the base; z = 0 is its top, where the rod leaves the socket."""
-    low, flange = -base.height, -base.height + base.flange_thickness
+    low, flange, reach = -base.height, -base.height + base.flange_thickness, base.column_radius + 1.0
     solid = (
         cylinder(base.flange_radius, low, flange)
         + cylinder(base.column_radius, low, 0.0)
         + cylinder(base.top_radius, -base.top_thickness, 0.0)
     )
-    holes = [cylinder(base.rod_hole / 2.0, -base.socket_depth, 1.0)]
-    holes += [cylinder(base.eyelet / 2.0, -base.top_thickness - 1.0, 1.0, at) for at in base.eyelets]
-    holes += [cylinder(base.passage / 2.0, low - 1.0, flange + 1.0, at) for at in base.eyelets]
-    holes += [cylinder(base.mount_hole / 2.0, low - 1.0, flange + 1.0, at) for at in base.mount_holes]
-    holes += [
-        _radial_hole(base.screw_hole, base.column_radius + 1.0, base.screw_angle + turn, -depth)
-        for depth in base.screw_depths
-        for turn in (0.0, math.pi / 2.0)
-    ]
-    return _without(solid, holes)
+    return _without(
+        solid,
+        *_holes(base.rod_hole, -base.socket_depth, 1.0),
+        *_holes(base.eyelet, -base.top_thickness - 1.0, 1.0, base.eyelets),
+        *_holes(base.passage, low - 1.0, flange + 1.0, base.eyelets),
+        *_holes(base.mount_hole, low - 1.0, flange + 1.0, base.mount_holes),
+        *(
+            _radial_hole(base.screw_hole, reach, base.screw_angle + turn, -depth)
+            for depth in base.screw_depths
+            for turn in (0.0, math.pi / 2.0)
+        ),
+    )
 
 
 def make_plate(plate: Plate) -> Any:
     """Return the motor plate; z = 0 is its upper side."""
     low = -plate.thickness
-    sizes = [
-        (plate.passage, plate.passages),
-        (plate.mount_hole, plate.mount_holes),
-        (plate.cell_hole, plate.cell_holes),
-        (plate.leg_hole, plate.leg_holes),
-    ]
-    holes = [cylinder(size / 2.0, low - 1.0, 1.0, at) for size, points in sizes for at in points]
-    return _without(cylinder(plate.radius, low, 0.0), holes)
-
-
-def make_cell(cell: Cell) -> Any:
-    """Return a load cell's beam along y; z = 0 is its upper side, y = 0 its end at the motor."""
-    half = cell.width / 2.0
-    beam = block((-half, 0.0, -cell.thickness), (half, cell.length, 0.0))
     return _without(
-        beam, [cylinder(cell.hole / 2.0, -cell.thickness - 1.0, 1.0, (0.0, y)) for y in cell.holes]
+        cylinder(plate.radius, low, 0.0),
+        *_holes(plate.passage, low - 1.0, 1.0, plate.passages),
+        *_holes(plate.mount_hole, low - 1.0, 1.0, plate.mount_holes),
+        *_holes(plate.cell_hole, low - 1.0, 1.0, plate.cell_holes),
+        *_holes(plate.leg_hole, low - 1.0, 1.0, plate.leg_holes),
     )
 
 
-def make_mount(mount: Mount) -> Any:
-    """Return a load-cell mount along y; z = 0 is its upper side, at the plate."""
-    half = mount.width / 2.0
-    solid = block((-half, 0.0, -mount.height), (half, mount.length, 0.0))
-    return _without(
-        solid, [cylinder(mount.hole / 2.0, -mount.height - 1.0, 1.0, (0.0, y)) for y in mount.holes]
-    )
+def make_bar(part: Cell | Mount) -> Any:
+    """Return a load cell's beam or its mount along y; z = 0 is the upper side, y = 0 the end at the motor."""
+    half, low = part.width / 2.0, -(part.thickness if isinstance(part, Cell) else part.height)
+    bar = block((-half, 0.0, low), (half, part.length, 0.0))
+    return _without(bar, *_holes(part.hole, low - 1.0, 1.0, tuple((0.0, y) for y in part.holes)))
 
 
 def make_bracket(bracket: Bracket) -> Any:
     """Return a motor bracket; x = 0 at the tendon, y = 0 at the spool's side, z = 0 at the foot's top."""
     cad = library()
-    x, z = bracket.axis
-    face = block((bracket.left, 0.0, -bracket.height), (bracket.right, bracket.face, 0.0))
-    foot = block((bracket.left, 0.0, -bracket.foot), (bracket.right, bracket.foot_length, 0.0))
-    corners = (
-        (0.0, 0.0),
-        (bracket.foot_length, 0.0),
-        (bracket.face, -bracket.height),
-        (0.0, -bracket.height),
+    (x, z), depth, face = bracket.axis, bracket.height, bracket.face
+    corners = ((0.0, 0.0), (bracket.foot_length, 0.0), (face, -depth), (0.0, -depth))
+    gusset = cad.extrude(cad.Plane.YZ * cad.make_face(cad.Polyline(*corners, close=True)), bracket.gusset)
+    solid = (
+        block((bracket.left, 0.0, -depth), (bracket.right, face, 0.0))
+        + block((bracket.left, 0.0, -bracket.foot), (bracket.right, bracket.foot_length, 0.0))
+        + cad.Pos(bracket.right - bracket.gusset, 0, 0) * gusset
     )
-    triangle = cad.Plane.YZ * cad.make_face(cad.Polyline(*corners, close=True))
-    gusset = cad.extrude(triangle, bracket.gusset)
-    solid = face + foot + cad.Pos(bracket.right - bracket.gusset, 0, 0) * gusset
     if x - bracket.motor_radius - 0.5 >= bracket.left + bracket.gusset:
         solid = solid + cad.Pos(bracket.left, 0, 0) * gusset
-    sizes = [
-        (bracket.boss_hole, x),
-        (bracket.screw_hole, x - bracket.screw_spacing / 2.0),
-        (bracket.screw_hole, x + bracket.screw_spacing / 2.0),
+    screws = tuple((x + side * bracket.screw_spacing / 2.0, -z) for side in (-1.0, 1.0))
+    through = [
+        *_holes(bracket.boss_hole, -1.0, face + 1.0, ((x, -z),)),
+        *_holes(bracket.screw_hole, -1.0, face + 1.0, screws),
     ]
-    through = cad.Rot(-90, 0, 0)
-    holes = [
-        cad.Pos(at, 0, z) * through * cylinder(size / 2.0, -1.0, bracket.face + 1.0) for size, at in sizes
-    ]
-    holes += [
-        cylinder(bracket.foot_hole / 2.0, -bracket.foot - 1.0, 1.0, (0.0, y)) for y in bracket.foot_holes
-    ]
-    return _without(solid, holes)
+    return _without(
+        solid,
+        *(cad.Rot(-90, 0, 0) * hole for hole in through),
+        *_holes(bracket.foot_hole, -bracket.foot - 1.0, 1.0, tuple((0.0, y) for y in bracket.foot_holes)),
+    )
 
 
 def make_motor(part: PartDimensions) -> Any:
@@ -215,8 +194,8 @@ def make_parts(part: PartDimensions) -> dict[str, Any]:
         "spool": make_spool(part.spool),
         "base": make_base(part.base),
         "motor-plate": make_plate(part.plate),
-        "load-cell": make_cell(part.cell),
-        "load-cell-mount": make_mount(part.mount),
+        "load-cell": make_bar(part.cell),
+        "load-cell-mount": make_bar(part.mount),
         "motor-bracket": make_bracket(part.bracket),
     }
 
@@ -249,7 +228,7 @@ def place_parts(part: PartDimensions) -> list[tuple[str, Any]]:
 
 def _drive(part: PartDimensions, made: dict[str, Any], motor: Any) -> list[tuple[str, Any]]:
     """Return the bodies of one tendon below the plate, in its frame: x radial, y tangential, z up."""
-    cad, face = library(), part.face_distance
+    cad, face = library(), part.spool.face_distance
     start, top = face + part.bracket.face, -part.mount.height
     foot = top - part.cell.thickness
     axis = (part.bracket.axis[0], foot + part.bracket.axis[1])

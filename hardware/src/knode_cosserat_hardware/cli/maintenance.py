@@ -240,7 +240,6 @@ def _weighed(driver: Driver, index: int, weights: list[float]) -> Any:
     from knode_cosserat_hardware.driver import HardwareError, fault_message
 
     hang: Any = getattr(driver, "hang", None)
-    wait: Any = getattr(driver, "wait", None)
     readings = []
     for weight in weights:
         if hang is not None:
@@ -250,8 +249,7 @@ def _weighed(driver: Driver, index: int, weights: list[float]) -> Any:
                 f"Hang {weight / GRAVITY:g} kg on tendon {index + 1}, wait until it is still, press Enter",
                 default="", show_default=False, prompt_suffix=" ", err=True,
             )  # fmt: skip
-        if wait is not None:
-            wait(0.1)
+        driver.wait(0.1)
         readings.append(float(_mean(driver, READINGS)[index]))
         if fault := driver.read().fault:
             raise HardwareError(f"while weighing {weight / GRAVITY:g} kg: {fault_message(fault)}")
@@ -318,7 +316,7 @@ def commission(
 
     with connected(machine, yes) as driver:
         who = Person(person or getpass.getuser(), confirm, consent)
-        work = Commissioning(driver, report, machine.name, who, silence=machine.silence)
+        work = Commissioning(driver, report, machine.name, who)
         found = work.run(show)
     failed = [step["name"] for step in found["steps"] if step["result"] == "failed"]
     lines.append("complete" if found["complete"] else "not complete")

@@ -86,13 +86,13 @@ def record(
         names = _body_names(machine, poses)
         config = _recording_config(count, names, machine)
         driver = stack.enter_context(connected(machine, yes, motion))
-        recorder = Recorder(out, config, clock=HostClock(machine.clock))
+        recorder = Recorder(out, config, clock=HostClock(machine.driver.now))
         config.save(out.with_suffix(".yaml"))
         reduced = 0
         try:
             with recorder, emergency_stop(driver) as emergency:
                 driver.arm()
-                begin = machine.clock()
+                begin = machine.driver.now()
                 for k, row in enumerate(rows):
                     emergency.check()
                     sent = driver.command(row)
@@ -132,7 +132,7 @@ def _tension_rows(controls: str, seconds: float | None, dt: float | None, count:
 def _read_until(end: float, machine: OpenedDriver, recorder: Any, poses: Any) -> None:
     """Record readings and poses until a time (s)."""
     true = machine.poses
-    while machine.clock() < end - 1e-9:
+    while machine.driver.now() < end - 1e-9:
         reading = machine.driver.read()
         recorder.add_reading(reading)
         if poses is not None:
@@ -142,7 +142,7 @@ def _read_until(end: float, machine: OpenedDriver, recorder: Any, poses: Any) ->
             from knode_cosserat_hardware.middleware.mocap import PoseFrame
 
             found = true((1.0,))
-            recorder.add_poses(PoseFrame(machine.clock(), found[:, :3], found[:, 3:]))
+            recorder.add_poses(PoseFrame(machine.driver.now(), found[:, :3], found[:, 3:]))
 
 
 def _body_names(machine: OpenedDriver, poses: Any) -> list[str]:
@@ -237,6 +237,8 @@ def run(
     for path in (out, recording):
         require_writable(path)
     from knode_cosserat import control as kcc
+    from knode_cosserat_hardware.plant import HardwarePlant
+    from knode_cosserat_hardware.safety import SafeRegion
 
     system = load_system(model)
     machine = opened(port, robot, None if robot else system)
@@ -251,11 +253,13 @@ def run(
     wanted = parsed_reference(reference)
     controller = kcc.controller_named(method, system, dt, limits)
     motion = f"the tip follows {reference} for {seconds:g} s, tensions up to {np.max(limits.high):.3g} N"
+    region = None if radius is None else SafeRegion(radius=radius)
     with motion_capture(machine, capture) as poses, connected(machine, yes, motion) as driver:
-        with _kept_log(out):
-            log, plant = _closed_loop(
-                machine, controller, wanted, seconds, tip_source(machine, poses), radius
-            )
+        with _kept_log(out), emergency_stop(driver) as emergency:
+            source = tip_source(machine, poses)
+            plant = HardwarePlant(driver, source, controller.dt, region=region, emergency=emergency)
+            log = kcc.run_loop(controller, plant, wanted, seconds)
+            driver.disarm()
         latency = driver.latency
     if out is not None:
         log.to_csv(out)
@@ -280,25 +284,6 @@ def _control_limits(driver: Driver, high: str | None, lag: float) -> Any:
     if np.max(most) > limits.high:
         raise ValueError(f"--high is {high}; the robot allows {limits.high:g} N")
     return ControlLimits(limits.low, most, limits.rate, lag=lag)
-
-
-def _closed_loop(
-    machine: OpenedDriver, controller: Any, reference: Any, seconds: float, source: Any, radius: float | None
-) -> tuple[Any, Any]:
-    """Return the log of a loop and its plant."""
-    from knode_cosserat.control import run_loop
-    from knode_cosserat_hardware.plant import HardwarePlant
-    from knode_cosserat_hardware.safety import SafeRegion
-
-    driver = machine.driver
-    region = None if radius is None else SafeRegion(radius=radius)
-    with emergency_stop(driver) as emergency:
-        plant = HardwarePlant(
-            driver, source, controller.dt, region=region, clock=machine.clock, emergency=emergency
-        )
-        log = run_loop(controller, plant, reference, seconds)
-        driver.disarm()
-    return log, plant
 
 
 @contextlib.contextmanager
@@ -374,7 +359,7 @@ def steer(
             if others is not None and not emergency.has_keys:
                 raise ValueError("the keyboard needs a terminal; give --device /dev/input/js0 for a gamepad")
             count = teleoperate(
-                driver, inputs, mapping if window is None else window, emergency,
+                driver, inputs, mapping if window is None else None, emergency,
                 seconds=float("inf") if seconds is None else seconds, shown=shown,
             )  # fmt: skip
     facts = {"commands": count, "tension": [round(float(value), 4) for value in last[0]]}

@@ -158,11 +158,11 @@ def motion_capture(machine: OpenedDriver, source: str | None) -> Iterator[Motion
     if kind == "natnet":
         from knode_cosserat_hardware.middleware.natnet import NatNet
 
-        made = NatNet({name: int(names[name]) for name in ordered}, server, clock=machine.clock)
+        made = NatNet({name: int(names[name]) for name in ordered}, server, clock=machine.driver.now)
     else:
         from knode_cosserat_hardware.middleware.mocap import VRPN
 
-        made = VRPN(ordered, server, clock=machine.clock)
+        made = VRPN(ordered, server, clock=machine.driver.now)
     with made as capture:
         yield capture
 
@@ -185,7 +185,7 @@ def tip_source(machine: OpenedDriver, capture: MotionCapture | None) -> Any:
     poses = machine.poses
     if poses is None:
         return None
-    return lambda: (machine.clock(), poses((1.0,))[-1, :3])
+    return lambda: (machine.driver.now(), poses((1.0,))[-1, :3])
 
 
 def tendon_index(tendon: int, count: int) -> int:

@@ -1,101 +1,34 @@
 """Standard ROS 2 messages as DDS types, with ROS 2's names: all definitions of the DDS bridge.
 
-Annotations are evaluated by cyclonedds: this module has no `from __future__ import annotations`.
+Positions are in m, forces in N, torques in N m; a tendon's effort in a JointState is its tension (N). Values
+are checked by cyclonedds, which has no types that mypy understands.
 """
 
-from dataclasses import dataclass
+from typing import Any
 
-from cyclonedds.idl import IdlStruct
-from cyclonedds.idl.types import float64, int32, sequence, uint32
+from cyclonedds.idl import make_idl_struct, types
+from cyclonedds.idl.types import float64, int32, uint32
 
-
-def _name(package: str, message: str) -> str:
-    """Return the DDS name of a ROS 2 message type."""
-    return f"{package}::msg::dds_::{message}_"
+sequence: Any = types.sequence
 
 
-@dataclass
-class Time(IdlStruct, typename=_name("builtin_interfaces", "Time")):
-    """Time since 1970: seconds and nanoseconds."""
-
-    sec: int32
-    nanosec: uint32
+def _message(package: str, name: str, /, **fields: Any) -> Any:
+    """Return the class of a ROS 2 message type, with its fields in order."""
+    return make_idl_struct(name, f"{package}::msg::dds_::{name}_", fields)
 
 
-@dataclass
-class Header(IdlStruct, typename=_name("std_msgs", "Header")):
-    """Time and frame of a message."""
-
-    stamp: Time
-    frame_id: str
-
-
-@dataclass
-class Point(IdlStruct, typename=_name("geometry_msgs", "Point")):
-    """Position (m)."""
-
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-class Quaternion(IdlStruct, typename=_name("geometry_msgs", "Quaternion")):
-    """Orientation, scalar last."""
-
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-
-@dataclass
-class Pose(IdlStruct, typename=_name("geometry_msgs", "Pose")):
-    """Position (m) and orientation."""
-
-    position: Point
-    orientation: Quaternion
-
-
-@dataclass
-class PoseArray(IdlStruct, typename=_name("geometry_msgs", "PoseArray")):
-    """Poses of several bodies at one time."""
-
-    header: Header
-    poses: sequence[Pose]  # type: ignore[type-arg, unused-ignore]
-
-
-@dataclass
-class Vector3(IdlStruct, typename=_name("geometry_msgs", "Vector3")):
-    """Vector of a force (N) or torque (N m)."""
-
-    x: float64
-    y: float64
-    z: float64
-
-
-@dataclass
-class Wrench(IdlStruct, typename=_name("geometry_msgs", "Wrench")):
-    """Force (N) and torque (N m)."""
-
-    force: Vector3
-    torque: Vector3
-
-
-@dataclass
-class WrenchStamped(IdlStruct, typename=_name("geometry_msgs", "WrenchStamped")):
-    """Wrench at one time."""
-
-    header: Header
-    wrench: Wrench
-
-
-@dataclass
-class JointState(IdlStruct, typename=_name("sensor_msgs", "JointState")):
-    """State of joints: tendons, whose effort is the tension (N)."""
-
-    header: Header
-    name: sequence[str]  # type: ignore[type-arg, unused-ignore]
-    position: sequence[float64]  # type: ignore[type-arg, unused-ignore]
-    velocity: sequence[float64]  # type: ignore[type-arg, unused-ignore]
-    effort: sequence[float64]  # type: ignore[type-arg, unused-ignore]
+#: since 1970
+Time = _message("builtin_interfaces", "Time", sec=int32, nanosec=uint32)
+Header = _message("std_msgs", "Header", stamp=Time, frame_id=str)
+Point = _message("geometry_msgs", "Point", x=float64, y=float64, z=float64)
+#: scalar last
+Quaternion = _message("geometry_msgs", "Quaternion", x=float64, y=float64, z=float64, w=float64)
+Pose = _message("geometry_msgs", "Pose", position=Point, orientation=Quaternion)
+PoseArray = _message("geometry_msgs", "PoseArray", header=Header, poses=sequence[Pose])
+Vector3 = _message("geometry_msgs", "Vector3", x=float64, y=float64, z=float64)
+Wrench = _message("geometry_msgs", "Wrench", force=Vector3, torque=Vector3)
+WrenchStamped = _message("geometry_msgs", "WrenchStamped", header=Header, wrench=Wrench)
+JointState = _message(
+    "sensor_msgs", "JointState", header=Header, name=sequence[str], position=sequence[float64],
+    velocity=sequence[float64], effort=sequence[float64],
+)  # fmt: skip

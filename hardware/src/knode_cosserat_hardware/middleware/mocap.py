@@ -226,22 +226,14 @@ class SimulatedCapture(MotionCapture):
         self._last = -np.inf
 
     def poses(self, timeout: float = 1.0) -> PoseFrame:
-        """Return the present poses; does not wait.
-
-        Raises:
-            HardwareError: the robot is not connected.
-        """
+        """Return the present poses; does not wait. Raises `HardwareError` if the robot is not connected."""
         values = np.asarray(self.robot.poses(self._fractions), dtype=float)
         if self._height is not None:
             values = np.concatenate([[[0.0, 0.0, self._height, 1.0, 0.0, 0.0, 0.0]], values])
         return PoseFrame(self._now(), values[:, :3], values[:, 3:])
 
     def frames(self) -> list[PoseFrame]:
-        """Return the present poses once for each time of the robot.
-
-        Raises:
-            HardwareError: the robot is not connected.
-        """
+        """Return the present poses once for each time of the robot; raises as `poses` does."""
         frame = self.poses()
         if frame.time <= self._last:
             return []

@@ -1,4 +1,10 @@
-"""Latency of DDS messages from one process to another on the same host."""
+"""Latency of DDS messages from one process to another on the same host.
+
+    python -m benchmarks.dds_latency --messages 2000 --real-time
+
+Times are of the host's monotonic clock, which all processes share on Linux. On a busy machine the 99th
+percentile is that of the scheduler: real-time priority, which needs the right to it, removes most of it.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +14,7 @@ import os
 import subprocess
 import sys
 import time
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,7 +23,10 @@ from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.middleware.commands import tendon_names
 from knode_cosserat_hardware.middleware.dds import open_participant, open_reader, open_writer
 
+ROOT = Path(__file__).parent.parent
 TOPIC = "rt/latency"
+#: messages in a second (Hz)
+RATE = 500.0
 #: real-time priority of the processes, and longest time until both have found each other (s)
 PRIORITY, DISCOVERY = 10, 60.0
 
@@ -27,25 +37,13 @@ class LoopbackLatency(NamedTuple):
     median: float
     p99: float
     messages: int
-    #: number of messages that did not arrive
     lost: int
     #: True if both processes had real-time priority
     real_time: bool
 
 
-def measure_loopback(
-    messages: int = 1000, *, domain: int = 91, rate: float = 500.0, real_time: bool = False
-) -> LoopbackLatency:
+def measure_loopback(messages: int = 1000, domain: int = 91, real_time: bool = False) -> LoopbackLatency:
     """Return the latency of JointState messages of four tendons between two processes on this host.
-
-    Times are of the host's monotonic clock, which all processes share on Linux. On a busy machine the
-    99th percentile is that of the scheduler: real-time priority removes most of it.
-
-    Args:
-        messages: number of messages.
-        domain: number of a DDS domain that nothing else uses.
-        rate: messages in a second (Hz).
-        real_time: True gives both processes real-time priority, which needs the right to do so (Linux).
 
     Raises:
         HardwareError: a process failed, priority was refused, or no message arrived.
@@ -53,13 +51,13 @@ def measure_loopback(
     """
     # an error of the domain is raised here, and not in another process
     open_participant(domain, loopback=True)
-    program = [sys.executable, "-m", "knode_cosserat_hardware.middleware.loopback"]
-    program += [str(domain), str(messages), repr(rate), *(["--real-time"] if real_time else [])]
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
-    limit = DISCOVERY + messages / rate + 30.0
-    with subprocess.Popen(program, **pipes) as receiver:
+    program = [sys.executable, "-m", "benchmarks.dds_latency", f"--domain={domain}", f"--messages={messages}"]
+    program += ["--real-time"] * real_time
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT}
+    limit = DISCOVERY + messages / RATE + 30.0
+    with subprocess.Popen([*program, "--role=receive"], **pipes) as receiver:
         try:
-            sender = subprocess.run([*program, "--send"], timeout=limit, check=False, **pipes)
+            sender = subprocess.run([*program, "--role=send"], timeout=limit, check=False, **pipes)
             out, error = receiver.communicate(timeout=limit)
         except subprocess.TimeoutExpired:
             raise HardwareError("the measurement of latency did not end") from None
@@ -76,13 +74,11 @@ def measure_loopback(
     return LoopbackLatency(float(median), float(p99), messages, messages - len(latencies), real_time)
 
 
-def send(domain: int, messages: int, rate: float) -> None:
-    """Write messages, at a rate (Hz), once a reader is there; the time of writing travels as the position."""
+def send(domain: int, messages: int) -> None:
+    """Write messages once a reader is there; the time of writing travels as the position."""
     participant = open_participant(domain, loopback=True)
-    from knode_cosserat_hardware.middleware import idl as definitions
+    from knode_cosserat_hardware.middleware import idl
 
-    # cyclonedds has no types that mypy understands
-    idl: Any = definitions
     writer = open_writer(participant, TOPIC, idl.JointState)
     end = time.monotonic() + DISCOVERY
     while not writer.get_matched_subscriptions():
@@ -94,7 +90,7 @@ def send(domain: int, messages: int, rate: float) -> None:
     for _ in range(messages):
         sent = time.monotonic()
         writer.write(idl.JointState(header, names, [sent], [], [5.0] * 4))
-        time.sleep(max(0.0, 1.0 / rate - (time.monotonic() - sent)))
+        time.sleep(max(0.0, 1.0 / RATE - (time.monotonic() - sent)))
     # reliable messages may be sent again
     time.sleep(0.5)
 
@@ -117,37 +113,34 @@ def receive(domain: int, messages: int) -> list[float]:
             # a writer that has left is reported too, as another kind of object
             if isinstance(message, idl.JointState):
                 now = time.monotonic()
-                position: Any = message.position
-                latencies.append(now - position[0])
+                latencies.append(now - message.position[0])
                 end = now + 2.0
     return latencies
 
 
-def main() -> int:
-    """Run one of the two processes, and return the exit status."""
-    parser = argparse.ArgumentParser()
-    parser.add_argument("domain", type=int)
-    parser.add_argument("messages", type=int)
-    parser.add_argument("rate", type=float)
-    parser.add_argument("--send", action="store_true")
-    parser.add_argument("--real-time", action="store_true")
-    chosen = parser.parse_args()
+def main() -> None:
+    """Measure, or run one of the two processes."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.dds_latency")
+    parser.add_argument("--domain", type=int, default=91, help="DDS domain that nothing else uses")
+    parser.add_argument("--messages", type=int, default=1000)
+    parser.add_argument("--real-time", action="store_true", help="give both processes real-time priority")
+    parser.add_argument("--role", choices=("send", "receive"), help=argparse.SUPPRESS)
+    options = parser.parse_args()
     try:
-        if chosen.real_time:
+        if options.role and options.real_time:
             # threads of Cyclone DDS are created later, and inherit it
             os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(PRIORITY))
-        if chosen.send:
-            send(chosen.domain, chosen.messages, chosen.rate)
+        if options.role == "send":
+            send(options.domain, options.messages)
+        elif options.role == "receive":
+            print(json.dumps(receive(options.domain, options.messages)))
         else:
-            print(json.dumps(receive(chosen.domain, chosen.messages)))
+            print(measure_loopback(options.messages, options.domain, options.real_time))
     except (OSError, AttributeError):
-        print("real-time priority was refused; use real_time=False, or run as root", file=sys.stderr)
-        return 1
+        sys.exit("real-time priority was refused; leave out --real-time, or run as root")
     except HardwareError as error:
-        print(error, file=sys.stderr)
-        return 1
-    return 0
+        sys.exit(str(error))
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

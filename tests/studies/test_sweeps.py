@@ -2,7 +2,7 @@
 
 import pytest
 
-from studies.environments_sweep import measure_sweep
+from benchmarks.sweeps import measure_sweep
 
 
 @pytest.mark.campaign

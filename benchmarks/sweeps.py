@@ -38,8 +38,6 @@ SHARD = 1024
 ROUNDS = 3
 #: largest time (s) for a killed run to write its next shard
 PATIENCE = 600.0
-#: limits of the study
-LEAST_EFFICIENCY, MOST_SECONDS = 0.9, 900.0
 
 
 def sweep_of(rollouts: int, seed: int = 0) -> Sweep:
