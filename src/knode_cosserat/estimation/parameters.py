@@ -68,7 +68,7 @@ class Number(NamedTuple):
         """Return the derivative of the value by the coordinate, at a value."""
         return self.width * (value if self.logarithmic else 1.0)
 
-    @functools.cached_property
+    @property
     def bounds(self) -> tuple[float, float]:
         """Lowest and highest coordinate."""
         return self.coordinate(self.low), self.coordinate(self.high)
@@ -204,7 +204,7 @@ class Model:
         """Coordinates where a search begins."""
         return np.array([number.begin for number in self.numbers])
 
-    @property
+    @functools.cached_property
     def bounds(self) -> Float[np.ndarray, "2 n"]:
         """Lowest and highest coordinates."""
         return np.array([number.bounds for number in self.numbers]).reshape(-1, 2).T
