@@ -11,8 +11,8 @@ from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat_hardware.description import HardwareDescription
 from knode_cosserat_hardware.driver import Driver, HardwareError, Limits
 from knode_cosserat_hardware.motor_robot import MotorReel

@@ -20,7 +20,7 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.envs.tasks import Survey, Task, Tip
 from knode_cosserat.estimation.online import split_record
 from knode_cosserat.estimation.outputs import BodyPositions
-from knode_cosserat.rods.aspects import Drawing, Ends
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix

@@ -424,7 +424,10 @@ class Reach(Task):
             TaskError: the fixed position cannot be reached by an equilibrium within limits.
         """
         if self.position is not None:
-            target, length = np.asarray(self.position, dtype=float), float(np.max(nominal_model(robot).length))
+            target, length = (
+                np.asarray(self.position, dtype=float),
+                float(np.max(nominal_model(robot).length)),
+            )
             if target.shape != (3,) or not np.all(np.isfinite(target)):
                 raise TaskError(f"the target is {self.position!r}; allowed are three finite numbers (m)")
             nearest = inverse_kinematics(robot, target, low=limits.low, high=limits.high)

@@ -356,7 +356,9 @@ def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
     reach, low, high = WIDEST * deviation, -np.inf, np.inf
     if not value.ndim and not learned:
         place, _, last = name.rpartition(".")
-        known = parameters_of(type(value_at(nominal_model(robot), place) if place else nominal_model(robot)))[last]
+        known = parameters_of(type(value_at(nominal_model(robot), place) if place else nominal_model(robot)))[
+            last
+        ]
         low, high = known.low, known.high
     several = value.ndim == 1 or learned
     numbers = [
