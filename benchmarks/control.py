@@ -57,7 +57,7 @@ def costs() -> dict[str, Any]:
 
     @jax.jit
     def errors(plan: Any) -> Any:
-        system = model.at(belief.x)
+        system = model.parameters(belief.x)
         rows, _ = rollout(task, Pattern.of(system))(system, basis @ plan, belief.past)
         return errors_of(model.robot, controller.target, rows.records, wanted)
 
