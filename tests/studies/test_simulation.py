@@ -187,7 +187,7 @@ def test_a_fit_that_fails_is_recorded_for_every_seed(tmp_path, one_imperfection,
     def diverging(*arguments, **options):
         raise methods.FitError("the loss is not finite after epoch 3")
 
-    monkeypatch.setattr(methods, "fit", diverging)
+    monkeypatch.setattr(methods, "fit_states", diverging)
     cells = rerun(tmp_path, seeds=range(3), methods=["paper"], workers=1).cells
     assert [(cell["control"], cell["seed"]) for cell in cells] == [
         (control, seed) for control in ("sine", "step") for seed in range(3)
