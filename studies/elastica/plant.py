@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.cli.arguments import load_system, parse_limits
-from knode_cosserat.control.plants import Plant, Sensor
+from knode_cosserat.control.plants import Plant, Readings, Sensor
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.tendon_robots import TendonRod
@@ -76,7 +76,7 @@ class ElasticaPlant(Plant):
     def start(self) -> Float[np.ndarray, " c"]:
         """Go to rest without tensions, and return the control that acts there."""
         self.rod.restart()
-        self._random = np.random.default_rng(self.sensor.seed)
+        self._readings = Readings(self.sensor)
         self._sense()
         return self.rod.tension
 
@@ -88,14 +88,14 @@ class ElasticaPlant(Plant):
     def _sense(self) -> None:
         output = self.sensor.output
         fractions = output.fractions  # type: ignore[attr-defined]
-        value = self.rod.positions(fractions)
+        found = self.rod.positions(fractions)
         if isinstance(output, BodyPoses):
-            value = np.concatenate([value, self.rod.quaternions(fractions)], axis=1)
-        self._measured = self.sensor.reading(value.ravel(), self._random)
+            found = np.concatenate([found, self.rod.quaternions(fractions)], axis=1)
+        self._readings.add(found.ravel())
 
     def measure(self) -> Float[np.ndarray, " p"]:
-        """Return the measurement of this time."""
-        return self._measured.copy()
+        """Return the measurement of this time, or an older one if the sensor has latency."""
+        return self._readings.current()
 
     def tip(self) -> Float[np.ndarray, "3"]:
         """Return the true position of the tip (m)."""

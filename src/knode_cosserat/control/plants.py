@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections import deque
 from typing import Any, Literal
 
 import numpy as np
@@ -23,27 +24,43 @@ class Sensor:
     Attributes:
         output: the measured output.
         noise: multiple of the output's standard deviations; 0 for exact measurements.
+        latency: age of a measurement in periods.
         dropout: probability that a measurement is lost.
         seed: of the noise.
     """
 
     output: Output
     noise: float = 0.0
+    latency: int = 0
     dropout: float = 0.0
     seed: int = 0
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.dropout < 1.0:
             raise ValueError(f"dropout is {self.dropout}; allowed is 0 to less than 1")
-        if self.noise < 0.0:
-            raise ValueError(f"noise is {self.noise}; allowed is zero or more")
+        if self.latency < 0 or self.noise < 0.0:
+            raise ValueError("latency and noise must not be negative")
 
-    def reading(self, value: Any, random: np.random.Generator) -> Float[np.ndarray, " p"]:
-        """Return the reading of a true value of the output; NaN if it is lost."""
-        value = np.array(value)
-        if self.noise and len(self.output.noise) == len(value):
-            value = value + self.noise * self.output.noise * random.normal(size=len(value))
-        return np.full(len(value), np.nan) if random.uniform() < self.dropout else value
+
+class Readings:
+    """Readings of a sensor in a running loop: values with noise, some lost, delayed by the latency."""
+
+    def __init__(self, sensor: Sensor):
+        self.sensor, self.random = sensor, np.random.default_rng(sensor.seed)
+        self._queue: deque[Any] = deque(maxlen=sensor.latency + 1)
+
+    def add(self, value: Any) -> None:
+        """Take a true value of the output, at the time of a period."""
+        sensor, value = self.sensor, np.array(value)
+        if sensor.noise and len(sensor.output.noise) == len(value):
+            value = value + sensor.noise * sensor.output.noise * self.random.normal(size=len(value))
+        if self.random.uniform() < sensor.dropout:
+            value = np.full(len(value), np.nan)
+        self._queue.append(value)
+
+    def current(self) -> Float[np.ndarray, " p"]:
+        """Return the reading of this time, or an older one if the sensor has latency."""
+        return np.array(self._queue[0])
 
 
 class Plant(abc.ABC):
@@ -83,15 +100,22 @@ class SimulatedPlant(Plant):
     """A simulated robot, which may differ from the controller's model, with a sensor."""
 
     def __init__(
-        self, robot: System, dt: float, sensor: Sensor, *, control_noise: float = 0.0,
+        self,
+        robot: System,
+        dt: float,
+        sensor: Sensor,
+        *,
+        substeps: int = 1,
+        control_noise: float = 0.0,
         initial: Trajectory | Literal["equilibrium"] | None = "equilibrium",
-    ):  # fmt: skip
+    ):
         """Set up the robot at rest, under zero control, or at the last row of a trajectory.
 
         Args:
             robot: the true robot.
             dt: period (s).
             sensor: what is measured, and how well.
+            substeps: steps of the simulation in each period.
             control_noise: standard deviation by which acting controls differ from commanded ones, in their
                 unit, independent in each period.
             initial: a motion or equilibrium from which it moves on, or None for the unstressed robot, as in
@@ -100,13 +124,13 @@ class SimulatedPlant(Plant):
         self.robot, self.dt, self.sensor = robot, float(dt), sensor
         if control_noise < 0.0:
             raise ValueError(f"control_noise is {control_noise}; allowed is zero or more")
-        self._initial, self._control_noise = initial, control_noise
+        self._substeps, self._initial, self._control_noise = substeps, initial, control_noise
         self.start()
 
     def start(self) -> Float[np.ndarray, " c"]:
         """Go to the start, and return the control that acts there."""
-        self._stepper = Stepper(self.robot, self.dt, initial=self._initial)
-        self._random = np.random.default_rng(self.sensor.seed)
+        self._stepper = Stepper(self.robot, self.dt / self._substeps, initial=self._initial)
+        self._readings = Readings(self.sensor)
         self._sense()
         return np.asarray(self._stepper.state.control[-1])
 
@@ -114,17 +138,17 @@ class SimulatedPlant(Plant):
         """Move on by one period under a control."""
         control = np.asarray(control, dtype=float)
         if self._control_noise:
-            control = control + self._control_noise * self._random.normal(size=len(control))
-        self._stepper.step(control)
+            control = control + self._control_noise * self._readings.random.normal(size=len(control))
+        for _ in range(self._substeps):
+            self._stepper.step(control)
         self._sense()
 
     def _sense(self) -> None:
-        value = final_output(self.robot, self._stepper.state, self.sensor.output)
-        self._measured = self.sensor.reading(value, self._random)
+        self._readings.add(final_output(self.robot, self._stepper.state, self.sensor.output))
 
     def measure(self) -> Float[np.ndarray, " p"]:
-        """Return the measurement of this time."""
-        return self._measured.copy()
+        """Return the measurement of this time, or an older one if the sensor has latency."""
+        return self._readings.current()
 
     @property
     def state(self) -> Trajectory:
