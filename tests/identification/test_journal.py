@@ -50,9 +50,9 @@ class Curve:
         chosen = [self.data[k] for k in (range(2) if which is None else which)]
         if self.fails:
             return [None for _ in chosen]
-        return [Rollout(value[:, None] - it.data, lambda: slope) for it in chosen]
+        return [Rollout(value[:, None] - it.data, lambda which: slope[which]) for it in chosen]
 
-    def differentiated(self, rollouts):
+    def differentiated(self, rollouts, which=None):
         pass
 
 

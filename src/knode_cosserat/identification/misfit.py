@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from knode_cosserat.estimation.online import errors_along, errors_of
 from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
@@ -45,13 +45,22 @@ RECOVERY = 0.5
 class Rollout:
     """A simulated experiment: differences from its data in units of the noise; NaN where there are none."""
 
-    def __init__(self, values: Float[np.ndarray, "rows e"], tangents: Callable[[], np.ndarray]):
+    def __init__(self, values: Float[np.ndarray, "rows e"], tangents: Callable[[Any], np.ndarray]):
         self.values, self._tangents = values, tangents
+        self._last: tuple[bytes, np.ndarray] = b"", np.zeros(0)
 
     @functools.cached_property
     def derivatives(self) -> Float[np.ndarray, "n rows e"]:
-        """Derivatives of the differences by the coordinates."""
-        return self._tangents()
+        """Derivatives of the differences by all coordinates."""
+        return self._tangents(slice(None))
+
+    def derivatives_by(self, which: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m rows e"]:
+        """Return the derivatives by some coordinates, which take less time than all; the last are kept."""
+        if "derivatives" in vars(self):
+            return self.derivatives[which]
+        if self._last[0] != which.tobytes():
+            self._last = which.tobytes(), self._tangents(which)
+        return self._last[1]
 
 
 class _Start(NamedTuple):
@@ -65,7 +74,8 @@ class _Start(NamedTuple):
     #: earlier states that the first step may use, as in `TimeIntegration`
     known: int
     sudden: bool
-    tangents: Callable[[Any], tuple[Any, StateHistory, Any]]
+    #: of tangent systems and the weights of each in each tangent
+    tangents: Callable[[Any, np.ndarray], tuple[Any, StateHistory, Any]]
 
 
 class Misfit:
@@ -88,9 +98,11 @@ class Misfit:
         chosen = [self.data[k] for k in (range(len(self.data)) if which is None else which)]
         return self._parallel(lambda data: self._of_one(np.asarray(x, dtype=float), data, rows), chosen)
 
-    def differentiated(self, rollouts: Sequence[Rollout]) -> None:
-        """Compute the derivatives of all rollouts."""
-        self._parallel(lambda rollout: rollout.derivatives, rollouts)
+    def differentiated(
+        self, rollouts: Sequence[Rollout], which: Bool[np.ndarray, " n"] | None = None
+    ) -> None:
+        """Compute the derivatives of all rollouts, by some coordinates or by all."""
+        self._parallel(lambda it: it.derivatives if which is None else it.derivatives_by(which), rollouts)
         self._first = False
 
     def _parallel(self, work: Any, items: Sequence[Any]) -> list[Any]:
@@ -125,16 +137,17 @@ class Misfit:
 
         noise, stages = data.noise, 1 if data.static else data.settings.stages
 
-        def tangents() -> np.ndarray:
+        def tangents(which: Any) -> np.ndarray:
             directions, by_latency = _directions(self.model.robot, x)
-            d_first, past, d_past = start.tangents(directions)
+            weights = np.eye(len(x))[:, which]
+            d_first, past, d_past = start.tangents(directions, weights)
             controls = acting[:steps]
-            d_controls = np.zeros((*controls.shape, len(x)))
+            d_controls = np.zeros((*controls.shape, weights.shape[1]))
             if slope is not None:
-                d_controls = slope[:steps, :, None] * np.asarray(by_latency)
-            changes = Changes(d_controls, directions, np.eye(len(x)))
+                d_controls = slope[:steps, :, None] * np.asarray(by_latency)[which]
+            changes = Changes(d_controls, directions, weights)
             solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
-            d_records = np.zeros((0, *records.shape[1:], len(x)))
+            d_records = np.zeros((0, *records.shape[1:], weights.shape[1]))
             if steps and data.static:
                 d_rows, *_ = static_tangents(task.settings, solved, (system, controls), changes)
                 d_records = d_rows[:, :, :size]
@@ -144,9 +157,11 @@ class Misfit:
                     task.coefficients, solved, (system, controls), changes, state
                 )
                 d_records = d_rows[stages - 1 :: stages][compared][:, :, :size]
-            whole = np.concatenate([d_first[None, :, :size], d_records])
+            # zeros in all other columns: one compiled program serves any coordinates
+            whole = np.zeros((*records.shape, len(x)))
+            whole[..., which] = np.concatenate([d_first[None, :, :size], d_records])
             _, slopes = errors_along(system, data.output, every(records), every(whole), data.data)
-            return np.asarray(slopes)[:, : len(records)] / noise
+            return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, every(records), data.data))
         return Rollout(errors[: len(records)] / noise, tangents)
@@ -166,9 +181,9 @@ class Misfit:
         record = np.asarray(rest.records[0][:, :size])
         past = None if data.static else at_one_state(system, settings, record, control)
 
-        def tangents(directions: Any) -> Any:
+        def tangents(directions: Any, weights: np.ndarray) -> Any:
             held, solved = control[None], (rest.records, rest.unknowns)
-            changes = Changes(np.zeros((*held.shape, len(x))), directions, np.eye(len(x)))
+            changes = Changes(np.zeros((*held.shape, weights.shape[1])), directions, weights)
             d_rows, _, d_records = static_tangents(still, solved, (system, held), changes)
             return d_rows[0], past, (np.stack([d_records] * data.settings.memory), np.zeros_like(d_records))
 
@@ -187,9 +202,9 @@ class Misfit:
         known, past = at_start.state.known(settings), at_start.state.history
         record = np.asarray(at_start.record)[:, : system.y_layout.size + system.z_layout.size]
 
-        def tangents(directions: Any) -> Any:
+        def tangents(directions: Any, weights: np.ndarray) -> Any:
             begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings)
-            return np.asarray(d_record), begun, d_past
+            return np.asarray(d_record) @ weights, begun, tuple(np.asarray(part) @ weights for part in d_past)
 
         return _Start(record, past, np.asarray(at_start.control), known, at_start.state.dt is None, tangents)
 

@@ -256,7 +256,7 @@ def _fold(search: Search, point: Point, k: int) -> _Fold:
         return _Fold(None, FAILED, np.zeros(0))
     values, bodies = rollouts[0].values, (len(rollouts[0].values), -1, 6)
     off = values.reshape(bodies)[1:, :, :3]
-    slopes = rollouts[0].derivatives[end.free].reshape(int(end.free.sum()), *bodies)[:, 1:, :, :3]
+    slopes = rollouts[0].derivatives_by(end.free).reshape(int(end.free.sum()), *bodies)[:, 1:, :, :3]
     covariance = end.covariance()[np.ix_(end.free, end.free)]
     spread = np.sqrt(np.einsum("i...,ij,j...->...", slopes, covariance, slopes))
     known = np.isfinite(off)

@@ -424,13 +424,13 @@ class _Descent:
         """Return the derivatives of the values."""
         rollouts = self._at(step)
         assert rollouts is not None
-        self.search.misfit.differentiated(rollouts)
+        self.search.misfit.differentiated(rollouts, self.free)
         scaled = self._scaled(rollouts)
         size = np.abs(scaled)
         # of the square root of the cost
         factor = np.where(size <= ROBUST, 1.0, ROBUST / np.sqrt(np.maximum(huber(scaled)[0], 1.0)))
         parts = zip(rollouts, self.units, self.known, strict=True)
-        rows = [(rollout.derivatives[self.free] / unit)[:, known].T for rollout, unit, known in parts]
+        rows = [(rollout.derivatives_by(self.free) / unit)[:, known].T for rollout, unit, known in parts]
         scaled_rows = np.concatenate(rows) * (factor / self.thinned)[:, None]
         return np.concatenate([scaled_rows, np.diag(self.prior)]) * self.reach
 

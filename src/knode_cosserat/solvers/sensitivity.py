@@ -28,7 +28,7 @@ from knode_cosserat.solvers.space import SpaceScheme
 class Changes(NamedTuple):
     """Tangents of controls, of the system, and of the residual of the tip's conditions.
 
-    The equations are differentiated once for each direction of the system, whatever the number of tangents.
+    The equations are differentiated once for each direction with a weight, whatever the number of tangents.
     """
 
     controls: Float[Any, "T c m"]
@@ -87,6 +87,9 @@ def tangent_time_loop(
         ],
         axis=1,
     )
+    # directions of no tangent need no derivatives of the equations
+    needed = np.any(weights != 0.0, axis=1)
+    moved, weights = moved[needed], weights[needed]
     own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
     table = table_of(steps, len(controls), float(state.t0))
     known = SolvedSteps(parameters_of(system), table, own, *solved, state.records, state.rate)
