@@ -88,6 +88,7 @@ def tangent_time_loop(
         axis=1,
     )
     # directions of no tangent need no derivatives of the equations
+    weights = np.asarray(weights)
     needed = np.any(weights != 0.0, axis=1)
     moved, weights = moved[needed], weights[needed]
     own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
