@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
@@ -22,9 +23,6 @@ from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
-
-#: in the place of zero
-TINY = 1e-200
 
 
 class Spread(NamedTuple):
@@ -86,17 +84,15 @@ class OnlineModel(eqx.Module):
     def moved(self, x: Any) -> tuple[System, Any]:
         """Return the robot, and its tangents by each parameter, stacked; None if there are none.
 
-        Zeros that are adapted are tiny numbers: others are constants of the machine code, which would be
-        compiled again, in the loop, as soon as they move.
+        Zeros that are adapted are no constants of the machine code, which would be compiled again, in the
+        loop, as soon as they move.
         """
         if not self.parameters.size:
             return self.robot, None
         system, directions = jax.tree.map(np.asarray, _moved(self, x))
-
-        def adapted(leaf: Any, moves: Any) -> Any:
-            return np.where((leaf == 0.0) & np.any(moves != 0.0, axis=0), TINY, leaf)
-
-        return jax.tree.map(adapted, system, directions), directions
+        return jax.tree.map(
+            lambda leaf, moves: with_moving(leaf, np.any(moves != 0.0, axis=0)), system, directions
+        ), directions
 
     def rollout(
         self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]

@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.online import errors_along, errors_of
 from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
@@ -84,6 +85,9 @@ class Misfit:
     def __init__(self, model: Model, data: Sequence[Experiment]):
         self.model, self.data = model, tuple(data)
         self._first = True
+        # no value of a number, such as an effect that a robot lacks, needs machine code of its own
+        directions, _ = _directions(model.robot, np.where(model.begin == 0.0, 0.1, model.begin))
+        self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
 
     def differences(
         self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None
@@ -114,7 +118,7 @@ class Misfit:
     def _of_one(self, x: np.ndarray, data: Experiment, rows: int | None) -> Rollout | None:
         seen = len(data.control) if rows is None else min(len(data.control), data.moves + rows)
         steps = seen * data.steps
-        system = _system(self.model.robot, x)
+        system = jax.tree.map(with_moving, _system(self.model.robot, x), self._moving)
         start = self._start(system, x, data)
         if start is None:
             return None
@@ -139,6 +143,7 @@ class Misfit:
 
         def tangents(which: Any) -> np.ndarray:
             directions, by_latency = _directions(self.model.robot, x)
+            directions = jax.tree.map(with_moving, directions, self._moving)
             weights = np.eye(len(x))[:, which]
             d_first, past, d_past = start.tangents(directions, weights)
             controls = acting[:steps]
