@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from knode_cosserat.identification.result import standard_deviations
-from knode_cosserat.identification.search import Point, Problem
+from knode_cosserat.identification.information import Problem
+from knode_cosserat.identification.result import widening
+from knode_cosserat.identification.search import Point
 
 SIZE, RECORDINGS = 30, 3
 
@@ -13,7 +14,7 @@ def point_of(matrices):
     """The end of a search of `SIZE` numbers by linear recordings with these normal equations."""
     count = len(matrices)
     problem = Problem(np.ones(count), np.ones(count), np.zeros((count, SIZE)), np.array(matrices))
-    return Point(np.zeros(SIZE), np.ones(count), problem, problem, np.ones(SIZE, dtype=bool), np.ones(SIZE))
+    return Point(np.zeros(SIZE), np.ones(count), problem, np.ones(SIZE, dtype=bool), np.ones(SIZE))
 
 
 def folds_of(point, correlated, rng):
@@ -32,10 +33,7 @@ def folds_of(point, correlated, rng):
 def test_they_grow_by_the_scatter_of_the_folds(correlated):
     rng = np.random.default_rng(0)
     point = point_of([100.0 * np.diag(rng.uniform(0.5, 2.0, SIZE)) for _ in range(RECORDINGS)])
-    without = np.sqrt(np.diag(point.covariance()))
-    growth = [
-        np.median(standard_deviations(point, folds_of(point, correlated, rng)) / without) for _ in range(40)
-    ]
+    growth = [np.median(widening(point, folds_of(point, correlated, rng))) for _ in range(40)]
     # the jackknife is not small by chance: it leans to the large side (Efron & Stein 1981)
     assert np.sqrt(correlated) <= np.mean(growth) <= 1.4 * np.sqrt(correlated)
 
@@ -43,7 +41,9 @@ def test_they_grow_by_the_scatter_of_the_folds(correlated):
 def test_what_is_held_by_its_prior_stays_so():
     point = point_of([np.diag([1e-3] * SIZE)] * RECORDINGS)
     folds = [np.full(SIZE, float(k)) for k in range(RECORDINGS)]
-    assert np.allclose(standard_deviations(point, folds), np.sqrt(np.diag(point.covariance())))
-    assert np.all(standard_deviations(point_of([100.0 * np.eye(SIZE)] * 3), folds) <= 1.0)
+    assert np.all(widening(point, folds) == 1.0)
+    known = point_of([100.0 * np.eye(SIZE)] * 3)
+    # not above the prior's deviation
+    assert np.allclose(widening(known, folds) ** 2 * np.diag(known.covariance()), 1.0)
     # one recording has nothing to be left out
-    assert np.allclose(standard_deviations(point, []), np.sqrt(np.diag(point.covariance())))
+    assert np.all(widening(known, []) == 1.0)

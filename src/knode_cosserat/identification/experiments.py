@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, States
 from knode_cosserat.estimation.parameters import Model
-from knode_cosserat.identification.steps import steps_per_row, time_scheme
+from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.aspects import Drawing, Ends
@@ -96,6 +96,11 @@ class Experiment:
         if type(self.output) is BodyPositions:  # of two or three coordinates
             return np.full(self.data.shape[1], self.output.sigma)
         return self.output.noise
+
+    @property
+    def is_resolved(self) -> bool:
+        """True if time steps follow a continuous signal, so that shorter ones are nearer to the robot."""
+        return not self.static and is_resolved(self.dt, self.continuous)
 
     def replace(self, **changes: Any) -> Experiment:
         """Return a copy with changed attributes."""

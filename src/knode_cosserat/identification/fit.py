@@ -155,10 +155,11 @@ def with_residual(
     tension = np.concatenate([it.tension for it in measured])
     model = library_model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
     x = coordinates_of(model, identified)
-    residual = passive(model.reduced(x, identified.effects), tension)
-    both = residual_model(model, identified.effects, residual)
+    effects = (*identified.effects, *identified.undecided)
+    residual = passive(model.reduced(x, effects), tension)
+    both = residual_model(model, effects, residual)
     begin = np.zeros(both.size)
-    begin[: np.sum(model.mask(identified.effects))] = x[model.mask(identified.effects)]
+    begin[: np.sum(model.mask(effects))] = x[model.mask(effects)]
     data = experiments_of(measured, model, space)
     return learn_residual(both, begin, data, space, progress or log.info)
 

@@ -18,9 +18,10 @@ from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.effects import library_model, parameter_effects
 from knode_cosserat.identification.experiments import Experiment, experiments_of, measured_rows
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.identification.result import Identified, correlation_of, estimates_of
+from knode_cosserat.identification.posterior import SURE, Posterior
+from knode_cosserat.identification.result import Estimate, Identified, estimates_of
 from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import Selection, held_out, improved, selected, sizes
+from knode_cosserat.identification.selection import Selection, from_far, selected
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.identification.undetermined import gap_of, unexplained
 from knode_cosserat.learning.training.checkpoint import Checkpoints
@@ -44,6 +45,8 @@ SKIPPED = (0, 3, 9)
 #: row 0 disagrees with the initial equilibrium if it is further away than this part of the length, and than
 #: this part of the motion's root mean square
 AWAY, OF_MOTION = 0.01, 0.25
+#: an averaged robot is not used if the logarithm of its differences' size is larger by this
+WORSE = 0.02
 
 Tell = Callable[[str], None]
 
@@ -60,7 +63,7 @@ def identify(
     effects: Sequence[str] | None = None,
     *,
     parameters: Sequence[str] | Literal["all"] | None = None,
-    space: str | SpaceScheme = "lobatto2",
+    space: str | SpaceScheme = "lobatto4",
     progress: Tell | None = None,
     checkpoint: str | Path | None = None,
 ) -> Identified:
@@ -72,11 +75,12 @@ def identify(
     parameters of any system, without priors. One objective serves all: robust squares of differences, each
     kind in units of its usual size, and the priors.
 
-    Without `effects` and `parameters`, effects of a tendon robot are selected: an effect is kept only if it
-    lowers the error of held-out recordings by more than two standard errors of the improvement. A robot with
-    effects has to pass trials with larger and random tensions; effects are removed until it does. Time steps
-    are short enough for vibrations (`identification.steps`), unless tensions are held from row to row. If the
-    grid is too coarse, its nodes are doubled: the result may have more nodes than the nominal robot.
+    Without `effects` and `parameters`, effects of a tendon robot are selected by their probabilities
+    (`identification.posterior`). Where the data do not decide, the robot has the mean over all sets of
+    effects. A robot with effects has to pass trials with larger and random tensions; effects are removed
+    until it does. Between continuous tensions the differences are those of infinitely short time steps, by
+    extrapolation. If the grid is too coarse, its nodes are doubled: the result may have more nodes than the
+    nominal robot.
 
     Args:
         robot: nominal robot, where the search begins; effects need a robot with tendons.
@@ -128,30 +132,29 @@ def identify(
     if any(it.steps > 1 for it in search.misfit.data):
         far = Search(Misfit(model, [it.replace(steps=1) for it in search.misfit.data]), tell, journal=journal)
     try:
+        names, steps = tuple[str, ...](), tuple[str, ...]()
         if effects is not None:
             names = _known([*effects, *(effect.name for effect in plain)], model)
-            selection = Selection(names, far.from_far(model.mask(names)))
+            point = far.from_far(model.mask(names))
         else:
-            selection = selected(far, tell)
-        names, point, steps = selection
-        assert point is not None
-        if search is not far:
-            point = search.run(point.x, model.mask(names))
-        for _ in range(REFINEMENTS):
-            model = search.misfit.model
+            point = from_far(far, tell)
+        for _ in range(REFINEMENTS + 1):
+            if effects is None:
+                names, point, more = selected(search, point, tell)
+                steps += more
+            elif search is not far:
+                point = search.run(point.x, model.mask(names))
             if not has_coarse_rows(model.reduced(point.x, names), search.misfit.data, space):
                 break
             nodes = 2 * model.nominal.nodes
-            tell(f"the grid of {model.nominal.nodes} nodes is too coarse: {nodes} nodes")
+            steps += (f"{nodes} nodes, for the grid was too coarse",)
+            tell(steps[-1])
             search = searched(model.nominal.replace(nodes=nodes))
-            point = search.run(point.x, search.misfit.model.mask(names))
-            steps = (*steps, f"with {nodes} nodes, for the grid was too coarse: {sizes(point)}")
-        selection = Selection(names, point, steps)
-        if effects is None and search is not far:
-            selection = improved(search, selection, tell, ", by the final steps")
+            model = search.misfit.model
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
-    return _accepted(search, selection, space)
+    posterior = Posterior.of(model, point, None if effects is None else names)
+    return _accepted(search, Selection(names, point, steps), posterior, space)
 
 
 # plain parameters
@@ -185,7 +188,9 @@ def _with_parameters(search: Search) -> Identified:
     if not point.converged:
         raise IdentificationError("the search did not converge; begin closer to the data")
     _require_range(model, names, point)
-    result = _result(search, model.reduced(point.x, names), Selection(names, point, tuple(steps)))
+    posterior = Posterior.of(model, point, names)
+    estimates = estimates_of(point, posterior, point.x)
+    result = _result(search, model.reduced(point.x, names), point.x, estimates, posterior, steps)
     undetermined = tuple(name for name in model.names if name not in names)
     return dataclasses.replace(result, undetermined=undetermined)
 
@@ -204,7 +209,7 @@ def _from_far(search: Search, free: np.ndarray) -> Point:
                 raise
             continue
         points.append(point)
-        if point.converged and not unexplained(search, point):
+        if point.converged and not unexplained(search, point.x):
             return point
     return min(points, key=lambda point: (not point.converged, float(np.sum(np.log(point.scale)))))
 
@@ -252,31 +257,31 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
     return tuple(name for name in model.names if name in wanted)
 
 
-def _accepted(search: Search, selection: Selection, space: str | SpaceScheme) -> Identified:
+def _accepted(
+    search: Search, selection: Selection, posterior: Posterior, space: str | SpaceScheme
+) -> Identified:
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails."""
     model, data = search.misfit.model, search.misfit.data
     names, point, steps = selection.names, selection.point, list(selection.steps)
-    assert point is not None
     while True:
-        robot = model.reduced(point.x, names)
+        x, kept = _averaged(search, names, point, posterior)
+        robot = model.reduced(x, kept)
         reason = failed_trial(robot, data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
         search.tell(f"not accepted: {reason}")
         if not added:
-            steps.append(f"the nominal robot is returned: {reason}")
-            return _result(search, model.nominal, Selection((), None, tuple(steps)))
-        # costs without an effect, by the equations linear about the point
-        costs = {
-            name: held_out(point.problem, point.x, model.mask({*names} - {name}), model.bounds)
-            for name in added
+            return _nominal(search, (*steps, f"the nominal robot is returned: {reason}"))
+        fewer = {
+            name: tuple(it for it in names if name not in (it, *model.effect(it).needs)) for name in added
         }
-        weakest = min(costs, key=lambda name: costs[name])
+        weakest = max(added, key=lambda name: posterior.evidence(fewer[name]))
         steps.append(f"without {weakest}: {reason}")
-        names = tuple(name for name in names if name != weakest and weakest not in model.effect(name).needs)
+        names = fewer[weakest]
         free = model.mask(names)
-        point = search.run(np.where(free, point.x, 0.0), free, scale=point.scale)
+        point = search.run(np.where(free, point.x, 0.0), free)
+        posterior = Posterior.of(model, point, names)
     errors: list[float | None] = [None]
     folds = []
     if len(data) > 1:
@@ -286,13 +291,34 @@ def _accepted(search: Search, selection: Selection, space: str | SpaceScheme) ->
         nominal = _errors(search, np.zeros(model.size))
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
         if np.mean(unseen) >= np.mean(before):
-            steps.append("the nominal robot is returned: it predicts held-out recordings as well")
-            return _result(search, model.nominal, Selection((), None, tuple(steps)))
+            reason = "the nominal robot is returned: it predicts held-out recordings as well"
+            return _nominal(search, (*steps, reason))
     robot = robot.replace(trained=trained_range(robot, data, space))
-    result = _result(search, robot, Selection(names, point, tuple(steps)), folds)
+    result = _result(search, robot, x, estimates_of(point, posterior, x, folds), posterior, steps)
     return dataclasses.replace(
         result, held_out_error={it.name: error for it, error in zip(data, errors, strict=True)}
     )
+
+
+def _averaged(
+    search: Search, names: Sequence[str], point: Point, posterior: Posterior
+) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return the mean coordinates over all sets of effects, and the effects that are not improbable.
+
+    If the robot with them is further from the data than the selected effects, those are returned.
+    """
+    kept = posterior.names(1.0 - SURE)
+    x = np.where(search.misfit.model.mask(kept), posterior.mean, 0.0)
+    if set(kept) != set(names):
+        rollouts = search.solved(x)
+        if rollouts is None or np.mean(np.log(search.scales_of(rollouts) / point.scale)) > WORSE:
+            return np.where(point.free, point.x, 0.0), tuple(names)
+    return x, kept
+
+
+def _nominal(search: Search, steps: Sequence[str]) -> Identified:
+    errors = _errors_by_name(search, np.zeros(search.misfit.model.size))
+    return Identified(search.misfit.model.nominal, nominal_error=errors, error=errors, steps=tuple(steps))
 
 
 # errors of the tip
@@ -328,7 +354,7 @@ def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -
     """Return the root mean square error of the last body's position (m), by experiment."""
     chosen = [search.misfit.data[k] for k in (range(len(search.misfit.data)) if which is None else which)]
     errors: list[float | None] = []
-    for data, rollout in zip(chosen, search.misfit.differences(x, which=which), strict=True):
+    for data, rollout in zip(chosen, search.misfit.whole(x, which), strict=True):
         if rollout is None or _places(data) is None:
             errors.append(None)
             continue
@@ -337,22 +363,24 @@ def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -
     return errors
 
 
+def _errors_by_name(search: Search, x: np.ndarray) -> dict[str, float | None]:
+    return dict(zip((data.name for data in search.misfit.data), _errors(search, x), strict=True))
+
+
 def _result(
-    search: Search, robot: System, selection: Selection, folds: Sequence[np.ndarray] = ()
-) -> Identified:
-    """Return the result with an identified robot; `folds` are ends of searches without one recording each."""
-    model, (names, point, steps) = search.misfit.model, selection
-    recordings = [data.name for data in search.misfit.data]
-    nominal = dict(zip(recordings, _errors(search, np.zeros(model.size)), strict=True))
-    if point is None:
-        return Identified(robot, nominal_error=nominal, error=nominal, steps=steps)
+    search: Search, robot: System, x: np.ndarray, estimates: Sequence[Estimate], posterior: Posterior,
+    steps: Sequence[str],
+) -> Identified:  # fmt: skip
+    """Return the result with an identified robot at some coordinates."""
+    probable = {it.effect: it.probability for it in estimates}
     return Identified(
         robot=robot,
-        effects=names,
-        estimates=tuple(estimates_of(model, names, point, folds)),
-        correlation=correlation_of(model, names, point),
-        nominal_error=nominal,
-        error=dict(zip(recordings, _errors(search, point.x), strict=True)),
-        unexplained=unexplained(search, point),
-        steps=steps,
+        effects=tuple(name for name, share in probable.items() if share >= SURE),
+        undecided={name: share for name, share in probable.items() if share < SURE},
+        estimates=tuple(estimates),
+        correlation=posterior.correlation([it.label for it in estimates]),
+        nominal_error=_errors_by_name(search, np.zeros(len(x))),
+        error=_errors_by_name(search, x),
+        unexplained=unexplained(search, x),
+        steps=tuple(steps),
     )

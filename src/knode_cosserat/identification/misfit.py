@@ -7,6 +7,7 @@ in the online observers (`estimation.online.errors_along`).
 from __future__ import annotations
 
 import concurrent.futures
+import copy
 import dataclasses
 import functools
 from collections.abc import Callable, Sequence
@@ -44,11 +45,22 @@ RECOVERY = 0.5
 
 
 class Rollout:
-    """A simulated experiment: differences from its data in units of the noise; NaN where there are none."""
+    """A simulated experiment: differences from its data in units of the noise; NaN where there are none.
 
-    def __init__(self, values: Float[np.ndarray, "rows e"], tangents: Callable[[Any], np.ndarray]):
-        self.values, self._tangents = values, tangents
+    `offset` is what finer time steps add to the differences; it is part of the values.
+    """
+
+    def __init__(
+        self, values: Float[np.ndarray, "rows e"], tangents: Callable[[Any], np.ndarray], offset: Any = 0.0
+    ):
+        self.values, self.offset, self._tangents = values + offset, offset, tangents
         self._last: tuple[bytes, np.ndarray] = b"", np.zeros(0)
+
+    def moved(self, offset: Any) -> Rollout:
+        """Return it with another offset."""
+        copied = copy.copy(self)
+        copied.values, copied.offset = self.values - self.offset + offset, offset
+        return copied
 
     @functools.cached_property
     def derivatives(self) -> Float[np.ndarray, "n rows e"]:
@@ -90,17 +102,53 @@ class Misfit:
         self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
 
     def differences(
-        self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None
-    ) -> list[Rollout | None]:
+        self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None,
+        offsets: Sequence[Any] | None = None,
+    ) -> list[Rollout | None]:  # fmt: skip
         """Return the rollouts of all experiments, or of those with the given numbers; None if one failed.
 
         Args:
             x: coordinates.
             rows: rows after the first in motion that are simulated; None: all.
             which: numbers of experiments.
+            offsets: of the differences of each rollout; None: zero.
         """
-        chosen = [self.data[k] for k in (range(len(self.data)) if which is None else which)]
-        return self._parallel(lambda data: self._of_one(np.asarray(x, dtype=float), data, rows), chosen)
+        chosen = self._chosen(which)
+        found = self._parallel(lambda data: self._of_one(np.asarray(x, dtype=float), data, rows), chosen)
+        pairs = zip(found, offsets or [0.0] * len(found), strict=True)
+        return [None if each is None else each.moved(offset) for each, offset in pairs]
+
+    def refined(
+        self, rollouts: Sequence[Rollout], x: Float[np.ndarray, " n"], which: Sequence[int] | None = None
+    ) -> list[Rollout]:
+        """Return whole rollouts at a point with the differences of infinitely short steps, as an offset.
+
+        It is extrapolated from half the steps (Richardson), for schemes of order two. Derivatives are those
+        of the longer steps. Rollouts with held controls, which belong to one scheme, have no offset.
+        """
+
+        def finer(data: Experiment) -> Rollout | None:
+            if not data.is_resolved:
+                return None
+            return self._of_one(np.asarray(x, dtype=float), data.replace(steps=2 * data.steps), None)
+
+        found = self._parallel(finer, self._chosen(which))
+        return [
+            each if other is None else each.moved(4.0 / 3.0 * (other.values - each.values + each.offset))
+            for each, other in zip(rollouts, found, strict=True)
+        ]
+
+    def whole(self, x: Float[np.ndarray, " n"], which: Sequence[int] | None = None) -> list[Rollout | None]:
+        """Return the refined rollouts of whole experiments at a point; None if one failed."""
+        found = self.differences(x, which=which)
+        numbers = range(len(self.data)) if which is None else which
+        return [
+            None if each is None else self.refined([each], x, [k])[0]
+            for each, k in zip(found, numbers, strict=True)
+        ]
+
+    def _chosen(self, which: Sequence[int] | None) -> list[Experiment]:
+        return [self.data[k] for k in (range(len(self.data)) if which is None else which)]
 
     def differentiated(
         self, rollouts: Sequence[Rollout], which: Bool[np.ndarray, " n"] | None = None

@@ -13,21 +13,13 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from knode_cosserat.estimation.parameters import RESIDUAL, Effect, Model, Number, Replace
 from knode_cosserat.identification.experiments import Experiment
+from knode_cosserat.identification.information import Problem, normal_equations
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.identification.search import (
-    FINE,
-    Point,
-    Problem,
-    Search,
-    SearchError,
-    Subset,
-    normal_equations,
-)
-from knode_cosserat.identification.selection import held_out
+from knode_cosserat.identification.search import FINE, Point, Search, SearchError, Subset
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import PARTS, POSITIVE, Passive
@@ -40,6 +32,8 @@ WIDTHS = {"stiffness": 0.2, "levers": 0.3, "energy": 0.2, "damping": 1.0, "dissi
 TRIED = (0.3, 1.0, 3.0)
 #: least expected reduction of the held-out cost by a part
 PROMISE = 4.0
+#: smallest remaining fraction of the cost in linearised predictions
+LEAST_LEFT = 1e-3
 #: fractions of the residual that are tried beside all of it
 SHRUNK = (0.5, 0.25)
 #: evaluations of a search without one recording, and the fall of the cost at its end
@@ -160,7 +154,7 @@ def learn_residual(
     scale = search.scales_of(rollouts)
     problem = normal_equations(rollouts, search.units(scale), search.thinned())
     identified = [name for name in model.names if not name.startswith(RESIDUAL)]
-    point = Point(begin, scale, problem, problem, model.mask(identified), search.prior)
+    point = Point(begin, scale, problem, model.mask(identified), search.prior)
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
     before, steps = [fold.errors for fold in without], list[str]()
@@ -232,6 +226,59 @@ def promising(problem: Problem, x: Float[np.ndarray, " n"], model: Model) -> dic
             return widths
         cost, part, width = min(options)
         widths[part] = width
+
+
+def held_out(
+    problem: Problem,
+    x: Float[np.ndarray, " n"],
+    free: Bool[np.ndarray, " n"],
+    bounds: Float[np.ndarray, "2 n"],
+) -> float:
+    """Return the cost of recordings that were each left out of a search, linearised about a point.
+
+    It is -2 times the logarithm of the likelihood of differences of unknown size, by recording. Parameters
+    that are not free are nominal.
+    """
+    total = 0.0
+    for k, move in enumerate(_moves(problem, x, free, bounds)):
+        cost = problem.cost[k] + 2.0 * problem.gradient[k] @ move + move @ problem.matrix[k] @ move
+        total += problem.amount[k] * np.log(max(cost, LEAST_LEFT * problem.cost[k]) / problem.amount[k])
+    return float(total)
+
+
+def _moves(
+    problem: Problem,
+    x: Float[np.ndarray, " n"],
+    free: Bool[np.ndarray, " n"],
+    bounds: Float[np.ndarray, "2 n"],
+) -> list[Float[np.ndarray, " n"]]:
+    """Return the moves of searches that leave out one part each, linearised about a point."""
+    count = len(problem.cost)
+    moves = []
+    for k in range(count):
+        others = [j for j in range(count) if j != k] or [k]
+        gradient, matrix = problem.gradient[others].sum(axis=0), problem.matrix[others].sum(axis=0)
+        moves.append(_linear(x, free, gradient, matrix, bounds))
+    return moves
+
+
+def _linear(
+    x: np.ndarray, free: np.ndarray, gradient: np.ndarray, matrix: np.ndarray, bounds: np.ndarray
+) -> np.ndarray:
+    """Return the move to the least cost, with the prior, of the free numbers within their bounds."""
+    fixed, (low, high) = np.where(free, 0.0, -x), bounds
+    active = free.copy()
+    for _ in range(len(x)):
+        where = np.ix_(active, active)
+        right = gradient[active] + (matrix @ fixed)[active] + x[active]
+        move = fixed.copy()
+        move[active] = -np.linalg.solve(matrix[where] + np.eye(int(active.sum())), right)
+        beyond = active & ((x + move < low - 1e-9) | (x + move > high + 1e-9))
+        if not beyond.any():
+            return move
+        fixed = np.where(beyond, np.clip(x + move, low, high) - x, fixed)
+        active &= ~beyond
+    return fixed
 
 
 # acceptance

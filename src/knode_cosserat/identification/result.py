@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._reprs import robot_text, wrapped
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.search import Point
 from knode_cosserat.rods.system import System
 
@@ -23,8 +23,9 @@ HELD = 0.8
 class Estimate(NamedTuple):
     """One identified number, of an effect or of the parameter with that name.
 
-    `error` is its standard error, and `interval` contains it with a probability of 95 % if the remaining
-    differences are noise. `held` is true if the data say little about it beyond its prior.
+    `error` is its standard error, and `interval` contains it with a probability of 95 %, the doubt about the
+    set of effects included. `held` is true if the data say little about it beyond its prior. `probability` is
+    that of the effect; the value is the mean with and without it.
     """
 
     effect: str
@@ -35,6 +36,7 @@ class Estimate(NamedTuple):
     interval: tuple[float, float]
     held: bool = False
     error: float = np.nan
+    probability: float = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -43,7 +45,10 @@ class Identified:
 
     Attributes:
         robot: the identified robot; from recordings a controls row is the measured tensions.
-        effects: the effects that it has, and the parameters that were searched for.
+        effects: the effects that it has, with a probability of 95 % each, and the parameters that were
+            searched for.
+        undecided: effects that it may have, and their probabilities; the data do not decide. The robot has
+            the mean of what they would change.
         estimates: their numbers with 95 % intervals.
         correlation: correlation of the numbers' errors, in the order of `estimates` (n, n).
         nominal_error: by recording, root mean square error of the tip of the nominal robot (m).
@@ -56,6 +61,7 @@ class Identified:
 
     robot: System
     effects: tuple[str, ...] = ()
+    undecided: Mapping[str, float] = dataclasses.field(default_factory=dict)
     estimates: tuple[Estimate, ...] = ()
     correlation: Float[np.ndarray, "n n"] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     nominal_error: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
@@ -81,6 +87,7 @@ class Identified:
         """Return everything but the robot, as JSON has it."""
         return {
             "effects": list(self.effects),
+            "undecided": dict(self.undecided),
             "estimates": [it._asdict() | {"interval": list(it.interval)} for it in self.estimates],
             "correlation": self.correlation.tolist(),
             "nominal_error": dict(self.nominal_error),
@@ -120,12 +127,15 @@ class Identified:
             rows.append(
                 (
                     effect, it.label, it.unit, f"{it.nominal:.6g}", value, f"{low} to {high}",
-                    "held by its prior" if it.held else "",
+                    "held by its prior" if it.held else "" if it.probability >= SURE else "undecided",
                 )
             )  # fmt: skip
         if not any(row[0] for row in rows[1:]):
             rows = [row[1:] for row in rows]
         lines = _table(rows)
+        if self.undecided:
+            words = ", ".join(f"{name} ({share:.0%})" for name, share in self.undecided.items())
+            lines.append(f"not decided by these data, with probabilities: {words}")
         if self.undetermined:
             lines.append(f"not determined by these data, unchanged: {', '.join(self.undetermined)}")
         if self.unexplained:
@@ -158,60 +168,48 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
 
 
 def estimates_of(
-    model: Model, names: Sequence[str], point: Point, folds: Sequence[Float[np.ndarray, " n"]] = ()
-) -> list[Estimate]:
-    """Return the numbers of the named effects with their intervals.
+    point: Point, posterior: Posterior, x: Float[np.ndarray, " n"],
+    folds: Sequence[Float[np.ndarray, " n"]] = (),
+) -> list[Estimate]:  # fmt: skip
+    """Return the numbers of effects that are not improbable, with their intervals.
 
     Args:
-        model: all effects.
-        names: the identified effects.
-        point: end of their search.
+        point: end of a search.
+        posterior: probabilities about that point.
+        x: coordinates of the identified robot.
         folds: ends of searches that left one recording out each.
     """
-    # imported here: it takes a third of a second
-    from scipy.special import stdtrit
-
-    x, spread = point.x, standard_deviations(point, folds)
-    amount = float(np.sum(point.problem.amount)) - float(np.sum(point.free))
-    reach = float(stdtrit(max(amount, 1.0), 0.5 + LEVEL / 2.0))
-    low, high = model.bounds
+    model, wider = posterior.model, widening(point, folds)
+    ends, spread = posterior.interval(LEVEL, wider), wider * posterior.deviation
     estimates = []
-    for name in names:
+    for name in posterior.names(1.0 - SURE):
         for k in range(*model.slice(name).indices(model.size)):
             number = model.numbers[k]
-            ends = np.clip([x[k] - reach * spread[k], x[k] + reach * spread[k]], low[k], high[k])
-            first, last = map(number.value, ends)
+            first, last = map(number.value, ends[:, k])
             value = float(np.clip(number.value(x[k]), number.low, number.high))
             held = bool(not number.flat and spread[k] > HELD and abs(x[k]) < 1.0)
             error = float(abs(number.slope(value)) * spread[k])
             estimates.append(
                 Estimate(
-                    name, number.label, number.unit, number.nominal, value, (first, last), held, error
+                    name, number.label, number.unit, number.nominal, value, (first, last), held, error,
+                    posterior.probability[name],
                 )
             )  # fmt: skip
     return estimates
 
 
-def correlation_of(model: Model, names: Sequence[str], point: Point) -> Float[np.ndarray, "n n"]:
-    """Return the correlation of the errors of the named effects' numbers."""
-    mask = model.mask(names)
-    covariance = point.covariance()[np.ix_(mask, mask)]
-    spread = np.sqrt(np.diag(covariance))
-    return covariance / np.outer(spread, spread)
+def widening(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> Float[np.ndarray, " n"]:
+    """Return the factors by which estimates without one recording scatter more than expected, at least 1.
 
-
-def standard_deviations(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> Float[np.ndarray, " n"]:
-    """Return the standard deviations of the coordinates, widened by the scatter of the folds.
-
-    Least squares assumes random differences; those of an incomplete model are systematic. Estimates that
-    leave out one recording then scatter more than expected (jackknife, Efron & Stein 1981). All standard
-    deviations are multiplied by the root of the mean ratio of both variances, up to the prior's.
+    Least squares assumes random differences; those of an incomplete model are systematic, and differ between
+    recordings. The factor is the root of the mean ratio of both variances (jackknife, Efron & Stein 1981), up
+    to the prior's deviation.
     """
     spread = np.sqrt(np.diag(point.covariance()))
     count = len(folds)
     free = point.free & (spread < HELD)
     if count < 2 or not free.any():
-        return spread
+        return np.ones(len(spread))
     scatter = (count - 1) ** 2 / count * np.var(np.array(folds), axis=0, ddof=1)
-    ratio = float(np.mean(scatter[free] / spread[free] ** 2))
-    return np.where(free, np.minimum(spread * np.sqrt(max(ratio, 1.0)), 1.0), spread)
+    ratio = float(np.sqrt(max(1.0, np.mean(scatter[free] / spread[free] ** 2))))
+    return np.where(free, np.minimum(ratio, 1.0 / spread), 1.0)

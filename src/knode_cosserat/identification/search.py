@@ -7,18 +7,18 @@ field, by Huber's loss, and priors of the numbers. `scipy.optimize.least_squares
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import logging
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from knode_cosserat._files.writing import package_version
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.experiments import Experiment
+from knode_cosserat.identification.information import ROBUST, Problem, dispersion, huber, normal_equations
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, hashed
 
@@ -31,17 +31,11 @@ HORIZONS = (0.0, 1 / 64, 1 / 32, 1 / 16, 1 / 8, 1 / 4, 1 / 2)
 CORRELATED = 0.25
 #: largest number of independent bodies
 BODIES = 2.0
-#: threshold of the Huber loss, in units of the scale
-ROBUST = 3.0
 #: smallest scale of the differences: as a fraction of the length where a model with priors is not exact, and
 #: of natural sizes otherwise, ten times the solver's tolerance
 LEAST_SCALE, LEAST = 5e-4, 1e-9
 #: the scale is at least this part of the root mean square: fields may be zero in most rows
 OF_ALL = 0.2
-#: number of held-out pieces of a single recording
-FOLDS = 5
-#: duration of the blocks (s) for the scatter of an effect's improvement; at least two blocks
-BLOCK = 1.0
 #: evaluations of a search at one horizon, and of the last one; parts by which the cost falls at their end
 ROUGH, FINE = (6, 2e-2), (25, 1e-3)
 #: the same without priors, where a start may be far
@@ -56,16 +50,6 @@ class SearchError(KnodeCosseratError, RuntimeError):
     """A search cannot go on; one line says why."""
 
     code = "search"
-
-
-class Problem(NamedTuple):
-    """Normal equations at a point: robust cost, gradient and Gauss-Newton matrix of each recording."""
-
-    cost: Float[np.ndarray, " R"]
-    #: number of independent differences
-    amount: Float[np.ndarray, " R"]
-    gradient: Float[np.ndarray, "R n"]
-    matrix: Float[np.ndarray, "R n n"]
 
 
 class Subset(NamedTuple):
@@ -85,9 +69,7 @@ class Point:
     x: Float[np.ndarray, " n"]
     #: by experiment and field; of poses in m
     scale: Float[np.ndarray, "R G"]
-    #: of the rows that are left out together, and of their blocks (equally many in each part), in order
     problem: Problem
-    blocks: Problem
     free: Bool[np.ndarray, " n"]
     #: precision of each coordinate's prior
     prior: Float[np.ndarray, " n"]
@@ -95,13 +77,12 @@ class Point:
 
     def facts(self) -> dict[str, Any]:
         """Return its attributes, for a file."""
-        return {**vars(self), "problem": self.problem._asdict(), "blocks": self.blocks._asdict()}
+        return {**vars(self), "problem": self.problem._asdict()}
 
     @classmethod
     def of(cls, facts: dict[str, Any]) -> Self:
         """Return the point with these attributes: the inverse of `facts`."""
-        problems = {name: Problem(**facts[name]) for name in ("problem", "blocks")}
-        return cls(**{**facts, **problems})
+        return cls(**{**facts, "problem": Problem(**facts["problem"])})
 
     @property
     def cost(self) -> float:
@@ -115,36 +96,6 @@ class Point:
         matrix = self.problem.matrix.sum(axis=0)[np.ix_(free, free)] + np.diag(self.prior[free])
         full[np.ix_(free, free)] = np.linalg.inv(matrix)
         return full
-
-
-def huber(values: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray]:
-    """Return Huber's cost of scaled differences, and their weights."""
-    size = np.abs(values)
-    weights = np.where(size <= ROBUST, 1.0, ROBUST / np.maximum(size, ROBUST))
-    return np.where(size <= ROBUST, values**2, 2.0 * ROBUST * size - ROBUST**2), weights
-
-
-def normal_equations(
-    rollouts: Sequence[Rollout], units: Sequence[np.ndarray], thinned: float,
-    folds: Sequence[Any] = (slice(None),), derivatives: bool = True,
-) -> Problem:  # fmt: skip
-    """Return the normal equations, of each fold of each rollout; a difference counts 1 / `thinned`.
-
-    `units` are sizes (e,) of the differences of each rollout.
-    """
-    parts = []
-    for rollout, unit in zip(rollouts, units, strict=True):
-        for fold in folds:
-            scaled = rollout.values[fold] / unit
-            known = np.isfinite(scaled)
-            cost, weights = huber(scaled[known])
-            gradient, matrix = np.zeros(0), np.zeros((0, 0))
-            if derivatives:
-                slopes = (rollout.derivatives[:, fold] / unit)[:, known]
-                weighted = slopes * weights
-                gradient, matrix = weighted @ scaled[known], weighted @ slopes.T
-            parts.append((cost.sum() / thinned, known.sum() / thinned, gradient / thinned, matrix / thinned))
-    return Problem(*(np.array(part) for part in zip(*parts, strict=True)))
 
 
 class Search:
@@ -193,26 +144,8 @@ class Search:
         sizes = np.array([np.max(usual[groups == k]) for k in range(len(fields))])
         return LEAST * np.where(sizes > 0.0, sizes, 1.0)
 
-    @property
-    def folds(self) -> list[slice]:
-        """Rows that are left out together: a whole recording, or one piece of a single recording."""
-        first = self.misfit.data[0]
-        if len(self.misfit.data) > 1:
-            return [slice(None)]
-        if first.static:
-            return [slice(k, None, FOLDS) for k in range(FOLDS)]
-        edges = np.linspace(0, len(first.control) + 1, FOLDS + 1).astype(int)
-        return [slice(low, high) for low, high in itertools.pairwise(edges)]
-
-    def blocks(self, count: int) -> list[Int[np.ndarray, " m"]]:
-        """Return the indices of rows in the blocks of each fold, one fold after the other."""
-        first = self.misfit.data[0]
-        rows = [np.arange(count)[fold] for fold in self.folds]
-        pieces = FOLDS if first.static else max(2, round(min(map(len, rows)) * first.dt / BLOCK))
-        return [block for fold in rows for block in np.array_split(fold, pieces)]
-
     def thinned(self) -> float:
-        """Return the number of differences that count as one, for correlation in time and between bodies."""
+        """Return a guess of the number of differences that count as one (`information.dispersion`)."""
         data = self.misfit.data[0]
         if self.exact:
             return 1.0
@@ -298,6 +231,8 @@ class Search:
             descent = _Descent(self, subset, x, free, rollouts, sizes)
             used, converged = descent.run(budget, fall)
             x, rollouts, remaining = descent.x, descent.rollouts, remaining - used
+            if subset.rows is None:
+                rollouts = self.misfit.refined(rollouts, x, which)
             after = self.scales_of(rollouts, which)
             horizon = "all rows" if subset.rows is None else f"{subset.rows} rows"
             text = ", ".join(f"{1e3 * size:.2f}" for size in after[:, 0])
@@ -308,15 +243,12 @@ class Search:
         sizes = self.scales_of(rollouts, which) if scale is None else scale
         units = self.units(sizes, which)
         self.misfit.differentiated(rollouts)
-        if self.exact:
-            problem = normal_equations(rollouts, units, self.thinned())
-            return Point(x, sizes, problem, problem, free, self.prior, converged)
-        # a short horizon has fewer rows of a recording that rests for less time
-        count = min(len(rollout.values) for rollout in rollouts)
-        blocks = normal_equations(rollouts, units, self.thinned(), self.blocks(count))
-        parts = len(rollouts) * len(self.folds)
-        problem = Problem(*(part.reshape(parts, -1, *part.shape[1:]).sum(axis=1) for part in blocks))
-        return Point(x, sizes, problem, blocks, free, self.prior, converged)
+        thinned = self.thinned()
+        if not self.exact:
+            data = [self.misfit.data[k] for k in (range(len(self.misfit.data)) if which is None else which)]
+            thinned = dispersion(rollouts, units, [0.0 if it.static else it.dt for it in data], free)
+        problem = normal_equations(rollouts, units, thinned)
+        return Point(x, sizes, problem, free, self.prior, converged)
 
     def scales_of(self, rollouts: Sequence[Rollout], which: Sequence[int] | None = None) -> np.ndarray:
         """Return the usual size (R, G) of the differences by experiment and field.
@@ -343,9 +275,14 @@ class Search:
         chosen = range(len(self.misfit.data)) if which is None else which
         return [sizes[self.misfit.data[k].groups] for sizes, k in zip(scale, chosen, strict=True)]
 
-    def solved(self, x: np.ndarray, subset: Subset = ALL) -> list[Rollout] | None:
-        """Return the rollouts at a point; None if one failed."""
-        rollouts = self.misfit.differences(x, *subset)
+    def solved(
+        self, x: np.ndarray, subset: Subset = ALL, offsets: Sequence[Any] | None = None
+    ) -> list[Rollout] | None:
+        """Return the rollouts at a point; None if one failed. Whole ones are refined without `offsets`."""
+        if offsets is None and subset.rows is None:
+            rollouts = self.misfit.whole(x, subset.which)
+        else:
+            rollouts = self.misfit.differences(x, *subset, offsets)
         return None if any(it is None for it in rollouts) else rollouts  # type: ignore[return-value]
 
 
@@ -366,7 +303,7 @@ class _Descent:
         self.units, self.thinned = search.units(self.sizes, self.subset.which), np.sqrt(search.thinned())
         self.known = [np.isfinite(rollout.values) for rollout in self.rollouts]
         self.last: tuple[bytes, list[Rollout] | None] = (self.x[free].tobytes(), self.rollouts)
-        self.prior = np.sqrt(search.prior[free])
+        self.prior, self.offsets = np.sqrt(search.prior[free]), [it.offset for it in self.rollouts]
 
     def run(self, most: int, fall: float) -> tuple[int, bool]:
         """Minimise; return the number of evaluations and a flag of convergence."""
@@ -408,7 +345,7 @@ class _Descent:
         x = self._whole(step)
         key = x[self.free].tobytes()
         if self.last[0] != key:
-            self.last = key, self.search.solved(x, self.subset)
+            self.last = key, self.search.solved(x, self.subset, self.offsets)
         return self.last[1]
 
     def values(self, step: np.ndarray) -> np.ndarray:

@@ -67,19 +67,19 @@ def _combination(names: np.ndarray, parts: np.ndarray) -> tuple[tuple[str, ...],
     return involved[-1:], f"these data determine only a combination of {listed}"
 
 
-def unexplained(search: Search, point: Point) -> tuple[str, ...]:
+def unexplained(search: Search, x: np.ndarray) -> tuple[str, ...]:
     """Return the fields whose remaining differences are not noise: rows are correlated at large lags."""
     fields: dict[str, None] = {}
-    rollouts = search.misfit.differences(point.x)
-    for k, (data, rollout) in enumerate(zip(search.misfit.data, rollouts, strict=True)):
+    for k, (data, rollout) in enumerate(zip(search.misfit.data, search.misfit.whole(x), strict=True)):
         if rollout is None or data.static:
             continue
+        [scale] = search.scales_of([rollout], [k])
         values = rollout.values[1:]
         known = np.isfinite(values)
         values = np.where(known, values, 0.0)
         for field, name in enumerate(data.fields):
             rows, least = values[:, data.groups == field], search.least[k][field]
-            if point.scale[k, field] <= NEAR * least:
+            if scale[field] <= NEAR * least:
                 continue
             for lag in LAGS:
                 one, other = rows[:-lag], rows[lag:]
