@@ -611,13 +611,15 @@ class TangentCore(_TangentCode):
         with f.loop(count) as d:
             own = f.pointer(directions, d.value * self.direction_size)
             weight = f.load(weights, d.value * width, L)
-            for source, target in (
-                *((self.moved[name], target) for name, target in self.results.items()), (self.dh, t.lengths)
-            ):  # fmt: skip
-                with f.loop(source.count) as j:
-                    for i in range(source.size):
-                        number = f.load(j.address(own, source.place), source.at(i, 0))
-                        self._put(self._get(target, i, j, L) + weight * number, target, i, j, L)
+            with f.if_(f.any(f.apply("abs", weight) > 0.0)):
+                for source, target in (
+                    *((self.moved[name], target) for name, target in self.results.items()),
+                    (self.dh, t.lengths),
+                ):
+                    with f.loop(source.count) as j:
+                        for i in range(source.size):
+                            number = f.load(j.address(own, source.place), source.at(i, 0))
+                            self._put(self._get(target, i, j, L) + weight * number, target, i, j, L)
         write(self, self._solution_and_records(coefficients), L, False)
         with f.loop(len(self.grid.nodes)) as node:
             at = f.pointer(row, node.value * width * t.row.size)

@@ -130,7 +130,9 @@ def identify(
     search = far = searched(robot)
     model = search.misfit.model
     if any(it.steps > 1 for it in search.misfit.data):
-        far = Search(Misfit(model, [it.replace(steps=1) for it in search.misfit.data]), tell, journal=journal)
+        # a begin need not be accurate
+        rough = [it.replace(steps=1) for it in experiments_of(measured, model, "lobatto2")]
+        far = Search(Misfit(model, rough), tell, journal=journal)
     try:
         names, steps = tuple[str, ...](), tuple[str, ...]()
         if effects is not None:
