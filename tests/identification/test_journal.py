@@ -43,7 +43,7 @@ class Curve:
             np.zeros(1), name=name,
         )  # fmt: skip
 
-    def differences(self, x, rows=None, which=None):
+    def differences(self, x, rows=None, which=None, offsets=None):
         self.calls += 1
         value = np.tanh(x @ self.shape)
         slope = np.broadcast_to(((1.0 - value**2) * self.shape)[:, :, None], (3, ROWS, 3 * BODIES))
@@ -51,6 +51,12 @@ class Curve:
         if self.fails:
             return [None for _ in chosen]
         return [Rollout(value[:, None] - it.data, lambda which: slope[which]) for it in chosen]
+
+    def whole(self, x, which=None):
+        return self.differences(x, None, which)
+
+    def refined(self, rollouts, x, which=None):
+        return rollouts
 
     def differentiated(self, rollouts, which=None):
         pass

@@ -134,7 +134,7 @@ class Sampling(NamedTuple):
     ] = None
     seconds: Annotated[float | None, option("S", "Duration used (s).", show_default="to the end")] = None
     dt: Annotated[float, option("S", "Time between rows of a recording (s).")] = 0.0125
-    space: Space = "lobatto2"
+    space: Space = "lobatto4"
 
     @property
     def end(self) -> float | None:

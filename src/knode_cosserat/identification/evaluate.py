@@ -72,7 +72,7 @@ class Evaluation:
 
 def coverage(
     members: Iterable[System], measured: Measurements, level: float = 0.9, *,
-    space: str | SpaceScheme = "lobatto2",
+    space: str | SpaceScheme = "lobatto4",
 ) -> float:  # fmt: skip
     """Return the fraction of the measured positions within the spread of several models.
 
@@ -106,7 +106,7 @@ def coverage(
 
 
 def predict(
-    robot: System, measured: Measurements, *, space: str | SpaceScheme = "lobatto2",
+    robot: System, measured: Measurements, *, space: str | SpaceScheme = "lobatto4",
     recovery: float | None = None,
 ) -> Trajectory:  # fmt: skip
     """Return the motion of a robot under measured tensions, or motor angles, in the rows of the recording.
@@ -136,7 +136,7 @@ def predict(
 
 def evaluate(
     robot: System, measured: Measurements, *, every: int = 1, last: int | None = None,
-    space: str | SpaceScheme = "lobatto2", recovery: float = RECOVERY,
+    space: str | SpaceScheme = "lobatto4", recovery: float = RECOVERY,
 ) -> Evaluation:  # fmt: skip
     """Predict a recording from the equilibrium under its initial tensions, and compare.
 

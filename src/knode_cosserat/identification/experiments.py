@@ -122,7 +122,7 @@ class _Shapes(NamedTuple):
     position: Float[np.ndarray, "M d"]
 
 
-def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto2") -> list[Experiment]:
+def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto4") -> list[Experiment]:
     """Return the experiments of recordings, measurements, trajectories or experiments.
 
     Those of measurements have one length, so that they share compiled programs.
@@ -188,7 +188,7 @@ def names_of(measured: Sequence[Measurements]) -> list[str]:
 
 
 def of_measurements(
-    measured: Measurements, model: Model, name: str = "recording", space: str | SpaceScheme = "lobatto2"
+    measured: Measurements, model: Model, name: str = "recording", space: str | SpaceScheme = "lobatto4"
 ) -> Experiment:
     """Return the experiment of measurements, which start in the equilibrium before row 0.
 

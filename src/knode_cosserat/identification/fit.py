@@ -51,7 +51,7 @@ def fit(
     config: FitConfig = BEST,
     *,
     held_out: Sequence[Any] = (),
-    space: str | SpaceScheme = "lobatto2",
+    space: str | SpaceScheme = "lobatto4",
     progress: bool = False,
     **options: Any,
 ) -> Any:
@@ -135,7 +135,7 @@ class _Poses(NamedTuple):
 
 def with_residual(
     nominal: System, recordings: Sequence[Recording | Measurements], identified: Identified, *,
-    space: str | SpaceScheme = "lobatto2", progress: Tell | None = None,
+    space: str | SpaceScheme = "lobatto4", progress: Tell | None = None,
 ) -> LearnedResidual:  # fmt: skip
     """Learn a passive residual on an identified robot from the recordings that it was identified from.
 
