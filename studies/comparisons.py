@@ -11,10 +11,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.metrics import PoseHistory, pose_mse, tip_dtw
+from knode_cosserat.metrics import PoseHistory, pose_mse, rotation_rmse, tip_dtw
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
+from studies.report import MEASURES
 
 
 def _of_model(name: str) -> Any:
@@ -75,7 +76,7 @@ class NodePoses(NamedTuple):
 
 
 def compared(prediction: PoseHistory | str, reference: PoseHistory | str) -> dict[str, Any]:
-    """Return both metrics of a cell; None and the reason if a trajectory is replaced by a reason.
+    """Return the metrics of a cell; None and the reason if a trajectory is replaced by a reason.
 
     A prediction that is not finite counts as failed too.
     """
@@ -83,9 +84,9 @@ def compared(prediction: PoseHistory | str, reference: PoseHistory | str) -> dic
     if failed is None and not np.all(np.isfinite(np.asarray(prediction.position))):  # type: ignore[union-attr]
         failed = "the prediction grows beyond all numbers"
     if failed is not None:
-        return {"tip_dtw": None, "pose_mse": None, "failed": failed}
-    measures = {"tip_dtw": tip_dtw, "pose_mse": pose_mse}
-    return {name: measure(prediction, reference) for name, measure in measures.items()}  # type: ignore[arg-type]
+        return dict.fromkeys(MEASURES) | {"failed": failed}
+    measures = (tip_dtw, pose_mse, rotation_rmse)
+    return {measure.__name__: measure(prediction, reference) for measure in measures}  # type: ignore[arg-type]
 
 
 class LinearPredictor(NamedTuple):

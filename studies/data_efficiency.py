@@ -25,6 +25,7 @@ from studies.comparisons import NoKnowledge, compared, linear_predictor
 from studies.methods import METHODS, LearnedSystems, Method, fitted
 from studies.report import (
     MEASURES,
+    PAPER_MEASURES,
     Report,
     as_json,
     in_words,
@@ -167,7 +168,7 @@ def rerun(
     facts = runner.run(made, out, **how)
     cells = [cell for each in facts.values() for cell in each["cells"]]
     texts = {"data.md": as_markdown(cells), "data.json": as_json(cells)}
-    drawn = {f"data-{measure.replace('_', '-')}": figure(cells, measure) for measure in MEASURES}
+    drawn = {f"data-{measure.replace('_', '-')}": figure(cells, measure) for measure in PAPER_MEASURES}
     return Report(cells, write_texts(out, texts), write_figures(out, drawn))
 
 
@@ -176,10 +177,10 @@ def as_markdown(cells: Sequence[Any]) -> str:
     amounts = sorted({(cell["sines"], cell["rows"]) for cell in cells} - {NONE})
     lines = dict.fromkeys((cell["imperfection"], cell["control"], cell["method"]) for cell in cells)
     parts = []
-    for measure, title in MEASURES.items():
+    for measure, (title, factor) in MEASURES.items():
         heads = ["imperfection", "control", "method", *(f"{sines} x {rows} rows" for sines, rows in amounts)]
         found = {
-            amount: spreads([c for c in cells if (c["sines"], c["rows"]) == amount], measure)
+            amount: spreads([c for c in cells if (c["sines"], c["rows"]) == amount], measure, factor)
             for amount in [*amounts, NONE]
         }
 
@@ -223,7 +224,7 @@ def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
         for axes in grid[-1]:
             axes.set_xlabel("rows of each sine")
         for axes in grid[:, 0]:
-            axes.set_ylabel(MEASURES[measure])
+            axes.set_ylabel(MEASURES[measure][0])
         legend_below(whole, grid.ravel(), columns=4)
     return whole
 

@@ -19,8 +19,13 @@ from knode_cosserat._files.writing import replacing
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-#: the two metrics: key in a cell, and title
-MEASURES = {"tip_dtw": "Tip DTW [m]", "pose_mse": "Pose MSE [1e-3]"}
+#: metrics: key in a cell, title, and factor of the cell's value; the first two are the paper's
+MEASURES = {
+    "tip_dtw": ("Tip DTW [m]", 1.0),
+    "pose_mse": ("Pose MSE [1e-3]", 1.0),
+    "rotation_rmse": ("Angle between orientations, RMS [degrees]", math.degrees(1.0)),
+}
+PAPER_MEASURES = ("tip_dtw", "pose_mse")
 
 
 class Cell(TypedDict):
@@ -32,6 +37,7 @@ class Cell(TypedDict):
     seed: int
     tip_dtw: float | None
     pose_mse: float | None
+    rotation_rmse: float | None
     failed: NotRequired[str]
 
 
@@ -64,8 +70,8 @@ class Spread(NamedTuple):
 Case = tuple[str, str]
 
 
-def spreads(cells: Sequence[Cell], measure: str) -> dict[Case, dict[str, Spread]]:
-    """Return the values of a metric by case and method, in the order of the cells."""
+def spreads(cells: Sequence[Cell], measure: str, factor: float = 1.0) -> dict[Case, dict[str, Spread]]:
+    """Return the values of a metric, times a factor, by case and method, in the order of the cells."""
     found: dict[Case, dict[str, Spread]] = {}
     for cell in cells:
         methods = found.setdefault((cell["imperfection"], cell["control"]), {})
@@ -74,7 +80,7 @@ def spreads(cells: Sequence[Cell], measure: str) -> dict[Case, dict[str, Spread]
         if value is None:
             failures = (*failures, cell.get("failed", "no reason given"))
         else:
-            values = (*values, value)
+            values = (*values, factor * value)
         methods[cell["method"]] = Spread(values, failures)
     return found
 
@@ -92,7 +98,8 @@ def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
     writer.writerow(_COLUMNS)
     for k, measure in enumerate(MEASURES):
         for case, methods in spreads(cells, measure).items():
-            paper = [figures[k] for figures in published[case]] if case in published else [None] * 3
+            known = case in published and measure in PAPER_MEASURES
+            paper = [figures[k] for figures in published[case]] if known else [None] * 3
             for method, spread in methods.items():
                 values, mean = spread.values, spread.mean
                 ends = [min(values), max(values)] if values else [None, None]
@@ -105,22 +112,29 @@ def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
 
 
 def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], notes: Sequence[str] = ()) -> str:
-    """Return Markdown with one table per metric, with published values beside ours, and the failures."""
+    """Return Markdown with one table per metric, with published values beside ours, and the failures.
+
+    The paper has no angles between orientations, so that table has no columns of it.
+    """
     parts = ["Mean and standard deviation over seeds. Ratios are to the paper's KNODE; less is better."]
-    for k, (measure, title) in enumerate(MEASURES.items()):
-        found = spreads(cells, measure)
+    for k, (measure, (title, factor)) in enumerate(MEASURES.items()):
+        found = spreads(cells, measure, factor)
+        known = measure in PAPER_MEASURES
         methods = list(dict.fromkeys(method for by_method in found.values() for method in by_method))
-        heads = ["imperfection", "control", "paper: baseline", "paper: KNODE", "its rerun"]
+        heads = ["imperfection", "control"]
+        heads += ["paper: baseline", "paper: KNODE", "its rerun"] if known else []
         for method in methods:
-            heads += [method] if method == "baseline" else [method, "ratio"]
+            heads += [method, "ratio"] if known and method != "baseline" else [method]
         rows = []
         for case, by_method in found.items():
             paper = published.get(case)
-            row = [*case, *(f"{figures[k]:.2f}" if paper else "" for figures in paper or [(0.0, 0.0)] * 3)]
+            row = list(case)
+            if known:
+                row += [f"{figures[k]:.2f}" for figures in paper] if paper else [""] * 3
             for method in methods:
                 spread = by_method.get(method, Spread((), ()))
                 row.append(in_words(spread))
-                if method != "baseline":
+                if known and method != "baseline":
                     row.append(ratio_in_words(spread.mean, paper.learned[k] if paper else 0.0))
             rows.append(row)
         parts += [f"## {title}", markdown_table(heads, rows)]

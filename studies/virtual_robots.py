@@ -147,10 +147,12 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
         true, have = set(each["true_effects"]), set(each["identified"]["effects"])
         gains = [outcome["improvement"] for outcome in each["unseen"].values()]
         inside = list(each["covered"].values())
+        angles = [outcome["identified"]["rotation_rmse"] for outcome in each["unseen"].values()]
         rows.append(
             [
                 str(each["seed"]),
                 *("failed" if gain is None else f"{100 * gain:.1f} %" for gain in gains),
+                *("failed" if angle is None else f"{np.degrees(angle):.2f}" for angle in angles),
                 f"{len(true & have)} of {len(true)}",
                 ", ".join(sorted(true - have)) or "none",
                 ", ".join(sorted(have - true)) or "none",
@@ -158,12 +160,14 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
             ]
         )
     gains = [f"improvement, {name}" for name in UNSEEN]
-    heads = ["seed", *gains, "effects found", "missed", "false", "in interval"]
+    angles = [f"orientations, {name} [degrees]" for name in UNSEEN]
+    heads = ["seed", *gains, *angles, "effects found", "missed", "false", "in interval"]
     told = summary(facts)
     lines = [
         "# Virtual robots with random imperfections",
         "Simulated recordings with noise. Improvement: mean part by which DTW of the tip and pose MSE are "
-        "less than the nominal robot's, on recordings that were not learned from.",
+        "less than the nominal robot's, on recordings that were not learned from. Orientations: root mean "
+        "square angle between predicted and measured ones.",
         markdown_table(heads, rows),
         f"Median improvement {100 * told['median_improvement']:.1f} %, least "
         f"{100 * told['least_improvement']:.1f} %, failed predictions {told['failed']}. "

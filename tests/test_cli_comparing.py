@@ -1,5 +1,6 @@
 """Commands on trajectories that there are: evaluate, plot and animate."""
 
+import numpy as np
 import pytest
 
 import knode_cosserat as kc
@@ -24,12 +25,14 @@ def test_evaluate_compares_trajectories(tmp_path, truth):
         "tip_dtw": kc.metrics.tip_dtw(a, b),
         "pose_mse": kc.metrics.pose_mse(a, b),
         "tip_rmse": kc.metrics.tip_rmse(a, b),
+        "rotation_rmse": kc.metrics.rotation_rmse(a, b),
     }
     first, second = facts["references"]
     assert first == {"reference": str(truth), "rows": 17, **expected}
-    assert second == {"reference": str(other), "rows": 17, "tip_dtw": 0.0, "pose_mse": 0.0, "tip_rmse": 0.0}
+    assert second == {"reference": str(other), "rows": 17, **dict.fromkeys(expected, 0.0)}
     words = succeeded("evaluate", other, truth, other)
     assert f"{expected['tip_dtw']:.4g}" in words and "tip DTW [m]" in words
+    assert f"{np.degrees(expected['rotation_rmse']):.4g}" in words and "orientations [deg]" in words
 
 
 def test_evaluate_simulates_a_robot_as_the_papers_table_has_it(tmp_path):

@@ -22,9 +22,14 @@ def names() -> list[str]:
 
 
 def draw(name: str) -> Path:
-    """Run an example, and keep its picture with 256 colours: a third of the size."""
+    """Run an example, and keep its picture."""
     path = PICTURES / f"{name}.png"
     importlib.import_module(f"examples.{name}").main(out=str(path))
+    return reduced(path)
+
+
+def reduced(path: Path) -> Path:
+    """Reduce a picture to 256 colours: a third of the size."""
     with Image.open(path) as image:
         small = image.convert("RGB").quantize(256, dither=Image.Dither.NONE)
     small.save(path, optimize=True)

@@ -111,10 +111,10 @@ def test_what_knows_nothing_does_not_see_the_imperfection():
 
 def test_a_cell_without_figures_has_a_reason():
     poses = NodePoses(np.zeros((5, 2, 3)), np.tile([1.0, 0.0, 0.0, 0.0], (5, 2, 1)))
-    assert compared(poses, poses) == {"tip_dtw": 0.0, "pose_mse": 0.0}
+    assert compared(poses, poses) == {"tip_dtw": 0.0, "pose_mse": 0.0, "rotation_rmse": 0.0}
     away = poses._replace(position=np.add(poses.position, [0.0, 0.0, 0.1]))
     assert compared(away, poses)["tip_dtw"] == pytest.approx(0.5)
-    none = {"tip_dtw": None, "pose_mse": None}
+    none = {"tip_dtw": None, "pose_mse": None, "rotation_rmse": None}
     assert compared("it broke", poses) == {**none, "failed": "it broke"}
     assert compared(poses, "no truth") == {**none, "failed": "no truth"}
     grown = poses._replace(position=np.full((5, 2, 3), np.inf))
@@ -150,7 +150,7 @@ def test_five_rows_of_one_sine_are_enough_with_the_right_knowledge():
 
 
 def cells():
-    of = {"imperfection": "stiffness", "control": "sine", "seed": 0}
+    of = {"imperfection": "stiffness", "control": "sine", "seed": 0, "rotation_rmse": None}
     made = [{**of, "method": "baseline", "sines": 0, "rows": 0, "tip_dtw": 20.0, "pose_mse": 12.0}]
     for rows in (5, 10):
         for sines in (1, 2):

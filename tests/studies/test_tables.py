@@ -24,7 +24,7 @@ PUBLISHED = {
 def cell(imperfection, method, seed, dtw, mse, **more) -> Cell:
     return {
         "imperfection": imperfection, "control": "sine", "method": method, "seed": seed, "tip_dtw": dtw,
-        "pose_mse": mse, **more,
+        "pose_mse": mse, "rotation_rmse": None if mse is None else 0.01 * mse, **more,
     }  # fmt: skip
 
 
@@ -93,6 +93,11 @@ def test_the_markdown_has_the_papers_figures_beside_ours_and_every_failure():
     ]  # fmt: skip
     assert weight == ["self-weight", "sine", "1.75", "0.00", "0.00", "", "failed (2 of 2)", ""]
     assert rows[6][2:6] == ["16.46", "1.44", "1.17", "16.5"]
+    # the paper has no angles; cells have radians, tables degrees
+    assert rows[8:11:2] == [
+        ["imperfection", "control", "baseline", "best"],
+        ["length", "sine", "9.45", "0.201 ± 0.04 (1 of 3 failed)"],
+    ]
     assert len({len(line) for line in text.splitlines()[4:8]}) == 1
     assert text.count("length, sine, best: step 7 (t = 0.35 s): no solution found") == 1
     assert text.count("self-weight, sine, best: the loss diverged") == 2
@@ -107,7 +112,7 @@ def test_without_a_failure_nothing_is_said_of_any():
 
 def test_the_csv_has_all_of_it_as_numbers():
     rows = list(csv.DictReader(io.StringIO(as_csv(CELLS, PUBLISHED))))
-    assert len(rows) == 2 * 3
+    assert len(rows) == 3 * 3
     best = next(row for row in rows if row["method"] == "best" and row["measure"] == "pose_mse")
     assert float(best["mean"]) == pytest.approx(0.35)
     assert (float(best["least"]), float(best["most"])) == (0.3, 0.4)

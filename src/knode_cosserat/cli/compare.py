@@ -135,7 +135,8 @@ def evaluate(
 
     Tip RMSE: root mean square distance of the tips (m). Tip DTW: dynamic-time-warping distance between the
     tip paths (m). Pose MSE: mean squared error of positions and Euler angles, times 1000. DTW and MSE are
-    defined as in the paper.
+    defined as in the paper. Orientations: root mean square angle between them, in --json as rotation_rmse
+    (rad).
 
     A recording is predicted from its measured tensions, starting at the equilibrium under the first ones.
     Rotations are relative to the start. --config, --start, --seconds, --dt and --space apply to recordings.
@@ -149,7 +150,8 @@ def evaluate(
         return evaluate_on_recordings(system, references, sampling, report.as_json)
     source = predictor.load()
     compared: list[dict[str, Any]] = []
-    measures = (kc.metrics.tip_dtw, kc.metrics.pose_mse, kc.metrics.tip_rmse)
+    metrics = kc.metrics
+    measures = (metrics.tip_dtw, metrics.pose_mse, metrics.tip_rmse, metrics.rotation_rmse)
     for path in references:
         reference = load_trajectory_file(path)
         try:
@@ -162,9 +164,10 @@ def evaluate(
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         compared.append({"reference": str(path), "rows": len(reference.time[:rows]), **errors})
-    lines: list[list[str]] = [["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]"]]
-    for name, count, *numbers in (one.values() for one in compared):
-        lines.append([name, str(count), *(f"{number:.4g}" for number in numbers)])
+    heads = ["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]", "orientations [deg]"]
+    lines = [heads]
+    for name, count, *numbers, angle in (one.values() for one in compared):
+        lines.append([name, str(count), *(f"{each:.4g}" for each in (*numbers, np.degrees(angle)))])
     write_output(report.as_json, {"prediction": prediction, "references": compared}, table(lines))
 
 

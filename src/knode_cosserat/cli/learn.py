@@ -275,7 +275,8 @@ def evaluate_on_recordings(system: System, recordings: list[Path], sampling: Sam
         # coarse rows would lose the tensions between them: predict finely, and compare every few rows
         count = math.ceil(dt / FINELY - 1e-6) if FINELY < dt < math.inf else 1
         rows = recording.sampled(dt / count, sampling.start, sampling.end, mean=True)
-        evaluation = compare(system, rows, every=1 if rows.static else count, space=sampling.space)
+        every = 1 if rows.static else count
+        evaluation = compare(system, rows, every=every, space=sampling.space, recovery=None)
         facts[str(path)] = evaluation.to_dict()
         lines.append(f"{path}: {evaluation}")
     write_output(as_json, {"recordings": facts}, lines)

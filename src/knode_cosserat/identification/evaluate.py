@@ -136,7 +136,7 @@ def predict(
 
 def evaluate(
     robot: System, measured: Measurements, *, every: int = 1, last: int | None = None,
-    space: str | SpaceScheme = "lobatto4", recovery: float = RECOVERY,
+    space: str | SpaceScheme = "lobatto4", recovery: float | None = RECOVERY,
 ) -> Evaluation:  # fmt: skip
     """Predict a recording from the equilibrium under its initial tensions, and compare.
 
@@ -148,7 +148,7 @@ def evaluate(
         every: interval of compared rows: 1 for all, 2 for every second.
         last: largest number of compared rows.
         space: the scheme along the rod.
-        recovery: seconds that recovery from failed steps may take.
+        recovery: seconds that recovery from failed steps may take; None: the usual budget.
 
     Returns:
         The `Evaluation` over the rows in which all bodies were seen; with `failed` if a step has no solution.

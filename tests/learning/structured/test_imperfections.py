@@ -197,7 +197,7 @@ def cell(name, control, method, error, seed=0):
     failed = {"failed": "it broke"} if error is None else {}
     return {
         "imperfection": name, "control": control, "method": method, "seed": seed, "tip_dtw": error,
-        "pose_mse": error, **failed,
+        "pose_mse": error, "rotation_rmse": error, **failed,
     }  # fmt: skip
 
 
