@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import re
 from typing import Any, Self
 
 import jax
@@ -12,9 +13,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.rotation import conjugate, quaternion_product
-from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.rotation import conjugate, quaternion_product, rotation_matrix
+from knode_cosserat.solvers.places import Places, places_on, positions_at, quaternions_at
 from knode_cosserat.trajectory import Trajectory
+
+#: in the place of zero, where a root has no derivative
+TINY = 1e-30
 
 
 @dataclasses.dataclass(frozen=True)
@@ -55,6 +59,12 @@ class Output(abc.ABC):
         """Number of numbers in a value."""
         return len(self.labels)
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Kind of every number of an error; by default all are of one kind, with the name of the class."""
+        words = re.sub(r"(?<!^)(?=[A-Z])", " ", type(self).__name__)
+        return (words.lower(),) * len(self.noise)
+
 
 def _xyz(name: str, unit: str) -> tuple[str, ...]:
     return tuple(f"{name}.{axis} ({unit})" for axis in "xyz")
@@ -78,6 +88,28 @@ class _AtFractions(Output):
         """Standard deviation of every number of an error."""
         return np.full(self.size, self.sigma)
 
+    def places(self, system: System) -> Places:
+        """Return the places on a robot, which may have identified places of its own."""
+        return places_on(system, self.fractions)
+
+    def turned(
+        self, system: System, y: Float[Any, "T N y"], references: Float[Any, "T M 4"]
+    ) -> Float[Any, "T M 3"]:
+        """Return differences of the rotations since the first row that was seen (rad, global frame).
+
+        The mounting of the bodies on the rod need not be known.
+        """
+        h = quaternions_at(system, y, self.places(system))
+        known = jnp.isfinite(references[..., :1])
+        row = jnp.argmax(known, axis=0)[None]
+        product, inverse = jax.vmap(jax.vmap(quaternion_product)), jax.vmap(jax.vmap(conjugate))
+
+        def since(turns: Any) -> Any:
+            return product(turns, inverse(jnp.broadcast_to(jnp.take_along_axis(turns, row, 0), turns.shape)))
+
+        off = product(since(h), inverse(since(jnp.where(known, references, 1.0))))
+        return jnp.where(known, 2.0 * off[..., 1:] * jnp.where(off[..., :1] < 0.0, -1.0, 1.0), jnp.nan)
+
 
 @dataclasses.dataclass(frozen=True)
 class BodyPositions(_AtFractions):
@@ -93,8 +125,7 @@ class BodyPositions(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the positions, one after the other."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
-        return positions_at(system, y[None], places, z[None])[0].ravel()
+        return positions_at(system, y[None], self.places(system), z[None])[0].ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +161,7 @@ class BodyPoses(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return position and quaternion of each place."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
+        places = self.places(system)
         p, h = positions_at(system, y[None], places, z[None])[0], quaternions_at(system, y[None], places)[0]
         return jnp.concatenate([p, h], axis=1).ravel()
 
@@ -165,16 +196,74 @@ class BodyMotions(BodyPoses):
         self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
     ) -> Float[Any, "T e"]:
         """Return differences of positions (m), and of rotations since the first row (rad, global frame)."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
-        h, reference = quaternions_at(system, y, places), references.reshape(len(references), -1, 7)
-        product, inverse = jax.vmap(jax.vmap(quaternion_product)), jax.vmap(jax.vmap(conjugate))
-        since = product(h, inverse(jnp.broadcast_to(h[:1], h.shape)))
-        known = jnp.isfinite(reference[..., 3:4])
-        turned = product(since, inverse(jnp.where(known, reference[..., 3:], 1.0)))
-        turned = 2.0 * turned[..., 1:] * jnp.where(turned[..., :1] < 0.0, -1.0, 1.0)
-        moved = positions_at(system, y, places, z) - reference[..., :3]
-        both = jnp.concatenate([moved, jnp.where(known, turned, jnp.nan)], axis=-1)
+        reference = references.reshape(len(references), -1, 7)
+        moved = positions_at(system, y, self.places(system), z) - reference[..., :3]
+        both = jnp.concatenate([moved, self.turned(system, y, reference[..., 3:])], axis=-1)
         return both.reshape(len(references), -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Orientations(_AtFractions):
+    """Unit quaternions (scalar first) at fractions of the length, such as those of an inertial sensor.
+
+    Rows of data are compared by the rotations since the first one, so that the mounting of the sensor need
+    not be known.
+    """
+
+    #: standard deviation of a rotation (rad)
+    sigma: float = 5e-3
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(f"quaternion[{part:g}].{k}" for part in self.fractions for k in "wxyz")
+
+    @property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Standard deviation of every number of an error."""
+        return np.full(3 * len(self.fractions), self.sigma)
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return the orientations, one after the other."""
+        return quaternions_at(system, y[None], self.places(system))[0].ravel()
+
+    def error(
+        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
+    ) -> Float[Any, " e"]:
+        """Return rotation vectors from the reference (rad)."""
+        value, wanted = self.value(system, y, z).reshape(-1, 4), reference.reshape(-1, 4)
+        off = jax.vmap(quaternion_product)(jax.vmap(conjugate)(wanted), value)
+        return (2.0 * off[:, 1:] * jnp.where(off[:, :1] < 0.0, -1.0, 1.0)).ravel()
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return differences of the rotations since the first row (rad, global frame)."""
+        count = len(references)
+        return self.turned(system, y, references.reshape(count, -1, 4)).reshape(count, -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class BendingAngles(_AtFractions):
+    """Bending angle of the rod's axis from the z axis, times the cosine and the sine of its direction (rad).
+
+    The direction is the angle about z from x. A product has no singularity where the rod is straight.
+    """
+
+    #: standard deviation (rad)
+    sigma: float = 5e-3
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(f"bending[{part:g}].{axis} (rad)" for part in self.fractions for axis in "xy")
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return the angles, one pair after the other."""
+        h = quaternions_at(system, y[None], self.places(system))[0]
+        axis = jax.vmap(rotation_matrix)(h)[:, :, 2]
+        sine = jnp.sqrt(jnp.sum(axis[:, :2] ** 2, axis=1, keepdims=True) + TINY)
+        return (axis[:, :2] * jnp.arctan2(sine, axis[:, 2:]) / sine).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,6 +289,11 @@ class States(Output):
         fields = self.y_names, self.z_names
         parts = ([name for name, size in names for _ in range(size)] for names in fields)
         return tuple(label for part in parts for label in part * self.nodes)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Field of y or z of every number."""
+        return self.labels
 
     @property
     def noise(self) -> Float[np.ndarray, " e"]:
@@ -241,7 +335,7 @@ class Curvatures(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the curvatures, interpolated linearly between nodes."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
+        places = self.places(system)
         u = system.z_layout.get(z, "u")[..., :2]
         part = jnp.asarray(places.part)[:, None]
         return ((1.0 - part) * u[places.node] + part * u[places.node + 1]).ravel()
@@ -268,6 +362,57 @@ class BaseWrench(Output):
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the internal force and moment at the base."""
         return jnp.concatenate([system.y_layout.get(y[0], "n"), system.y_layout.get(y[0], "m")])
+
+
+@dataclasses.dataclass(frozen=True)
+class Several(Output):
+    """Several outputs, one after the other."""
+
+    outputs: tuple[Output, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(label for it in self.outputs for label in it.labels)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Kind of every number of an error, numbered where outputs are of one kind."""
+        names = [it.fields[0] for it in self.outputs]
+        return tuple(
+            f"{field} {k + 1}" if names.count(field) > 1 else field
+            for k, it in enumerate(self.outputs)
+            for field in it.fields
+        )
+
+    @property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Standard deviation of every number of an error."""
+        return np.concatenate([it.noise for it in self.outputs])
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return all values."""
+        return jnp.concatenate([it.value(system, y, z) for it in self.outputs])
+
+    def parts(self, numbers: Float[Any, "... p"]) -> list[Float[Any, "... q"]]:
+        """Return the numbers of each output, of values or of errors."""
+        values = numbers.shape[-1] == self.size
+        sizes = [it.size if values else len(it.noise) for it in self.outputs]
+        return jnp.split(numbers, np.cumsum(sizes)[:-1], axis=-1)
+
+    def error(
+        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
+    ) -> Float[Any, " e"]:
+        """Return all differences."""
+        pairs = zip(self.outputs, self.parts(reference), strict=True)
+        return jnp.concatenate([it.error(system, y, z, part) for it, part in pairs])
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return the errors of consecutive rows."""
+        pairs = zip(self.outputs, self.parts(references), strict=True)
+        return jnp.concatenate([it.errors(system, y, z, part) for it, part in pairs], axis=-1)
 
 
 def final_output(system: System, trajectory: Trajectory, output: Output) -> Float[np.ndarray, " p"]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.estimation.outputs import States
+from knode_cosserat.estimation.outputs import Several, States
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.effects import library_model, parameter_effects
 from knode_cosserat.identification.experiments import Experiment, experiments_of, measured_rows
@@ -311,11 +311,17 @@ def _places(data: Experiment) -> Callable[[np.ndarray], np.ndarray] | None:
         return lambda rows: rows[:, : output.nodes * count].reshape(len(rows), output.nodes, count)[
             ..., first : first + size
         ]
-    bodies = len(getattr(output, "fractions", ()))
-    if not bodies or not output.labels[0].startswith("position"):
+    first = output.outputs[0] if isinstance(output, Several) else output
+    bodies = len(getattr(first, "fractions", ()))
+    if not bodies or not first.labels[0].startswith("position"):
         return None
-    dimension = 3 if hasattr(output, "sigma_rotation") else data.data.shape[1] // bodies
-    return lambda rows: rows.reshape(len(rows), bodies, -1)[..., :dimension]
+    dimension = 3 if hasattr(first, "sigma_rotation") else data.data.shape[1] // bodies
+
+    def places(rows: np.ndarray) -> np.ndarray:
+        part = output.parts(rows)[0] if isinstance(output, Several) else rows
+        return np.asarray(part.reshape(len(rows), bodies, -1)[..., :dimension])
+
+    return places
 
 
 def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:

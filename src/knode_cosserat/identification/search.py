@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 
 from knode_cosserat._files.writing import package_version
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.estimation.outputs import States
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, hashed
@@ -186,8 +187,8 @@ class Search:
         fields, groups = data.fields, data.groups
         if not self.exact:
             return np.full(len(fields), LEAST_SCALE * self.length)
-        if len(fields) == 1:
-            return np.array([LEAST * self.length])
+        if not isinstance(data.output, States):
+            return np.full(len(fields), LEAST * self.length)
         count = np.maximum(np.isfinite(data.data[1:]).sum(axis=0), 1)
         usual = np.sqrt(np.nansum(np.square(data.data[1:]), axis=0) / count)
         sizes = np.array([np.max(usual[groups == k]) for k in range(len(fields))])

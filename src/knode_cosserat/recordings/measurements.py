@@ -5,13 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import count_of, wrapped
+from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.streams import Body, Tensions
@@ -21,6 +22,14 @@ from knode_cosserat.solvers.places import places_at, positions_at, quaternions_a
 
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
+
+
+class Readings(NamedTuple):
+    """Values of a sensor beside motion capture in rows, and the kind of its output."""
+
+    output: Output
+    #: in SI units; NaN where nothing was measured
+    values: Float[np.ndarray, "T p"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -55,16 +64,21 @@ class Measurements:
     static: bool = False
     #: True if the tensions are samples of a continuous signal: row i's is then that at the time of row i + 1
     continuous: bool = False
+    #: orientations, bending angles, curvatures or wrenches by other sensors
+    sensors: tuple[Readings, ...] = ()
+    #: standard deviations of `fractions`, zero where they are known; others are identified
+    deviations: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
         kind = "equilibria" if self.static else "rows"
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
         places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions)
+        more = "".join(f"; {it.output.fields[0]}" for it in self.sensors)
         return wrapped(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
             f"{count_of(self.tension.shape[-1], 'tendon')}; "
-            f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length; "
+            f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length{more}; "
             f"source: {self.source}"
         )
 
@@ -123,6 +137,8 @@ class Measurements:
         """
         path = Path(path)
         writer_of(path)
+        if self.sensors:
+            raise RecordingError(f"{path}: {self.sensors[0].output.fields[0]} cannot be written; only poses can")
         is_table = path.suffix in (".csv", ".parquet")
         root = "" if is_table else "/"
         position = self.position
@@ -196,6 +212,7 @@ class Measurements:
         """Return the rows from index `first` to before index `last`."""
         names = ("time", "tension", "position", "quaternion", "measured")
         changes: dict[str, Any] = {name: getattr(self, name)[first:last] for name in names}
+        changes["sensors"] = tuple(it._replace(values=it.values[first:last]) for it in self.sensors)
         if first:
             changes["initial_tension"] = None
         return dataclasses.replace(self, **changes)
