@@ -18,7 +18,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
-from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -92,7 +92,7 @@ def coverage(
     predicted = []
     for robot in members:
         moved = predict(robot, measured, space=space, recovery=RECOVERY)
-        places = places_at(measured.fractions, robot.nodes)
+        places = places_on(robot, measured.fractions)
         predicted.append(np.asarray(positions_at(robot, np.asarray(moved.y), places)))
     count = len(predicted)
     if count < 2:
@@ -166,7 +166,7 @@ def compared(
     """Return the errors of a motion in the rows of a recording; arguments as in `evaluate`."""
     rows = np.arange(len(measured.time))[::every][:last]
     y, z = np.asarray(moved.y)[rows], np.asarray(moved.z)[rows]
-    places = places_at(measured.fractions, robot.nodes)
+    places = places_on(robot, measured.fractions)
     position = np.asarray(positions_at(robot, y, places, z))
     quaternion = np.asarray(quaternions_at(robot, y, places))
     seen, known = measured.position[rows], measured.complete[rows]

@@ -119,7 +119,7 @@ def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto2
     Raises:
         DataError: data that do not fit the robot or each other, are too short or not finite.
     """
-    rows = _listed(data)
+    rows = listed_rows(data)
     measured = [it for it in rows if isinstance(it, Measurements)]
     same_steps(measured)
     names = iter(names_of(measured))
@@ -135,7 +135,7 @@ def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto2
     return [it.padded(longest) for it in experiments]
 
 
-def _listed(data: Any) -> list[Any]:
+def listed_rows(data: Any) -> list[Any]:
     """Return data in a list, recordings as rows with mean tensions; `DataError` for anything else."""
     if isinstance(data, str | Recording | Measurements | Trajectory | Experiment) or not isinstance(
         data, Sequence
@@ -155,7 +155,7 @@ def _listed(data: Any) -> list[Any]:
 
 def measured_rows(data: Any) -> list[Measurements]:
     """Return the rows of recordings; `DataError` for anything else."""
-    rows = _listed(data)
+    rows = listed_rows(data)
     for it in rows:
         if not isinstance(it, Measurements):
             raise DataError(f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of")

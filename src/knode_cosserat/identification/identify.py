@@ -15,8 +15,8 @@ from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import Several, States
 from knode_cosserat.estimation.parameters import Model
-from knode_cosserat.identification.effects import library_model, parameter_effects
-from knode_cosserat.identification.experiments import Experiment, experiments_of, measured_rows
+from knode_cosserat.identification.effects import library_model, parameter_effects, place_effects
+from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.result import Identified, correlation_of, estimates_of
 from knode_cosserat.identification.search import Point, Search, SearchError
@@ -105,7 +105,9 @@ def identify(
     if not isinstance(system, System) or np.ndim(robot.length):
         raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")
     tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
+    data = listed_rows(data)
     plain = [] if parameters is None else parameter_effects(robot, parameters)
+    plain += place_effects(data, flat=effects is None and parameters is not None)
     if effects is None and parameters is not None:
         model = Model(robot, plain)
         search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
@@ -281,9 +283,9 @@ def _accepted(search: Search, selection: Selection, space: str | SpaceScheme) ->
     folds = []
     if len(data) > 1:
         ends = [search.without(point, k, FOLD) for k in range(len(data))]
-        errors = [None if end is None else _errors(search, end.x, [k])[0] for k, end in enumerate(ends)]
+        errors = [None if end is None else _errors(search, end.x, [k], False)[0] for k, end in enumerate(ends)]
         folds = [end.x for end in ends if end is not None]
-        nominal = _errors(search, np.zeros(model.size))
+        nominal = _errors(search, np.zeros(model.size), tip=False)
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
         if np.mean(unseen) >= np.mean(before):
             steps.append("the nominal robot is returned: it predicts held-out recordings as well")
@@ -291,7 +293,8 @@ def _accepted(search: Search, selection: Selection, space: str | SpaceScheme) ->
     robot = robot.replace(trained=trained_range(robot, data, space))
     result = _result(search, robot, Selection(names, point, tuple(steps)), folds)
     return dataclasses.replace(
-        result, held_out_error={it.name: error for it, error in zip(data, errors, strict=True)}
+        result,
+        held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
     )
 
 
@@ -330,16 +333,22 @@ def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:
     return places(rollout.values * data.noise)
 
 
-def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -> list[float | None]:
-    """Return the root mean square error of the last body's position (m), by experiment."""
+def _errors(
+    search: Search, x: np.ndarray, which: Sequence[int] | None = None, tip: bool = True
+) -> list[float | None]:
+    """Return the root mean square error of the last body's position (m), by experiment.
+
+    Without positions it is None if `tip`, or else that of all differences.
+    """
     chosen = [search.misfit.data[k] for k in (range(len(search.misfit.data)) if which is None else which)]
     errors: list[float | None] = []
     for data, rollout in zip(chosen, search.misfit.differences(x, which=which), strict=True):
-        if rollout is None or _places(data) is None:
+        seen = _places(data) is not None
+        if rollout is None or (tip and not seen):
             errors.append(None)
             continue
-        tip = np.sum(_positions(rollout, data)[:, -1] ** 2, axis=-1)
-        errors.append(float(np.sqrt(np.nanmean(tip))))
+        squares = np.sum(_positions(rollout, data)[:, -1] ** 2, axis=-1) if seen else rollout.values**2
+        errors.append(float(np.sqrt(np.nanmean(squares))))
     return errors
 
 

@@ -1,7 +1,7 @@
 """Differences between simulated and measured rows of experiments, and their derivatives.
 
-Every solved step is differentiated by the implicit function theorem (`solvers.sensitivity`), and outputs as
-in the online observers (`estimation.online.errors_along`).
+Every solved step is differentiated by the implicit function theorem (`solvers.sensitivity`), and outputs by
+rows and by the parameters that they depend on, such as the length or the places of bodies.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat.estimation.online import errors_along, errors_of
+from knode_cosserat.estimation.online import errors_of, split_record
+from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import stepped
@@ -138,13 +139,15 @@ class Misfit:
         noise, stages = data.noise, 1 if data.static else data.settings.stages
 
         def tangents(which: Any) -> np.ndarray:
-            directions, by_latency = _directions(self.model.robot, x)
+            directions, *by_delay = _directions(self.model.robot, x)
             weights = np.eye(len(x))[:, which]
             d_first, past, d_past = start.tangents(directions, weights)
             controls = acting[:steps]
             d_controls = np.zeros((*controls.shape, weights.shape[1]))
             if slope is not None:
-                d_controls = slope[:steps, :, None] * np.asarray(by_latency)[which]
+                late, drift = (np.asarray(part)[which] for part in by_delay)
+                time = task.dt * np.arange(1.0, steps + 1.0)
+                d_controls = slope[:steps, :, None] * (late + time[:, None] * drift)[:, None]
             changes = Changes(d_controls, directions, weights)
             solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             d_records = np.zeros((0, *records.shape[1:], weights.shape[1]))
@@ -160,7 +163,7 @@ class Misfit:
             # zeros in all other columns: one compiled program serves any coordinates
             whole = np.zeros((*records.shape, len(x)))
             whole[..., which] = np.concatenate([d_first[None, :, :size], d_records])
-            _, slopes = errors_along(system, data.output, every(records), every(whole), data.data)
+            slopes = _slopes(self.model.robot, x, data.output, every(records), every(whole), data.data)
             return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, every(records), data.data))
@@ -239,15 +242,30 @@ def _system(robot: ParametrisedRobot, x: Any) -> Any:
 
 
 @jax.jit
-def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
-    """Return a system's tangents by each coordinate, stacked, and those of the load cells' latency (n,)."""
+def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any, Any]:
+    """Return a system's tangents by each coordinate, stacked, and the load cells' latency and drift (n,)."""
 
     def along(direction: Any) -> Any:
         d_system = jax.jvp(robot, (x,), (direction,))[1]
         cells = _cells(d_system)
-        return d_system, jnp.zeros(()) if cells is None else cells.latency
+        return d_system, *((jnp.zeros(()),) * 2 if cells is None else (cells.latency, cells.drift))
 
     return jax.vmap(along)(jnp.eye(len(x)))
+
+
+@functools.partial(jax.jit, static_argnames="output")
+def _slopes(
+    robot: ParametrisedRobot, x: Any, output: Output, records: Float[Any, "T N x"],
+    d_records: Float[Any, "T N x n"], data: Float[Any, "T p"],
+) -> Float[Any, "n T e"]:  # fmt: skip
+    """Return the tangents of the errors of an output by each coordinate, of rows and of the robot itself."""
+
+    def errors(x: Any, records: Any) -> Any:
+        system = robot(x)
+        return output.errors(system, *split_record(system, records), data)
+
+    _, moved = jax.linearize(errors, x, records)
+    return jax.vmap(moved, in_axes=(0, -1))(jnp.eye(len(x)), d_records)
 
 
 @functools.partial(jax.jit, static_argnames="settings")

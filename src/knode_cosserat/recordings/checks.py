@@ -11,18 +11,19 @@ import scipy.ndimage
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.controls import TENSION_UNITS
+from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations, Output
 from knode_cosserat.recordings.config import (
-    MOTOR_UNITS,
     POSITION_UNITS,
+    SENSOR_UNITS,
     MotorSource,
     RecordingConfig,
+    SensorSource,
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
-from knode_cosserat.recordings.recording import bridge
-from knode_cosserat.recordings.streams import SLOW, Body, Tensions, period
+from knode_cosserat.recordings.recording import bridge, continuous
+from knode_cosserat.recordings.streams import SLOW, Body, Sensor, Tensions, period
 
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
@@ -38,8 +39,6 @@ SHORT, LONG = 0.02, 20.0
 FACTOR = 20.0
 #: largest share of rows with implausible tensions; more of them are no accidents
 RARE = 0.05
-
-_UNITS = {**TENSION_UNITS, **MOTOR_UNITS}
 
 
 @dataclasses.dataclass
@@ -142,6 +141,53 @@ def cleaned_body(
     return Body(rows.time, rows.values[:, :3], orientation, name, topic, fraction), rows.findings
 
 
+# other sensors
+
+
+def cleaned_sensor(
+    config: RecordingConfig, source: SensorSource, time: np.ndarray, numbers: np.ndarray, path: str
+) -> tuple[Sensor, list[Finding]]:
+    """Return a sensor's usable rows in SI units and in the robot's frame, and the findings.
+
+    Raises:
+        RecordingError: another number of numbers than its kind has, or too few usable rows.
+    """
+    try:
+        source.require(numbers.shape[1])
+    except RecordingError as error:
+        raise RecordingError(f"{path}: {error}") from None
+    factor, places = SENSOR_UNITS[source.kind][str(source.unit)], source.fractions
+    rows = _Rows(source.topic or "", time, numbers)
+    is_turn = source.kind == "orientation" and numbers.shape[1] == 4
+    none = np.zeros(len(time), dtype=bool)
+    no_rotation = ~(np.abs(np.linalg.norm(numbers, axis=1) - 1.0) < 0.05) if is_turn else none
+    rows.drop_unusable(no_rotation, ("row is", "rows are", "not finite, or no rotation"))
+    if config.repeats == "drop":
+        again = np.concatenate([[False], np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)])
+        rows.drop(again[: len(rows.time)], ("row repeats", "rows repeat", "the one before"), "note")
+    if len(rows.time) < FEWEST_FRAMES:
+        raise RecordingError(
+            f"{path}: {source.topic}: {len(rows.time)} usable rows; required is {FEWEST_FRAMES} or more"
+        )
+    frame = Rotation.from_quat(source.rotation or (1.0, 0.0, 0.0, 0.0), scalar_first=True)
+    values = rows.values * (1.0 if is_turn else factor)
+    output: Output = Curvatures(places)
+    if source.kind == "orientation":
+        output = Orientations(places)
+        turned = Rotation.from_quat(values, scalar_first=True) if is_turn else (
+            Rotation.from_euler("ZYX", values[:, ::-1])
+        )
+        values = continuous((frame * turned).as_quat(scalar_first=True))
+    elif source.kind == "bending_angle":
+        output = BendingAngles(places)
+        values = values[:, :1] * np.stack([np.cos(values[:, 1]), np.sin(values[:, 1])], axis=1)
+    elif source.kind == "base_wrench":
+        output = BaseWrench()
+        values = np.hstack([frame.apply(values[:, :3]), frame.apply(values[:, 3:])])
+    rows.add_pauses(config.longest_gap)
+    return Sensor(rows.time, values, output, rows.topic), rows.findings
+
+
 # tensions
 
 
@@ -185,7 +231,7 @@ def _cleaned_rows(
             f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; "
             f"the configuration's order has {len(source.order)} tendons"
         )
-    rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * _UNITS[source.unit])
+    rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * source.factor)
     rows.drop_unusable(np.zeros(len(time), dtype=bool), ("tension is", "tensions are", "not finite"))
     if not isinstance(source, TensionSource):
         return rows
@@ -337,6 +383,8 @@ def implausible_sizes(
             f"measured tensions are {sizes[0]:.3g} N and commanded ones {sizes[1]:.3g} N: not the same unit?"
         )
         findings.append(Finding("problem", "", what))
+    if not bodies:
+        return findings
     places = [np.median(body.position, axis=0) for body in bodies] if at_rest is None else at_rest
     far = float(np.linalg.norm(places, axis=1).max())
     if not SHORT < far < LONG:

@@ -45,7 +45,16 @@ PLACE = "{}"
 POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: units of motors: angles to rad, or wound-up lengths to m
-MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
+MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "ticks": math.pi / 2048.0}
+#: units of tensions: forces to N, or motor currents to A
+PULL_UNITS = {**TENSION_UNITS, "A": 1.0, "mA": 1e-3}
+#: kinds of sensors beside motion capture: their units with factors to SI units, the default first
+SENSOR_UNITS: dict[str, dict[str, float]] = {
+    "orientation": {"rad": 1.0, "deg": math.pi / 180.0},
+    "bending_angle": {"rad": 1.0, "deg": math.pi / 180.0},
+    "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/cm": 1e2},
+    "base_wrench": {"N": 1.0, "mN": 1e-3},
+}
 #: axes of motion capture that point up, with the rotation vector (rad) that turns them to z
 UP: dict[str, Vector] = {
     "z": (0.0, 0.0, 0.0), "y": (math.pi / 2, 0.0, 0.0), "x": (0.0, -math.pi / 2, 0.0),
@@ -126,6 +135,14 @@ def _numbers(count: int, words: str) -> _Check:
         return tuple(numbers)
 
     return check
+
+
+def _places(value: Any, name: str) -> Vector:
+    numbers = _listed(value) or [value]
+    places = _numbers(len(numbers), "places from 0 to 1, each above the last")(numbers, name)
+    if not all(0.0 <= it <= 1.0 for it in places) or any(b <= a for a, b in itertools.pairwise(places)):
+        raise _refused(places, name, "places from 0 to 1, each above the last")
+    return places
 
 
 def _quaternion(value: Any, name: str) -> Vector:
@@ -274,12 +291,14 @@ class MarkerSource(_Settings):
         fraction: its place, as a fraction of the rod's length: 0 is the clamped end, 1 the tip.
         rotation: the body's axes in the rod's local frame, as a quaternion, scalar first; None: the axes
             are calibrated at rest, when the rod points up.
+        deviation: standard deviation of `fraction`, if it is not well known: it is identified with the robot.
     """
 
     name: Annotated[str, _text]
     topic: Annotated[str, _text]
     fraction: Annotated[float, _number(0.0, 1.0)]
     rotation: Annotated[Vector | None, _quaternion] = None
+    deviation: Annotated[float | None, _number(0.0, 1.0)] = None
 
 
 def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
@@ -293,15 +312,62 @@ def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
             named = {"topic": marker["name"]} if "name" in marker else {}
             marker = _part(MarkerSource)(named | marker, where)
         markers.append(marker)
-    if not markers:
-        refused = tuple(value) if isinstance(value, list) else value
-        raise _refused(refused, name, "a list of one marker or more")
+    if not markers and value not in ([], ()):
+        raise _refused(value, name, "a list of markers")
     places, names = [marker.fraction for marker in markers], [marker.name for marker in markers]
     if any(b <= a for a, b in itertools.pairwise(places)):
         raise RecordingError(f"markers have the fractions {shown(places)}; allowed is each above the last")
     if len(set(names)) < len(names):
         raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
     return tuple(markers)
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorSource(_Settings):
+    """Sensor beside motion capture.
+
+    Attributes:
+        kind: "orientation" of a place since the first row: quaternions, scalar first, or roll, pitch and yaw
+            in the order z, y, x; "bending_angle" from the z axis and its direction about z from x;
+            "curvature" about the local x and y axes, in turn for each place; "base_wrench": force and moment
+            of the base on the rod.
+        columns: titles of its numbers in a table.
+        topic: topic in a bag (Imu, QuaternionStamped, PoseStamped, WrenchStamped or arrays); by default the
+            kind.
+        fractions: places, as fractions of the rod's length; a single number is one place.
+        unit: "rad" or "deg"; "1/m", "1/cm" or "1/mm"; "N" (and N m) or "mN" (and mN m).
+        rotation: rotation from its frame to the robot's, of orientations and wrenches; a quaternion, scalar
+            first.
+    """
+
+    kind: Annotated[str, _choice(SENSOR_UNITS)]
+    columns: Annotated[tuple[str, ...] | None, _titles()] = None
+    topic: Annotated[str | None, _text] = None
+    fractions: Annotated[Vector, _places] = (1.0,)
+    unit: str | None = None
+    rotation: Annotated[Vector | None, _quaternion] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        units = SENSOR_UNITS[self.kind]
+        self._set("topic", self.topic or self.kind)
+        self._set("unit", _choice(units)(self.unit or next(iter(units)), "unit"))
+        if self.kind != "curvature" and len(self.fractions) > 1:
+            raise _refused(self.fractions, "fractions", f"one place for {self.kind}: list a sensor for each")
+        if self.columns is not None:
+            self.require(len(self.columns))
+
+    def require(self, count: int) -> None:
+        """Raise `RecordingError` unless the sensor may have so many numbers."""
+        allowed = {"orientation": (4, 3), "bending_angle": (2,), "base_wrench": (6,)}
+        counts = allowed.get(self.kind, (2 * len(self.fractions),))
+        if count not in counts:
+            words = " or ".join(map(str, counts))
+            raise RecordingError(f"{self.topic} has {count} numbers; allowed for {self.kind} is {words}")
+
+
+def _sensors(value: Any, name: str) -> tuple[SensorSource, ...]:
+    return tuple(_part(SensorSource)(it, f"{name}, number {k + 1}") for k, it in enumerate(_listed(value)))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -347,7 +413,9 @@ class TensionSource(_NumbersSource):
         topic: topic of the tensions. With `{}` in it each tendon has its own topic: the place stands for the
             tendons' names, or without names for 1, 2, 3, …
         order: tendon of each number in a message; tendons count from 1. Empty: that of `names`.
-        unit: "N" or "gf" (grams-force).
+        unit: "N" or "gf" (grams-force); "A" or "mA" for currents of motors.
+        gain: tension over the reading, in N/A for currents (torque constant over the reel's radius, roughly,
+            for `load_cells.gain` is then identified); -1 where pulling is negative.
         held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
             at that instant, and tensions are interpolated linearly.
         names: names in the messages (joints of a JointState), or in the topics, of each number in `order`;
@@ -356,9 +424,20 @@ class TensionSource(_NumbersSource):
 
     topic: Annotated[str, _text]
     order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[Literal["N", "gf"], _choice(TENSION_UNITS)] = "N"
+    unit: Annotated[str, _choice(PULL_UNITS)] = "N"
     held: Annotated[bool | None, _flag] = None
     names: tuple[str, ...] | None = None
+    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.unit not in TENSION_UNITS and self.gain is None:
+            raise RecordingError(f"gain is missing; required of currents ({self.unit}), in N/A")
+
+    @property
+    def factor(self) -> float:
+        """Tension (N) over the numbers of the messages."""
+        return PULL_UNITS[self.unit] * (1.0 if self.gain is None else self.gain)
 
 
 def _command_text(value: Any, name: str) -> str:
@@ -393,7 +472,8 @@ class MotorSource(_NumbersSource):
     Attributes:
         topic: topic of the angles or lengths.
         order: motor of each number in a message; motors count from 1.
-        unit: "rad" or "deg" for angles; "m" or "mm" for lengths.
+        unit: "rad", "deg" or "ticks" (4096 in a turn, as Dynamixel motors count) for angles; "m" or "mm" for
+            lengths.
         latency: delay from an angle's stamp until it acts on the robot (s): the offset between the clocks
             of motors and motion capture.
         names: names of the motors in messages or topics, as in `TensionSource`. Angles in a JointState are
@@ -402,9 +482,14 @@ class MotorSource(_NumbersSource):
 
     topic: Annotated[str, _text]
     order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[Literal["rad", "deg", "m", "mm"], _choice(MOTOR_UNITS)] = "rad"
+    unit: Annotated[str, _choice(MOTOR_UNITS)] = "rad"
     latency: Annotated[float, _number(-10.0, 10.0, "s")] = 0.0
     names: tuple[str, ...] | None = None
+
+    @property
+    def factor(self) -> float:
+        """Angle (rad) or length (m) over the numbers of the messages."""
+        return MOTOR_UNITS[self.unit]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -463,7 +548,8 @@ class RecordingConfig(_Settings):
     Parts may be mappings, as in a file: `RecordingConfig(markers=[{"name": "tip", "fraction": 1}], …)`.
 
     Attributes:
-        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, rotation.
+        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, rotation, deviation.
+        sensors: sensors beside motion capture: kind, columns or topic, fractions, unit, rotation.
         tension: measured tensions, or None: topic, order of the tendons, unit (N or gf), held, names.
         motors: measured motor angles in place of tensions, or None: topic, order, unit, latency (s), names.
         command: commanded tensions, or None: as `tension`, with text and latency (s).
@@ -495,7 +581,8 @@ class RecordingConfig(_Settings):
         RecordingError: a value is not allowed.
     """
 
-    markers: Annotated[tuple[MarkerSource, ...], _markers]
+    markers: Annotated[tuple[MarkerSource, ...], _markers] = ()
+    sensors: Annotated[tuple[SensorSource, ...], _sensors] = ()
     tension: Annotated[TensionSource | None, _part(TensionSource)] = None
     motors: Annotated[MotorSource | None, _part(MotorSource)] = None
     command: Annotated[CommandSource | None, _part(CommandSource)] = None
@@ -521,6 +608,8 @@ class RecordingConfig(_Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.markers and not self.sensors:
+            raise RecordingError("markers is missing; required is a list of one marker or more, or of sensors")
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":
@@ -541,9 +630,8 @@ class RecordingConfig(_Settings):
             words = f"{self.tendons} numbers (N), one of each tendon"
             numbers = _numbers(self.tendons, words)(self.initial_tension, "initial_tension")
             self._set("initial_tension", numbers)
-        topics = [
-            source.topic for source in (*self.markers, self.base, self.measured, self.command) if source
-        ]
+        sources = (*self.markers, *self.sensors, self.base, self.measured, self.command)
+        topics = [source.topic for source in sources if source]
         repeated = next((topic for topic in topics if topics.count(topic) > 1), None)
         if repeated is not None:
             raise RecordingError(f"the topic {repeated} is there twice; allowed is one use of each topic")
@@ -613,8 +701,8 @@ class RecordingConfig(_Settings):
         defaults = {field.name: _plain(field.default) for field in dataclasses.fields(self)}
         lines = [f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
-            if name == "markers":
-                lines += ["markers:", *(f"  - {flow(marker)}" for marker in value)]
+            if name in ("markers", "sensors"):
+                lines += [f"{name}:", *(f"  - {flow(source)}" for source in value)] if value else []
             elif name == "columns":
                 lines += ["columns:", *(f"  {flow(key)}: {flow(titles)}" for key, titles in value.items())]
             elif not brief or value != defaults[name]:
@@ -657,6 +745,8 @@ def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
     if isinstance(base, dict) or (base is None and "base" in dict(columns.bodies)):
         values["base"] = {"topic": "base"} | (base or {})
     bodies = [name for name, _ in columns.bodies if name != "base"]
+    if not bodies and values.get("sensors"):
+        return values
     if not values.get("markers") and len(bodies) != 1:
         raise RecordingError(
             f"markers is missing; required with the columns of {len(bodies)} bodies: "

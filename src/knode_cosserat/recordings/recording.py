@@ -17,8 +17,8 @@ from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.streams import Body, Tensions, period
+from knode_cosserat.recordings.measurements import Measurements, Readings
+from knode_cosserat.recordings.streams import Body, Sensor, Tensions, period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.health import Health
@@ -47,6 +47,7 @@ class Recording:
         simulated: True if the robot was itself a simulation; None: not stated.
         findings: errors and repairs, the gravest first.
         delays: median delay from stamp to recording (s) by topic; NaN without stamps.
+        sensors: sensors beside motion capture.
     """
 
     source: str
@@ -59,14 +60,16 @@ class Recording:
     simulated: bool | None
     findings: tuple[Finding, ...]
     delays: Mapping[str, float]
+    sensors: tuple[Sensor, ...] = ()
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
-        bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies)
+        bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies) or "none"
+        sensors = "".join(f"; {sensor.topic}" for sensor in self.sensors)
         streams = [name for name in ("tension", "command") if getattr(self, name) is not None]
         return wrapped(
             f"Recording ({origin}): {self.end:.4g} s; {count_of(self.tendons, 'tendon')} "
-            f"({', '.join(streams)}); bodies {bodies} of the length; "
+            f"({', '.join(streams)}); bodies {bodies} of the length{sensors}; "
             f"{count_of(len(self.findings), 'finding')}; source: {self.source}"
         )
 
@@ -79,7 +82,7 @@ class Recording:
     def end(self) -> float:
         """End of the first stream to end (s): until then all poses and tensions are known."""
         driver = self._driver(self.config.tensions)
-        ends = [body.time[-1] for body in self.bodies]
+        ends = [stream.time[-1] for stream in (*self.bodies, *self.sensors)]
         if driver is self.tension:
             ends.append(driver.time[-1] + (period(driver.time) if self._is_held(driver) else 0.0))
         # a command holds until the next
@@ -138,18 +141,22 @@ class Recording:
             known &= np.isfinite(until)
             held = np.where(known, _averaged(driver, begin, dt, straight), np.nan)
         poses = [_interpolated(body, time, bridged) for body in self.bodies]
+        # arrays also have their shapes without bodies
+        nothing = np.zeros((len(time), 3)), np.zeros((len(time), 4)), np.zeros(len(time), dtype=bool)
         return Measurements(
             time=time,
             tension=held,
             fractions=np.array([body.fraction for body in self.bodies]),
-            position=np.stack([position for position, _, _ in poses], axis=1),
-            quaternion=np.stack([quaternion for _, quaternion, _ in poses], axis=1),
-            measured=np.stack([measured for _, _, measured in poses], axis=1),
+            position=np.stack([nothing[0], *(position for position, _, _ in poses)], axis=1)[:, 1:],
+            quaternion=np.stack([nothing[1], *(quaternion for _, quaternion, _ in poses)], axis=1)[:, 1:],
+            measured=np.stack([nothing[2], *(measured for _, _, measured in poses)], axis=1)[:, 1:],
             simulated=self.simulated,
             source=self.source,
             initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
             static=self.config.static,
             continuous=mean and not self.config.static and not self._is_held(driver),
+            sensors=tuple(Readings(it.output, _readings(it, time, bridged)) for it in self.sensors),
+            deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
         )
 
     def _initial_tension(self, driver: Tensions, at: float, longest: float) -> Float[np.ndarray, " c"] | None:
@@ -174,7 +181,7 @@ class Recording:
         if kind not in ("measured", "commanded", "none"):
             raise RecordingError(f"tensions is {kind!r}; allowed is measured, commanded or none")
         if kind == "none":
-            time = self.bodies[0].time
+            time = (*self.bodies, *self.sensors)[0].time
             return Tensions(time, np.zeros((len(time), 0)))
         driver = self.tension if kind == "measured" else self.command
         if driver is None:
@@ -194,7 +201,8 @@ class Recording:
         start = start if start is not None else trim[0]
         if start is None:
             # a lost frame at the beginning does not delay the first row
-            first = max(body.time[0] for body in self.bodies) - self.config.longest_gap
+            streams = (*self.bodies, *self.sensors)
+            first = max(stream.time[0] for stream in streams) - self.config.longest_gap
             start = max(0.0, math.ceil(first / dt - _SAME) * dt) if dt > 0 else 0.0
         last = min([self.end, *(limit for limit in (end, trim[1]) if limit is not None)])
         if not (dt > 0.0 and math.isfinite(dt)):
@@ -263,7 +271,7 @@ def _interpolated(
         position[inside] = CubicSpline(seen[piece], body.position[piece], bc_type="natural")(at)
         if body.quaternion is not None and len(at):
             turns = Slerp(seen[piece], Rotation.from_quat(body.quaternion[piece], scalar_first=True))
-            quaternion[inside] = _continuous(turns(at).as_quat(scalar_first=True))
+            quaternion[inside] = continuous(turns(at).as_quat(scalar_first=True))
     following = np.clip(np.searchsorted(seen, time - _SAME), 0, len(seen) - 1)
     exact = np.abs(seen[following] - time) <= _SAME
     near = seen[following] - seen[np.maximum(following - 1, 0)] <= 1.5 * period(seen) + _SAME
@@ -271,7 +279,18 @@ def _interpolated(
     return position, quaternion, measured & np.isfinite(position).all(axis=1)
 
 
-def _continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
+def _readings(sensor: Sensor, time: Float[np.ndarray, " T"], longest: float) -> Float[np.ndarray, "T p"]:
+    """Return values interpolated linearly between rows, NaN in gaps too long to be bridged."""
+    known, limit = sensor.time, bridge(sensor.time, longest)
+    values = np.stack([np.interp(time, known, column) for column in sensor.values.T], axis=1)
+    after = np.searchsorted(known, time - _SAME)
+    gap = known[np.minimum(after, len(known) - 1)] - known[np.maximum(after - 1, 0)]
+    outside = (time < known[0] - limit) | (time > known[-1] + _SAME)
+    exact = np.abs(known[np.minimum(after, len(known) - 1)] - time) <= _SAME
+    return np.where((outside | ((gap > limit) & ~exact))[:, None], np.nan, values)
+
+
+def continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
     """Return the same rotations with the signs that are continuous from row to row."""
     flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
     sign = 1.0 if quaternion[0, 0] >= 0.0 else -1.0
