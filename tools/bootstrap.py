@@ -92,6 +92,8 @@ def make_venv(folder: pathlib.Path) -> pathlib.Path:
 
 def set_up() -> None:
     """Bring .venv to what requirements.lock and both pyproject.toml say."""
+    if VENV.is_symlink():
+        sys.exit(f"error: .venv is a link to {VENV.resolve()}, which set-up would empty: remove the link")
     # Some network file systems have no such locks: there, two set-ups at once remain the user's own affair.
     with contextlib.suppress(OSError):
         fcntl.flock(TURN, fcntl.LOCK_EX)
