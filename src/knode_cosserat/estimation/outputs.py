@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import conjugate, quaternion_product, rotation_matrix
-from knode_cosserat.solvers.places import Places, places_on, positions_at, quaternions_at
+from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
 from knode_cosserat.trajectory import Trajectory
 
 #: in the place of zero, where a root has no derivative
@@ -70,6 +70,15 @@ def _xyz(name: str, unit: str) -> tuple[str, ...]:
     return tuple(f"{name}.{axis} ({unit})" for axis in "xyz")
 
 
+_product = jnp.vectorize(quaternion_product, signature="(4),(4)->(4)")
+
+
+def _rotation_vectors(a: Float[Any, "... M 4"], b: Float[Any, "... M 4"]) -> Float[Any, "... e"]:
+    """Return the rotation vectors (rad) of a ∘ b, which are small, one after the other."""
+    off = _product(a, b)
+    return (2.0 * off[..., 1:] * jnp.where(off[..., :1] < 0.0, -1.0, 1.0)).reshape(*off.shape[:-2], -1)
+
+
 @dataclasses.dataclass(frozen=True)
 class _AtFractions(Output):
     """Output at fractions of the length, with numbers of one standard deviation."""
@@ -88,28 +97,6 @@ class _AtFractions(Output):
         """Standard deviation of every number of an error."""
         return np.full(self.size, self.sigma)
 
-    def places(self, system: System) -> Places:
-        """Return the places on a robot, which may have identified places of its own."""
-        return places_on(system, self.fractions)
-
-    def turned(
-        self, system: System, y: Float[Any, "T N y"], references: Float[Any, "T M 4"]
-    ) -> Float[Any, "T M 3"]:
-        """Return differences of the rotations since the first row that was seen (rad, global frame).
-
-        The mounting of the bodies on the rod need not be known.
-        """
-        h = quaternions_at(system, y, self.places(system))
-        known = jnp.isfinite(references[..., :1])
-        row = jnp.argmax(known, axis=0)[None]
-        product, inverse = jax.vmap(jax.vmap(quaternion_product)), jax.vmap(jax.vmap(conjugate))
-
-        def since(turns: Any) -> Any:
-            return product(turns, inverse(jnp.broadcast_to(jnp.take_along_axis(turns, row, 0), turns.shape)))
-
-        off = product(since(h), inverse(since(jnp.where(known, references, 1.0))))
-        return jnp.where(known, 2.0 * off[..., 1:] * jnp.where(off[..., :1] < 0.0, -1.0, 1.0), jnp.nan)
-
 
 @dataclasses.dataclass(frozen=True)
 class BodyPositions(_AtFractions):
@@ -125,7 +112,7 @@ class BodyPositions(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the positions, one after the other."""
-        return positions_at(system, y[None], self.places(system), z[None])[0].ravel()
+        return positions_at(system, y[None], places_on(system, self.fractions), z[None])[0].ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -133,6 +120,57 @@ class TipPosition(BodyPositions):
     """Position (m) of the tip, global frame."""
 
     fractions: tuple[float, ...] = (1.0,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Orientations(_AtFractions):
+    """Unit quaternions (scalar first) at fractions of the length, such as those of an inertial sensor.
+
+    Rows of data are compared by the rotations since the first one that was seen: the mounting of the sensor
+    need not be known. An error is a rotation vector (rad), of one row from the reference in its own frame, of
+    rows in the global frame.
+    """
+
+    #: standard deviation of a rotation (rad)
+    sigma: float = 5e-3
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(f"quaternion[{part:g}].{k}" for part in self.fractions for k in "wxyz")
+
+    @property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Standard deviation of every number of an error."""
+        return np.full(3 * len(self.fractions), self.sigma)
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return the orientations, one after the other."""
+        return quaternions_at(system, y[None], places_on(system, self.fractions))[0].ravel()
+
+    def error(
+        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
+    ) -> Float[Any, " e"]:
+        """Return rotation vectors from the reference."""
+        return _rotation_vectors(conjugate(reference.reshape(-1, 4)), self.value(system, y, z).reshape(-1, 4))
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return differences of the rotations since the first row that was seen."""
+        h, wanted = (
+            quaternions_at(system, y, places_on(system, self.fractions)),
+            references.reshape(len(y), -1, 4),
+        )
+        size = jnp.linalg.norm(wanted, axis=-1, keepdims=True)
+        known = jnp.isfinite(size)
+        row = jnp.argmax(known, axis=0)[None]
+
+        def since(turns: Any) -> Any:
+            return _product(turns, conjugate(jnp.take_along_axis(turns, row, 0)))
+
+        off = _rotation_vectors(since(h), conjugate(since(jnp.where(known, wanted / size, 1.0))))
+        return jnp.where(jnp.repeat(known[..., 0], 3, axis=1), off, jnp.nan)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -161,7 +199,7 @@ class BodyPoses(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return position and quaternion of each place."""
-        places = self.places(system)
+        places = places_on(system, self.fractions)
         p, h = positions_at(system, y[None], places, z[None])[0], quaternions_at(system, y[None], places)[0]
         return jnp.concatenate([p, h], axis=1).ravel()
 
@@ -170,12 +208,8 @@ class BodyPoses(_AtFractions):
     ) -> Float[Any, " e"]:
         """Return differences of positions (m) and rotation vectors (rad)."""
         value, wanted = (it.reshape(-1, 7) for it in (self.value(system, y, z), reference))
-        parts = []
-        for k in range(len(self.fractions)):
-            turned = quaternion_product(conjugate(wanted[k, 3:]), value[k, 3:])
-            shorter = jnp.where(turned[0] < 0.0, -1.0, 1.0)
-            parts += [value[k, :3] - wanted[k, :3], 2.0 * shorter * turned[1:]]
-        return jnp.concatenate(parts)
+        turned = _rotation_vectors(conjugate(wanted[:, 3:]), value[:, 3:]).reshape(-1, 3)
+        return jnp.concatenate([value[:, :3] - wanted[:, :3], turned], axis=1).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -196,51 +230,10 @@ class BodyMotions(BodyPoses):
         self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
     ) -> Float[Any, "T e"]:
         """Return differences of positions (m), and of rotations since the first row (rad, global frame)."""
-        reference = references.reshape(len(references), -1, 7)
-        moved = positions_at(system, y, self.places(system), z) - reference[..., :3]
-        both = jnp.concatenate([moved, self.turned(system, y, reference[..., 3:])], axis=-1)
-        return both.reshape(len(references), -1)
-
-
-@dataclasses.dataclass(frozen=True)
-class Orientations(_AtFractions):
-    """Unit quaternions (scalar first) at fractions of the length, such as those of an inertial sensor.
-
-    Rows of data are compared by the rotations since the first one, so that the mounting of the sensor need
-    not be known.
-    """
-
-    #: standard deviation of a rotation (rad)
-    sigma: float = 5e-3
-
-    @property
-    def labels(self) -> tuple[str, ...]:
-        """Name and unit of every number of a value."""
-        return tuple(f"quaternion[{part:g}].{k}" for part in self.fractions for k in "wxyz")
-
-    @property
-    def noise(self) -> Float[np.ndarray, " e"]:
-        """Standard deviation of every number of an error."""
-        return np.full(3 * len(self.fractions), self.sigma)
-
-    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
-        """Return the orientations, one after the other."""
-        return quaternions_at(system, y[None], self.places(system))[0].ravel()
-
-    def error(
-        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
-    ) -> Float[Any, " e"]:
-        """Return rotation vectors from the reference (rad)."""
-        value, wanted = self.value(system, y, z).reshape(-1, 4), reference.reshape(-1, 4)
-        off = jax.vmap(quaternion_product)(jax.vmap(conjugate)(wanted), value)
-        return (2.0 * off[:, 1:] * jnp.where(off[:, :1] < 0.0, -1.0, 1.0)).ravel()
-
-    def errors(
-        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
-    ) -> Float[Any, "T e"]:
-        """Return differences of the rotations since the first row (rad, global frame)."""
-        count = len(references)
-        return self.turned(system, y, references.reshape(count, -1, 4)).reshape(count, -1)
+        count, reference = len(references), references.reshape(len(references), -1, 7)
+        moved = positions_at(system, y, places_on(system, self.fractions), z) - reference[..., :3]
+        turned = Orientations(self.fractions).errors(system, y, z, reference[..., 3:].reshape(count, -1))
+        return jnp.concatenate([moved, turned.reshape(count, -1, 3)], axis=-1).reshape(count, -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -260,7 +253,7 @@ class BendingAngles(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the angles, one pair after the other."""
-        h = quaternions_at(system, y[None], self.places(system))[0]
+        h = quaternions_at(system, y[None], places_on(system, self.fractions))[0]
         axis = jax.vmap(rotation_matrix)(h)[:, :, 2]
         sine = jnp.sqrt(jnp.sum(axis[:, :2] ** 2, axis=1, keepdims=True) + TINY)
         return (axis[:, :2] * jnp.arctan2(sine, axis[:, 2:]) / sine).ravel()
@@ -335,7 +328,7 @@ class Curvatures(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the curvatures, interpolated linearly between nodes."""
-        places = self.places(system)
+        places = places_on(system, self.fractions)
         u = system.z_layout.get(z, "u")[..., :2]
         part = jnp.asarray(places.part)[:, None]
         return ((1.0 - part) * u[places.node] + part * u[places.node + 1]).ravel()
@@ -377,13 +370,8 @@ class Several(Output):
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """Kind of every number of an error, numbered where outputs are of one kind."""
-        names = [it.fields[0] for it in self.outputs]
-        return tuple(
-            f"{field} {k + 1}" if names.count(field) > 1 else field
-            for k, it in enumerate(self.outputs)
-            for field in it.fields
-        )
+        """Kind of every number of an error."""
+        return tuple(field for it in self.outputs for field in it.fields)
 
     @property
     def noise(self) -> Float[np.ndarray, " e"]:
@@ -394,11 +382,9 @@ class Several(Output):
         """Return all values."""
         return jnp.concatenate([it.value(system, y, z) for it in self.outputs])
 
-    def parts(self, numbers: Float[Any, "... p"]) -> list[Float[Any, "... q"]]:
-        """Return the numbers of each output, of values or of errors."""
-        values = numbers.shape[-1] == self.size
-        sizes = [it.size if values else len(it.noise) for it in self.outputs]
-        return jnp.split(numbers, np.cumsum(sizes)[:-1], axis=-1)
+    def parts(self, values: Float[Any, "... p"]) -> list[Float[Any, "... q"]]:
+        """Return the values of each output."""
+        return jnp.split(values, np.cumsum([it.size for it in self.outputs])[:-1], axis=-1)
 
     def error(
         self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]

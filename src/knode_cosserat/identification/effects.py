@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.parameters import Effect, Model, Number, Replace
+from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.parameters import (
     Parameter,
     ParameterError,
@@ -95,16 +96,11 @@ def library_model(
     return Model(nominal, [*effects_of(nominal, usual), *more])
 
 
-def place_effects(measured: Iterable[Any], *, flat: bool) -> list[Effect]:
-    """Return the places of bodies that are not well known, as an effect of all recordings; none without any.
-
-    Args:
-        measured: rows of recordings, or other data.
-        flat: numbers without priors.
-    """
+def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Effect]:
+    """Return the places of bodies that are not well known, as an effect; `flat` ones have no priors."""
     places: dict[float, float] = {}
     for rows in measured:
-        places |= zip(map(float, getattr(rows, "fractions", ())), getattr(rows, "deviations", ()), strict=False)
+        places |= zip(map(float, rows.fractions), rows.deviations, strict=False)
     stated = tuple(sorted(place for place, deviation in places.items() if deviation > 0.0))
     numbers = tuple(Number(f"place[{it:g}]", "", it, places[it], 0.0, 1.0, flat=flat) for it in stated)
 

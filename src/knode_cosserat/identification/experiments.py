@@ -240,7 +240,8 @@ def _measured(measured: Measurements, robot: System) -> tuple[Output, np.ndarray
             return BodyPositions(fractions, 1.0), np.array(measured.position.reshape(rows, -1))
         outputs.append(BodyMotions(fractions, 1.0, 1.0 / (ARM * length)))
         data.append(np.concatenate([measured.position, measured.quaternion], axis=-1).reshape(rows, -1))
-    for output, values in measured.sensors:
+    for sensor in measured.sensors:
+        output, values = sensor.output, sensor.values
         known = np.isfinite(values)
         sizes = (values / np.resize(output.noise, values.shape[1]))[known]
         usual = float(np.sqrt(np.mean(sizes**2))) if len(sizes) else 0.0
@@ -262,7 +263,7 @@ def _as_steps(measured: Measurements) -> Measurements:
         tension=np.concatenate([measured.tension, measured.tension[-1:]]),
         position=late(measured.position),
         quaternion=late(measured.quaternion),
-        sensors=tuple(it._replace(values=late(it.values)) for it in measured.sensors),
+        sensors=tuple(dataclasses.replace(it, values=late(it.values)) for it in measured.sensors),
         initial_tension=measured.tension[0],
     )
 

@@ -107,7 +107,8 @@ def identify(
     tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
     data = listed_rows(data)
     plain = [] if parameters is None else parameter_effects(robot, parameters)
-    plain += place_effects(data, flat=effects is None and parameters is not None)
+    rows = [it for it in data if isinstance(it, Measurements)]
+    plain += place_effects(rows, flat=effects is None and parameters is not None)
     if effects is None and parameters is not None:
         model = Model(robot, plain)
         search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
@@ -283,7 +284,7 @@ def _accepted(search: Search, selection: Selection, space: str | SpaceScheme) ->
     folds = []
     if len(data) > 1:
         ends = [search.without(point, k, FOLD) for k in range(len(data))]
-        errors = [None if end is None else _errors(search, end.x, [k], False)[0] for k, end in enumerate(ends)]
+        errors = [None if it is None else _errors(search, it.x, [k], False)[0] for k, it in enumerate(ends)]
         folds = [end.x for end in ends if end is not None]
         nominal = _errors(search, np.zeros(model.size), tip=False)
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
@@ -314,17 +315,12 @@ def _places(data: Experiment) -> Callable[[np.ndarray], np.ndarray] | None:
         return lambda rows: rows[:, : output.nodes * count].reshape(len(rows), output.nodes, count)[
             ..., first : first + size
         ]
-    first = output.outputs[0] if isinstance(output, Several) else output
-    bodies = len(getattr(first, "fractions", ()))
-    if not bodies or not first.labels[0].startswith("position"):
+    poses = output.outputs[0] if isinstance(output, Several) else output
+    bodies = len(getattr(poses, "fractions", ()))
+    if not bodies or not poses.labels[0].startswith("position"):
         return None
-    dimension = 3 if hasattr(first, "sigma_rotation") else data.data.shape[1] // bodies
-
-    def places(rows: np.ndarray) -> np.ndarray:
-        part = output.parts(rows)[0] if isinstance(output, Several) else rows
-        return np.asarray(part.reshape(len(rows), bodies, -1)[..., :dimension])
-
-    return places
+    last = 6 * bodies if hasattr(poses, "sigma_rotation") else data.data.shape[1]
+    return lambda rows: rows[:, :last].reshape(len(rows), bodies, -1)[..., :3]
 
 
 def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:

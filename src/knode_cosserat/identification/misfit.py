@@ -139,15 +139,13 @@ class Misfit:
         noise, stages = data.noise, 1 if data.static else data.settings.stages
 
         def tangents(which: Any) -> np.ndarray:
-            directions, *by_delay = _directions(self.model.robot, x)
+            directions, by_latency = _directions(self.model.robot, x)
             weights = np.eye(len(x))[:, which]
             d_first, past, d_past = start.tangents(directions, weights)
             controls = acting[:steps]
             d_controls = np.zeros((*controls.shape, weights.shape[1]))
             if slope is not None:
-                late, drift = (np.asarray(part)[which] for part in by_delay)
-                time = task.dt * np.arange(1.0, steps + 1.0)
-                d_controls = slope[:steps, :, None] * (late + time[:, None] * drift)[:, None]
+                d_controls = slope[:steps, :, None] * np.asarray(by_latency)[which]
             changes = Changes(d_controls, directions, weights)
             solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             d_records = np.zeros((0, *records.shape[1:], weights.shape[1]))
@@ -242,13 +240,13 @@ def _system(robot: ParametrisedRobot, x: Any) -> Any:
 
 
 @jax.jit
-def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any, Any]:
-    """Return a system's tangents by each coordinate, stacked, and the load cells' latency and drift (n,)."""
+def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
+    """Return a system's tangents by each coordinate, stacked, and those of the load cells' latency (n,)."""
 
     def along(direction: Any) -> Any:
         d_system = jax.jvp(robot, (x,), (direction,))[1]
         cells = _cells(d_system)
-        return d_system, *((jnp.zeros(()),) * 2 if cells is None else (cells.latency, cells.drift))
+        return d_system, jnp.zeros(()) if cells is None else cells.latency
 
     return jax.vmap(along)(jnp.eye(len(x)))
 

@@ -433,6 +433,8 @@ class _Descent:
         parts = zip(rollouts, self.units, self.known, strict=True)
         rows = [(rollout.derivatives_by(self.free) / unit)[:, known].T for rollout, unit, known in parts]
         scaled_rows = np.concatenate(rows) * (factor / self.thinned)[:, None]
+        if not np.isfinite(scaled_rows).all():
+            raise SearchError("the search left the range of robots whose motion has derivatives")
         return np.concatenate([scaled_rows, np.diag(self.prior)]) * self.reach
 
     def _scaled(self, rollouts: list[Rollout]) -> np.ndarray:

@@ -25,6 +25,8 @@ from knode_cosserat.recordings.frame import NORMAL, rotation_steps
 from knode_cosserat.recordings.recording import bridge, continuous
 from knode_cosserat.recordings.streams import SLOW, Body, Sensor, Tensions, period
 
+#: allowed numbers in a row of a sensor, by its kind; of curvatures two for each place
+SENSOR_COUNTS = {"orientation": (4, 3), "bending_angle": (2,), "base_wrench": (6,)}
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
 #: longest spike of a load cell (s): spikes last one or two messages, a longer change can be a command
@@ -61,6 +63,11 @@ class _Rows:
         """Remove rows with numbers that are not finite or implausibly large, and others that are wrong."""
         large = ~np.all(np.abs(np.nan_to_num(self.values, nan=np.inf)) < 1e9, axis=1)
         self.drop(wrong | large, words, "warning")
+
+    def drop_repeats(self, what: str) -> None:
+        """Remove rows that repeat the one before."""
+        again = np.concatenate([[False], np.all(np.diff(self.values, axis=0) == 0.0, axis=1)])
+        self.drop(again[: len(self.time)], (f"{what} repeats", f"{what}s repeat", "the one before"), "note")
 
     def add(self, message: str, severity: Severity, rows: Bool[np.ndarray, " n"]) -> None:
         """Add a finding on rows."""
@@ -103,8 +110,7 @@ def cleaned_body(
             no_rotation = ~(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) < 0.05)
     rows.drop_unusable(no_rotation, ("pose is", "poses are", "not finite, or no rotation"))
     if config.repeats == "drop":
-        again = np.concatenate([[False], np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)])
-        rows.drop(again[: len(rows.time)], ("pose repeats", "poses repeat", "the one before"), "note")
+        rows.drop_repeats("pose")
     if len(rows.time) < FEWEST_FRAMES:
         raise RecordingError(
             f"{path}: topic {topic}: {len(rows.time)} usable poses of {name}; required is {FEWEST_FRAMES} or "
@@ -152,38 +158,37 @@ def cleaned_sensor(
     Raises:
         RecordingError: another number of numbers than its kind has, or too few usable rows.
     """
-    try:
-        source.require(numbers.shape[1])
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
-    factor, places = SENSOR_UNITS[source.kind][str(source.unit)], source.fractions
-    rows = _Rows(source.topic or "", time, numbers)
-    is_turn = source.kind == "orientation" and numbers.shape[1] == 4
-    none = np.zeros(len(time), dtype=bool)
-    no_rotation = ~(np.abs(np.linalg.norm(numbers, axis=1) - 1.0) < 0.05) if is_turn else none
-    rows.drop_unusable(no_rotation, ("row is", "rows are", "not finite, or no rotation"))
+    counts = SENSOR_COUNTS.get(source.kind, (2 * len(source.fractions),))
+    if (count := numbers.shape[1]) not in counts:
+        words = f"allowed for {source.kind} is {' or '.join(map(str, counts))}"
+        raise RecordingError(f"{path}: {source.topic} has {count} numbers in a row; {words}")
+    rows = _Rows(source.topic, time, numbers)
+    length = np.ones(len(time))
+    if source.kind == "orientation" and count == 4:
+        length = np.linalg.norm(numbers, axis=1)
+    rows.drop_unusable(~(np.abs(length - 1.0) < 0.05), ("row is", "rows are", "not finite, or no rotation"))
     if config.repeats == "drop":
-        again = np.concatenate([[False], np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)])
-        rows.drop(again[: len(rows.time)], ("row repeats", "rows repeat", "the one before"), "note")
+        rows.drop_repeats("row")
     if len(rows.time) < FEWEST_FRAMES:
         raise RecordingError(
             f"{path}: {source.topic}: {len(rows.time)} usable rows; required is {FEWEST_FRAMES} or more"
         )
+    units = SENSOR_UNITS[source.kind]
+    values = rows.values * units[source.unit or next(iter(units))]
     frame = Rotation.from_quat(source.rotation or (1.0, 0.0, 0.0, 0.0), scalar_first=True)
-    values = rows.values * (1.0 if is_turn else factor)
-    output: Output = Curvatures(places)
+    output: Output = Curvatures(source.fractions)
     if source.kind == "orientation":
-        output = Orientations(places)
-        turned = Rotation.from_quat(values, scalar_first=True) if is_turn else (
-            Rotation.from_euler("ZYX", values[:, ::-1])
-        )
-        values = continuous((frame * turned).as_quat(scalar_first=True))
+        output = Orientations(source.fractions)
+        if count == 3:
+            values = Rotation.from_euler("ZYX", values[:, ::-1]).as_quat(scalar_first=True)
+        turned = frame * Rotation.from_quat(values, scalar_first=True)
+        values = continuous(turned.as_quat(scalar_first=True))
     elif source.kind == "bending_angle":
-        output = BendingAngles(places)
+        output = BendingAngles(source.fractions)
         values = values[:, :1] * np.stack([np.cos(values[:, 1]), np.sin(values[:, 1])], axis=1)
     elif source.kind == "base_wrench":
         output = BaseWrench()
-        values = np.hstack([frame.apply(values[:, :3]), frame.apply(values[:, 3:])])
+        values = frame.apply(values.reshape(-1, 3)).reshape(values.shape)
     rows.add_pauses(config.longest_gap)
     return Sensor(rows.time, values, output, rows.topic), rows.findings
 

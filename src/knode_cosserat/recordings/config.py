@@ -45,9 +45,7 @@ PLACE = "{}"
 POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: units of motors: angles to rad, or wound-up lengths to m
-MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3, "ticks": math.pi / 2048.0}
-#: units of tensions: forces to N, or motor currents to A
-PULL_UNITS = {**TENSION_UNITS, "A": 1.0, "mA": 1e-3}
+MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
 #: kinds of sensors beside motion capture: their units with factors to SI units, the default first
 SENSOR_UNITS: dict[str, dict[str, float]] = {
     "orientation": {"rad": 1.0, "deg": math.pi / 180.0},
@@ -137,12 +135,8 @@ def _numbers(count: int, words: str) -> _Check:
     return check
 
 
-def _places(value: Any, name: str) -> Vector:
-    numbers = _listed(value) or [value]
-    places = _numbers(len(numbers), "places from 0 to 1, each above the last")(numbers, name)
-    if not all(0.0 <= it <= 1.0 for it in places) or any(b <= a for a, b in itertools.pairwise(places)):
-        raise _refused(places, name, "places from 0 to 1, each above the last")
-    return places
+def _fractions(value: Any, name: str) -> Vector:
+    return tuple(_number(0.0, 1.0)(place, name) for place in _listed(value) or [value])
 
 
 def _quaternion(value: Any, name: str) -> Vector:
@@ -332,8 +326,8 @@ class SensorSource(_Settings):
             "curvature" about the local x and y axes, in turn for each place; "base_wrench": force and moment
             of the base on the rod.
         columns: titles of its numbers in a table.
-        topic: topic in a bag (Imu, QuaternionStamped, PoseStamped, WrenchStamped or arrays); by default the
-            kind.
+        topic: topic in a bag (Imu, QuaternionStamped, PoseStamped, WrenchStamped or arrays), or name in
+            reports; by default the kind.
         fractions: places, as fractions of the rod's length; a single number is one place.
         unit: "rad" or "deg"; "1/m", "1/cm" or "1/mm"; "N" (and N m) or "mN" (and mN m).
         rotation: rotation from its frame to the robot's, of orientations and wrenches; a quaternion, scalar
@@ -341,33 +335,26 @@ class SensorSource(_Settings):
     """
 
     kind: Annotated[str, _choice(SENSOR_UNITS)]
+    topic: Annotated[str, _text]
     columns: Annotated[tuple[str, ...] | None, _titles()] = None
-    topic: Annotated[str | None, _text] = None
-    fractions: Annotated[Vector, _places] = (1.0,)
+    fractions: Annotated[Vector, _fractions] = (1.0,)
     unit: str | None = None
     rotation: Annotated[Vector | None, _quaternion] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        units = SENSOR_UNITS[self.kind]
-        self._set("topic", self.topic or self.kind)
-        self._set("unit", _choice(units)(self.unit or next(iter(units)), "unit"))
+        if self.unit is not None:
+            _choice(SENSOR_UNITS[self.kind])(self.unit, "unit")
         if self.kind != "curvature" and len(self.fractions) > 1:
             raise _refused(self.fractions, "fractions", f"one place for {self.kind}: list a sensor for each")
-        if self.columns is not None:
-            self.require(len(self.columns))
-
-    def require(self, count: int) -> None:
-        """Raise `RecordingError` unless the sensor may have so many numbers."""
-        allowed = {"orientation": (4, 3), "bending_angle": (2,), "base_wrench": (6,)}
-        counts = allowed.get(self.kind, (2 * len(self.fractions),))
-        if count not in counts:
-            words = " or ".join(map(str, counts))
-            raise RecordingError(f"{self.topic} has {count} numbers; allowed for {self.kind} is {words}")
 
 
 def _sensors(value: Any, name: str) -> tuple[SensorSource, ...]:
-    return tuple(_part(SensorSource)(it, f"{name}, number {k + 1}") for k, it in enumerate(_listed(value)))
+    sensors = []
+    for k, sensor in enumerate(_listed(value)):
+        named = {"topic": sensor.get("kind")} | sensor if isinstance(sensor, dict) else sensor
+        sensors.append(_part(SensorSource)(named, f"{name}, number {k + 1}"))
+    return tuple(sensors)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -384,6 +371,13 @@ class _NumbersSource(_Settings):
     topic: str
     order: tuple[int, ...]
     names: tuple[str, ...] | None
+    unit: str
+    gain: float
+
+    @property
+    def factor(self) -> float:
+        """Tension (N), angle (rad) or length (m) over the numbers of the messages."""
+        return {**TENSION_UNITS, **MOTOR_UNITS}[self.unit] * self.gain
 
     def __post_init__(self) -> None:
         names = None
@@ -401,6 +395,8 @@ class _NumbersSource(_Settings):
                 f"names has {len(names)} names and order {len(self.order)} numbers; allowed is the same "
                 "number"
             )
+        if self.gain == 0.0:
+            raise _refused(self.gain, "gain", "any other number")
         if self.topic.count(PLACE) > 1:
             raise _refused(self.topic, "topic", f"one {PLACE} at most")
 
@@ -413,9 +409,9 @@ class TensionSource(_NumbersSource):
         topic: topic of the tensions. With `{}` in it each tendon has its own topic: the place stands for the
             tendons' names, or without names for 1, 2, 3, …
         order: tendon of each number in a message; tendons count from 1. Empty: that of `names`.
-        unit: "N" or "gf" (grams-force); "A" or "mA" for currents of motors.
-        gain: tension over the reading, in N/A for currents (torque constant over the reel's radius, roughly,
-            for `load_cells.gain` is then identified); -1 where pulling is negative.
+        unit: "N" or "gf" (grams-force).
+        gain: factor from a message's numbers to this unit, such as the tension of a motor current of 1 A; a
+            rough one will do where gains of load cells are identified. Negative if numbers pull below zero.
         held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
             at that instant, and tensions are interpolated linearly.
         names: names in the messages (joints of a JointState), or in the topics, of each number in `order`;
@@ -424,20 +420,10 @@ class TensionSource(_NumbersSource):
 
     topic: Annotated[str, _text]
     order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[str, _choice(PULL_UNITS)] = "N"
+    unit: Annotated[Literal["N", "gf"], _choice(TENSION_UNITS)] = "N"
     held: Annotated[bool | None, _flag] = None
     names: tuple[str, ...] | None = None
-    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.unit not in TENSION_UNITS and self.gain is None:
-            raise RecordingError(f"gain is missing; required of currents ({self.unit}), in N/A")
-
-    @property
-    def factor(self) -> float:
-        """Tension (N) over the numbers of the messages."""
-        return PULL_UNITS[self.unit] * (1.0 if self.gain is None else self.gain)
+    gain: Annotated[float, _number(-1e6, 1e6)] = 1.0
 
 
 def _command_text(value: Any, name: str) -> str:
@@ -472,8 +458,8 @@ class MotorSource(_NumbersSource):
     Attributes:
         topic: topic of the angles or lengths.
         order: motor of each number in a message; motors count from 1.
-        unit: "rad", "deg" or "ticks" (4096 in a turn, as Dynamixel motors count) for angles; "m" or "mm" for
-            lengths.
+        unit: "rad" or "deg" for angles; "m" or "mm" for lengths.
+        gain: factor from a message's numbers to this unit, such as 360 / 4096 degrees for a motor's ticks.
         latency: delay from an angle's stamp until it acts on the robot (s): the offset between the clocks
             of motors and motion capture.
         names: names of the motors in messages or topics, as in `TensionSource`. Angles in a JointState are
@@ -482,14 +468,10 @@ class MotorSource(_NumbersSource):
 
     topic: Annotated[str, _text]
     order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[str, _choice(MOTOR_UNITS)] = "rad"
+    unit: Annotated[Literal["rad", "deg", "m", "mm"], _choice(MOTOR_UNITS)] = "rad"
     latency: Annotated[float, _number(-10.0, 10.0, "s")] = 0.0
     names: tuple[str, ...] | None = None
-
-    @property
-    def factor(self) -> float:
-        """Angle (rad) or length (m) over the numbers of the messages."""
-        return MOTOR_UNITS[self.unit]
+    gain: Annotated[float, _number(-1e6, 1e6)] = 1.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -548,7 +530,8 @@ class RecordingConfig(_Settings):
     Parts may be mappings, as in a file: `RecordingConfig(markers=[{"name": "tip", "fraction": 1}], …)`.
 
     Attributes:
-        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, rotation, deviation.
+        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, its deviation,
+            rotation.
         sensors: sensors beside motion capture: kind, columns or topic, fractions, unit, rotation.
         tension: measured tensions, or None: topic, order of the tendons, unit (N or gf), held, names.
         motors: measured motor angles in place of tensions, or None: topic, order, unit, latency (s), names.
@@ -609,7 +592,7 @@ class RecordingConfig(_Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.markers and not self.sensors:
-            raise RecordingError("markers is missing; required is a list of one marker or more, or of sensors")
+            raise RecordingError("markers is missing; required is one marker or more, or sensors")
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":

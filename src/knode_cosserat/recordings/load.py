@@ -185,10 +185,10 @@ def _assembled(
         base = bodies.pop()
     sensors = []
     for sensor in config.sensors:
-        topic = sensor.topic or ""
-        rows_of, about_sensor = checks.cleaned_sensor(config, sensor, seconds[topic], values[topic], path)
+        numbers_of = seconds[sensor.topic], values[sensor.topic]
+        cleaned, about_sensor = checks.cleaned_sensor(config, sensor, *numbers_of, path)
         findings += about_sensor
-        sensors.append(rows_of)
+        sensors.append(cleaned)
     tension, commanded, about_tensions = checks.cleaned_tensions(config, seconds, values, path)
     bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
     at_rest = frame.rest_positions(bodies, rest)

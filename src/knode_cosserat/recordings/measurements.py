@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Self
+from typing import TYPE_CHECKING, Any, Self
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -15,21 +17,13 @@ from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, Sensor, Tensions
 from knode_cosserat.recordings.table import HELD
 from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
-
-
-class Readings(NamedTuple):
-    """Values of a sensor beside motion capture in rows, and the kind of its output."""
-
-    output: Output
-    #: in SI units; NaN where nothing was measured
-    values: Float[np.ndarray, "T p"]
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -64,8 +58,8 @@ class Measurements:
     static: bool = False
     #: True if the tensions are samples of a continuous signal: row i's is then that at the time of row i + 1
     continuous: bool = False
-    #: orientations, bending angles, curvatures or wrenches by other sensors
-    sensors: tuple[Readings, ...] = ()
+    #: orientations, bending angles, curvatures or wrenches by other sensors, in the same rows
+    sensors: tuple[Sensor, ...] = ()
     #: standard deviations of `fractions`, zero where they are known; others are identified
     deviations: tuple[float, ...] = ()
 
@@ -73,8 +67,8 @@ class Measurements:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
         kind = "equilibria" if self.static else "rows"
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
-        places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions)
-        more = "".join(f"; {it.output.fields[0]}" for it in self.sensors)
+        places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions) or "none"
+        more = "".join(f"; {it.topic}" for it in self.sensors)
         return wrapped(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
             f"{count_of(self.tension.shape[-1], 'tendon')}; "
@@ -83,18 +77,21 @@ class Measurements:
         )
 
     @classmethod
-    def of(cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,)) -> Self:
+    def of(
+        cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,), outputs: Sequence[Output] = ()
+    ) -> Self:
         """Return noise-free measurements of a trajectory of one robot.
 
         Args:
             trajectory: a whole trajectory, or consecutive rows, of a system with positions.
             fractions: places of the bodies, as fractions of the rod's length, from base to tip.
+            outputs: outputs that other sensors measure.
 
         Raises:
             AttributeError: the system has no positions.
             ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
         """
-        y, system = np.asarray(trajectory.y), trajectory.system
+        y, z, system = np.asarray(trajectory.y), np.asarray(trajectory.z), trajectory.system
         if y.ndim == 4:
             raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
         held, initial = np.array(trajectory.held_control), np.asarray(trajectory.control)[0]
@@ -104,14 +101,15 @@ class Measurements:
         held[-1] = held[-2] if len(held) > 1 else initial
         along = np.array(fractions, dtype=float)
         places = places_at(along, system.nodes)
-        position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
+        position = np.asarray(positions_at(system, y, places, z))
         try:
             quaternion = np.asarray(quaternions_at(system, y, places))
         except AttributeError:
             # the system has no orientations
             quaternion = np.full((*position.shape[:2], 4), np.nan)
+        time = np.asarray(trajectory.time, dtype=float)
         return cls(
-            time=np.asarray(trajectory.time, dtype=float),
+            time=time,
             tension=held,
             fractions=along,
             position=position,
@@ -120,6 +118,12 @@ class Measurements:
             simulated=True,
             source=f"simulated {type(system).__name__}",
             initial_tension=initial,
+            sensors=tuple(
+                Sensor(
+                    time, np.asarray(jax.vmap(functools.partial(it.value, system))(y, z)), it, it.fields[0]
+                )
+                for it in outputs
+            ),
         )
 
     def save(self, path: str | Path) -> None:
@@ -138,7 +142,7 @@ class Measurements:
         path = Path(path)
         writer_of(path)
         if self.sensors:
-            raise RecordingError(f"{path}: {self.sensors[0].output.fields[0]} cannot be written; only poses can")
+            raise RecordingError(f"{path}: {self.sensors[0].topic} cannot be written; only poses can")
         is_table = path.suffix in (".csv", ".parquet")
         root = "" if is_table else "/"
         position = self.position
@@ -212,7 +216,10 @@ class Measurements:
         """Return the rows from index `first` to before index `last`."""
         names = ("time", "tension", "position", "quaternion", "measured")
         changes: dict[str, Any] = {name: getattr(self, name)[first:last] for name in names}
-        changes["sensors"] = tuple(it._replace(values=it.values[first:last]) for it in self.sensors)
+        changes["sensors"] = tuple(
+            dataclasses.replace(it, time=it.time[first:last], values=it.values[first:last])
+            for it in self.sensors
+        )
         if first:
             changes["initial_tension"] = None
         return dataclasses.replace(self, **changes)

@@ -17,7 +17,7 @@ from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
-from knode_cosserat.recordings.measurements import Measurements, Readings
+from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.streams import Body, Sensor, Tensions, period
 
 if TYPE_CHECKING:
@@ -79,10 +79,15 @@ class Recording:
         return self.config.tendons
 
     @property
+    def _times(self) -> list[Float[np.ndarray, " n"]]:
+        """Times of all bodies and sensors (s)."""
+        return [*(it.time for it in self.bodies), *(it.time for it in self.sensors)]
+
+    @property
     def end(self) -> float:
         """End of the first stream to end (s): until then all poses and tensions are known."""
         driver = self._driver(self.config.tensions)
-        ends = [stream.time[-1] for stream in (*self.bodies, *self.sensors)]
+        ends = [time[-1] for time in self._times]
         if driver is self.tension:
             ends.append(driver.time[-1] + (period(driver.time) if self._is_held(driver) else 0.0))
         # a command holds until the next
@@ -141,21 +146,29 @@ class Recording:
             known &= np.isfinite(until)
             held = np.where(known, _averaged(driver, begin, dt, straight), np.nan)
         poses = [_interpolated(body, time, bridged) for body in self.bodies]
-        # arrays also have their shapes without bodies
-        nothing = np.zeros((len(time), 3)), np.zeros((len(time), 4)), np.zeros(len(time), dtype=bool)
+
+        def rows(part: int, *shape: int) -> np.ndarray:
+            # without bodies, too
+            return np.reshape([it[part] for it in poses], (len(poses), len(time), *shape)).swapaxes(0, 1)
+
         return Measurements(
             time=time,
             tension=held,
             fractions=np.array([body.fraction for body in self.bodies]),
-            position=np.stack([nothing[0], *(position for position, _, _ in poses)], axis=1)[:, 1:],
-            quaternion=np.stack([nothing[1], *(quaternion for _, quaternion, _ in poses)], axis=1)[:, 1:],
-            measured=np.stack([nothing[2], *(measured for _, _, measured in poses)], axis=1)[:, 1:],
+            position=rows(0, 3),
+            quaternion=rows(1, 4),
+            measured=rows(2).astype(bool),
             simulated=self.simulated,
             source=self.source,
             initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
             static=self.config.static,
             continuous=mean and not self.config.static and not self._is_held(driver),
-            sensors=tuple(Readings(it.output, _readings(it, time, bridged)) for it in self.sensors),
+            sensors=tuple(
+                dataclasses.replace(
+                    it, time=time, values=_interpolated(Body(it.time, it.values), time, bridged)[0]
+                )
+                for it in self.sensors
+            ),
             deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
         )
 
@@ -181,7 +194,7 @@ class Recording:
         if kind not in ("measured", "commanded", "none"):
             raise RecordingError(f"tensions is {kind!r}; allowed is measured, commanded or none")
         if kind == "none":
-            time = (*self.bodies, *self.sensors)[0].time
+            time = self._times[0]
             return Tensions(time, np.zeros((len(time), 0)))
         driver = self.tension if kind == "measured" else self.command
         if driver is None:
@@ -201,8 +214,7 @@ class Recording:
         start = start if start is not None else trim[0]
         if start is None:
             # a lost frame at the beginning does not delay the first row
-            streams = (*self.bodies, *self.sensors)
-            first = max(stream.time[0] for stream in streams) - self.config.longest_gap
+            first = max(known[0] for known in self._times) - self.config.longest_gap
             start = max(0.0, math.ceil(first / dt - _SAME) * dt) if dt > 0 else 0.0
         last = min([self.end, *(limit for limit in (end, trim[1]) if limit is not None)])
         if not (dt > 0.0 and math.isfinite(dt)):
@@ -256,7 +268,7 @@ def _interpolated(
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
     """Return positions, orientations, and a mask of the rows that are not bridged."""
     seen = body.time
-    position, quaternion = np.full((len(time), 3), np.nan), np.full((len(time), 4), np.nan)
+    position, quaternion = (np.full((len(time), size), np.nan) for size in (body.position.shape[1], 4))
     limit = bridge(seen, longest)
     ends = [0, *(np.flatnonzero(np.diff(seen) > limit) + 1).tolist(), len(seen)]
     for first, last in itertools.pairwise(ends):
@@ -277,17 +289,6 @@ def _interpolated(
     near = seen[following] - seen[np.maximum(following - 1, 0)] <= 1.5 * period(seen) + _SAME
     measured = exact | (near & (time >= seen[0] - _SAME) & (time <= seen[-1] + _SAME))
     return position, quaternion, measured & np.isfinite(position).all(axis=1)
-
-
-def _readings(sensor: Sensor, time: Float[np.ndarray, " T"], longest: float) -> Float[np.ndarray, "T p"]:
-    """Return values interpolated linearly between rows, NaN in gaps too long to be bridged."""
-    known, limit = sensor.time, bridge(sensor.time, longest)
-    values = np.stack([np.interp(time, known, column) for column in sensor.values.T], axis=1)
-    after = np.searchsorted(known, time - _SAME)
-    gap = known[np.minimum(after, len(known) - 1)] - known[np.maximum(after - 1, 0)]
-    outside = (time < known[0] - limit) | (time > known[-1] + _SAME)
-    exact = np.abs(known[np.minimum(after, len(known) - 1)] - time) <= _SAME
-    return np.where((outside | ((gap > limit) & ~exact))[:, None], np.nan, values)
 
 
 def continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:

@@ -79,12 +79,12 @@ class Body:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Sensor:
-    """Values of a sensor beside motion capture in SI units, at their times (s), and the kind of its output."""
+    """Sensor beside motion capture: times (s), values in SI units (NaN: none), and the output it measures."""
 
     time: Float[np.ndarray, " n"]
     values: Float[np.ndarray, "n p"]
     output: Output
-    topic: str = ""
+    topic: str
 
     def __repr__(self) -> str:
         return f"Sensor {self.topic}: {count_of(len(self.time), 'row')}"

@@ -245,7 +245,7 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> 
     for sensor in config.sensors:
         if sensor.columns is None:
             raise RecordingError(f"{path}: the columns of the sensor {sensor.topic} are missing; name them")
-        titles[sensor.topic or ""] = list(sensor.columns)
+        titles[sensor.topic] = list(sensor.columns)
     for tendons, named in zip(
         (config.tension, config.motors, config.command),
         (mapped.tensions, mapped.motors, mapped.commands),

@@ -193,7 +193,7 @@ class Markers(Effect):
 
     def __check_init__(self) -> None:
         super().__check_init__()
-        if np.shape(self.at) != np.shape(self.stated):
+        if np.size(self.at) != len(self.stated or ()):
             raise ParameterError("markers have not as many places `at` as `stated`; allowed is one for each")
 
 

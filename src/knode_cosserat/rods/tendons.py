@@ -159,23 +159,18 @@ class LoadCells(Part):
     latency: Any = parameter(
         "s", "delay of the readings behind the poses of a recording", low=-10.0, high=10.0, default=0.0
     )
-    drift: Any = parameter(
-        "", "rise of the latency in a second: the readings' clock is slow by this part", low=-0.5, high=0.5,
-        default=0.0,
-    )  # fmt: skip
 
     def undelayed(
         self, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
     ) -> Float[np.ndarray, "T c"]:
-        """Return the readings (N) at the times of the poses: each row's reading from its latency later.
+        """Return the readings (N) at the times of the poses: each row's reading from `latency` later.
 
         Rows are means over steps of `dt` (s), with linear interpolation between them. The last row holds
         beyond the end. Before the first row the value is `before`, or by default the first row.
         """
         first = measured[0] if before is None else before
         rows = np.concatenate([[first], measured, measured[-1:]])
-        row = np.arange(1, len(measured) + 1)
-        at = np.clip(row * (1.0 + float(self.drift)) + float(self.latency) / dt, 0, len(measured) + 1)
+        at = np.clip(np.arange(1, len(measured) + 1) + float(self.latency) / dt, 0, len(measured) + 1)
         low = np.minimum(at.astype(int), len(measured))
         part = (at - low)[:, None]
         return np.asarray((1.0 - part) * rows[low] + part * rows[low + 1])

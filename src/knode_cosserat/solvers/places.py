@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -32,7 +32,7 @@ def places_at(fractions: Float[Any, " M"], nodes: int) -> Places:
     return Places(node, along - node)
 
 
-def places_on(robot: System, fractions: Sequence[float]) -> Places:
+def places_on(robot: System, fractions: Iterable[float]) -> Places:
     """Return the places of bodies on a robot: identified ones (`Markers`) in place of stated ones."""
     known: dict[float, Any] = {}
     for part in getattr(nominal_model(robot), "effects", ()):
