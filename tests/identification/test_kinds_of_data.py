@@ -4,11 +4,14 @@ import dataclasses
 
 import numpy as np
 import pytest
+import yaml
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations
 from knode_cosserat.identification.evaluate import evaluate
-from knode_cosserat.recordings import Measurements
+from knode_cosserat.recordings import Measurements, RecordingConfig, RecordingError
 from knode_cosserat.rods.parts import Markers
 from knode_cosserat.rotation import quaternion_product
 
@@ -89,3 +92,77 @@ def test_kinds_are_weighted_in_one_objective(motion):
     errors = evaluate(found.robot, seen)
     assert {*errors.sensors} == {"orientations (rad)", "base wrench (N)", "base wrench (N m)"}
     assert str(errors).count("RMSE") == 4
+
+
+SENSED = """format: 1
+columns: {time: t, tensions: [I1, I2, I3, I4]}
+tension: {gain: 0.8e-3, held: true}
+sensors:
+  - {kind: orientation, columns: [roll, pitch, yaw], unit: deg, fractions: 1.0}
+  - {kind: bending_angle, columns: [bend, direction], fractions: 0.5}
+  - {kind: curvature, columns: [kx1, ky1, kx2, ky2], fractions: [0.25, 0.6], unit: 1/mm}
+  - {kind: base_wrench, columns: [fx, fy, fz, mx, my, mz], unit: mN, rotation: [0.5, 0.5, 0.5, 0.5]}
+repeats: drop
+"""
+
+
+def logged(motion, path):
+    """Currents (mA) of motors and all sensors, at irregular times, with lost and repeated rows."""
+    outputs = [Orientations((1.0,)), BendingAngles((0.5,)), Curvatures((0.25, 0.6)), BaseWrench()]
+    seen = Measurements.of(motion, (), outputs)
+    rng = np.random.default_rng(1)
+    time = np.sort(np.append(rng.uniform(0.0, 1.0, 240), seen.time))
+    time = time[(time < 0.61) | (time > 0.62)]
+    turns, angles, curvatures, wrench = (
+        CubicSpline(seen.time, sensor.values)(time) for sensor in seen.sensors
+    )
+    euler = Rotation.from_quat(mounted(turns), scalar_first=True).as_euler("ZYX", degrees=True)[:, ::-1]
+    bend = np.stack([np.linalg.norm(angles, axis=1), np.arctan2(angles[:, 1], angles[:, 0])], axis=1)
+    frame = Rotation.from_quat([0.5, 0.5, 0.5, 0.5], scalar_first=True).inv()
+    forces = 1e3 * frame.apply(wrench.reshape(-1, 3)).reshape(wrench.shape)
+    currents = seen.tension[np.searchsorted(seen.time, time + 1e-9, side="right") - 1] / 0.8e-3
+    table = np.hstack([time[:, None], currents, euler, bend, 1e-3 * curvatures, forces])
+    table = np.repeat(table, 1 + (np.arange(len(time)) % 7 == 3), axis=0)
+    table[40:42, 5:8] = np.nan
+    titles = "t,I1,I2,I3,I4,roll,pitch,yaw,bend,direction,kx1,ky1,kx2,ky2,fx,fy,fz,mx,my,mz"
+    np.savetxt(path, table, delimiter=",", header=titles, comments="")
+    return seen
+
+
+def test_a_log_of_sensors_is_read_and_recovers_the_robot(motion, tmp_path):
+    seen = logged(motion, tmp_path / "log.csv")
+    (tmp_path / "map.yaml").write_text(SENSED)
+    config = RecordingConfig.load(tmp_path / "map.yaml")
+    assert RecordingConfig.from_dict(yaml.safe_load(config.to_yaml())) == config
+    recording = kc.load_recording(tmp_path / "log.csv", config)
+    rows = recording.sampled(DT)
+    np.testing.assert_allclose(rows.tension, seen.tension[: len(rows.time)], atol=1e-9)
+    for read, exact in zip(rows.sensors[1:], seen.sensors[1:], strict=True):
+        np.testing.assert_allclose(
+            read.values, exact.values[: len(rows.time)], atol=1e-3 * np.ptp(exact.values)
+        )
+    assert "orientation" in repr(recording) and "orientation" in str(recording.health)
+    parts = recovered([recording.sampled(DT)])[1]
+    np.testing.assert_allclose(parts, 1.0, rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("kind: curvature, columns: [kx1, ky1, kx2], fractions: [0.5]", "allowed for curvature is 2"),
+        ("kind: orientation, columns: [roll, pitch], fractions: 1.0", "allowed for orientation is 4 or 3"),
+        ("kind: orientation, columns: [roll, pitch, yaw], unit: 1/m", "unit"),
+        ("kind: strain, columns: [kx1, ky1]", "allowed is"),
+        ("kind: curvature, columns: [kx1, ky1], fractions: 1.5", "1.5"),
+        ("kind: base_wrench", "the columns of the sensor base_wrench are missing"),
+        ("kind: bending_angle, columns: [bend, no]", "no"),
+    ],
+)
+def test_wrong_sensors_are_refused_in_one_line(motion, tmp_path, text, words):
+    logged(motion, tmp_path / "log.csv")
+    (tmp_path / "map.yaml").write_text(
+        f"format: 1\ncolumns: {{time: t, tensions: [I1, I2, I3, I4]}}\nsensors:\n  - {{{text}}}\n"
+    )
+    with pytest.raises(RecordingError) as refused:
+        kc.load_recording(tmp_path / "log.csv", RecordingConfig.load(tmp_path / "map.yaml"))
+    assert words in str(refused.value) and "\n" not in str(refused.value)

@@ -283,6 +283,37 @@ def test_inspect_proposes_a_map_that_reads_the_table(tmp_path, name):
     assert json.loads(succeeded("inspect", path, "--json"))["proposed_config"] in proposed + "\n"
 
 
+#: logs of MuJoCo and of Dynamixel motors: numbers that drive the robot, and what is proposed of them
+LOGS = {
+    "actuator_force_{}": (-PULLS, "tension", -1.0),
+    "ctrl[{}]": (PULLS, "command", None),
+    "present_current_{}": (PULLS, "tension", 1.0),
+    "[ID:00{}] Present Position": (np.round(512.0 * PULLS), "motors", 360.0 / 4096.0),
+}
+
+
+@pytest.mark.parametrize("title", LOGS)
+def test_inspect_proposes_a_map_of_logs_of_simulators_and_motors(tmp_path, title):
+    values, source, gain = LOGS[title]
+    content = {"time": TIME} | {title.format(k + 1): values[:, k] for k in range(6)}
+    content |= {f"[ID:00{k}] Goal Position": TIME for k in range(1, 7)}
+    content |= {f"tip_pos_{k}": POSITION[:, k] for k in range(3)}
+    content |= {f"tip_quat_{k}": QUATERNION[:, k] for k in range(4)}
+    path = tmp_path / "log.csv"
+    path.write_bytes(table(content))
+    text = succeeded("inspect", path)
+    config = written(tmp_path, text.partition("proposed configuration, for a file of --config:\n")[2])
+    assert (config.measured or config.command) == getattr(config, source)
+    assert getattr(config, source).gain == gain and ("gain" in text) == (gain is not None)
+    recording = load_recording(path, config)
+    (body,) = recording.bodies
+    np.testing.assert_allclose(body.position, POSITION, atol=1e-7)
+    assert body.quaternion is not None
+    driver = recording.command if source == "command" else recording.tension
+    expected = np.radians(values * gain) if source == "motors" else values * (gain or 1.0)
+    np.testing.assert_allclose(driver.tension, expected, atol=1e-6)
+
+
 def test_inspect_proposes_places_of_bodies_in_exports(tmp_path):
     path = tmp_path / "take.csv"
     path.write_bytes(exported.motive(exported.times()))

@@ -372,12 +372,12 @@ class _NumbersSource(_Settings):
     order: tuple[int, ...]
     names: tuple[str, ...] | None
     unit: str
-    gain: float
+    gain: float | None
 
     @property
     def factor(self) -> float:
         """Tension (N), angle (rad) or length (m) over the numbers of the messages."""
-        return {**TENSION_UNITS, **MOTOR_UNITS}[self.unit] * self.gain
+        return {**TENSION_UNITS, **MOTOR_UNITS}[self.unit] * (1.0 if self.gain is None else self.gain)
 
     def __post_init__(self) -> None:
         names = None
@@ -423,7 +423,7 @@ class TensionSource(_NumbersSource):
     unit: Annotated[Literal["N", "gf"], _choice(TENSION_UNITS)] = "N"
     held: Annotated[bool | None, _flag] = None
     names: tuple[str, ...] | None = None
-    gain: Annotated[float, _number(-1e6, 1e6)] = 1.0
+    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
 
 
 def _command_text(value: Any, name: str) -> str:
@@ -471,7 +471,7 @@ class MotorSource(_NumbersSource):
     unit: Annotated[Literal["rad", "deg", "m", "mm"], _choice(MOTOR_UNITS)] = "rad"
     latency: Annotated[float, _number(-10.0, 10.0, "s")] = 0.0
     names: tuple[str, ...] | None = None
-    gain: Annotated[float, _number(-1e6, 1e6)] = 1.0
+    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -532,10 +532,10 @@ class RecordingConfig(_Settings):
     Attributes:
         markers: bodies on the rod, from base to tip: name, topic, fraction of the length, its deviation,
             rotation.
-        sensors: sensors beside motion capture: kind, columns or topic, fractions, unit, rotation.
         tension: measured tensions, or None: topic, order of the tendons, unit (N or gf), held, names.
         motors: measured motor angles in place of tensions, or None: topic, order, unit, latency (s), names.
         command: commanded tensions, or None: as `tension`, with text and latency (s).
+        sensors: sensors beside motion capture: kind, columns or topic, fractions, unit, rotation.
         base: body that locates the clamped end, or None (`origin` locates it): topic, height above it (m).
         tensions: default choice of the tensions that drive the robot, "measured" or "commanded"; "none" for
             a recording of poses only.
@@ -565,10 +565,10 @@ class RecordingConfig(_Settings):
     """
 
     markers: Annotated[tuple[MarkerSource, ...], _markers] = ()
-    sensors: Annotated[tuple[SensorSource, ...], _sensors] = ()
     tension: Annotated[TensionSource | None, _part(TensionSource)] = None
     motors: Annotated[MotorSource | None, _part(MotorSource)] = None
     command: Annotated[CommandSource | None, _part(CommandSource)] = None
+    sensors: Annotated[tuple[SensorSource, ...], _sensors] = ()
     base: Annotated[BaseSource | None, _part(BaseSource)] = None
     table: Annotated[TableSource | None, _part(TableSource)] = None
     columns: Annotated[ColumnMap | None, _part(ColumnMap)] = None
@@ -592,7 +592,7 @@ class RecordingConfig(_Settings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.markers and not self.sensors:
-            raise RecordingError("markers is missing; required is one marker or more, or sensors")
+            raise _refused(self.markers, "markers", "a list of one marker or more, or sensors")
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":
