@@ -45,7 +45,7 @@ _TIME = re.compile(
     re.IGNORECASE,
 )
 _TENSION = re.compile(
-    r"tension|tendon|force|load|cell|effort|pull|cable|wire|current|zug|kraft|^[tf]$", re.IGNORECASE
+    r"tension|tendon|force|load|cell|effort|pull|cable|wire|current|zug|kraft|^[tfi]$", re.IGNORECASE
 )
 _COMMAND = re.compile(r"cmd|command|desired|target|ref|set|soll|goal|ctrl", re.IGNORECASE)
 _MOTOR = re.compile(r"motor|phi|encoder|angle|servo|present.?position", re.IGNORECASE)
@@ -55,7 +55,7 @@ _CURRENT, _STATE = (re.compile(words, re.IGNORECASE) for words in ("current", "c
 _TICK = 360.0 / 4096.0
 #: beginnings of titles of turns, speeds and forces along x, y, z
 _NO_PLACE = re.compile(
-    r"(q|quat|quaternion|rot|rotation|orientation|vel|speed|acc|(^|[_ .])[vrawf])[_ .]?$", re.I
+    r"(q|quat|quaternion|rot|rotation|orientation|vel|speed|acc|(^|[_ .])[vrawfm])[_ .]?$", re.I
 )
 #: spellings of the parts of an orientation, scalar first
 _QUATERNIONS = (
