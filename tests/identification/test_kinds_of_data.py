@@ -1,7 +1,9 @@
 """A known robot is recovered from each kind of data that laboratories measure."""
 
 import dataclasses
+from functools import partial
 
+import jax
 import numpy as np
 import pytest
 import yaml
@@ -12,6 +14,7 @@ import knode_cosserat as kc
 from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import Measurements, RecordingConfig, RecordingError
+from knode_cosserat.recordings.streams import Sensor
 from knode_cosserat.rods.parts import Markers
 from knode_cosserat.rotation import quaternion_product
 
@@ -29,6 +32,15 @@ def motion():
     sine = kc.controls.sine(0.8, 35, DT, base=4.0, amplitude=2.5)
     pulled = np.concatenate([np.full((5, 4), 4.0), sine])
     return kc.simulate(TRUE, pulled, DT, initial=kc.equilibrium(TRUE, pulled[0]))
+
+
+def sensed(motion, fractions, outputs):
+    """Measurements of bodies, and of the outputs by other sensors."""
+    time, y, z = (np.asarray(part) for part in (motion.time, motion.y, motion.z))
+    sensors = [
+        Sensor(time, np.asarray(jax.vmap(partial(it.value, TRUE))(y, z)), it, it.fields[0]) for it in outputs
+    ]
+    return dataclasses.replace(Measurements.of(motion, fractions), sensors=tuple(sensors))
 
 
 def recovered(data):
@@ -49,7 +61,7 @@ def mounted(orientations):
     ids=lambda output: output.fields[0],
 )
 def test_no_motion_capture_is_needed(motion, output):
-    seen = Measurements.of(motion, (), [output])
+    seen = sensed(motion, (), [output])
     (sensor,) = seen.sensors
     values = sensor.values.copy()
     if isinstance(output, Orientations):
@@ -86,7 +98,7 @@ def test_places_are_kept_in_the_robots_file(motion, tmp_path):
 
 
 def test_kinds_are_weighted_in_one_objective(motion):
-    seen = Measurements.of(motion, (1.0,), [Orientations((0.5,)), BaseWrench()])
+    seen = sensed(motion, (1.0,), [Orientations((0.5,)), BaseWrench()])
     found, parts = recovered([seen])
     np.testing.assert_allclose(parts, 1.0, rtol=1e-6)
     errors = evaluate(found.robot, seen)
@@ -109,7 +121,7 @@ repeats: drop
 def logged(motion, path):
     """Currents (mA) of motors and all sensors, at irregular times, with lost and repeated rows."""
     outputs = [Orientations((1.0,)), BendingAngles((0.5,)), Curvatures((0.25, 0.6)), BaseWrench()]
-    seen = Measurements.of(motion, (), outputs)
+    seen = sensed(motion, (), outputs)
     rng = np.random.default_rng(1)
     time = np.sort(np.append(rng.uniform(0.0, 1.0, 240), seen.time))
     time = time[(time < 0.61) | (time > 0.62)]

@@ -28,8 +28,21 @@ MOST_OPERATIONS = 60_000
 
 
 def constant_zeros(leaf: np.ndarray) -> np.ndarray:
-    """Return true where a parameter is a constant of the program: zeros, but not those of large arrays."""
-    return (leaf == 0.0) & (leaf.size <= LARGEST_PRODUCT)
+    """Return true where a parameter is a constant of the program: zeros, but not those of large arrays.
+
+    A zero with a minus sign is a parameter that is going to move (`with_moving`).
+    """
+    return ~is_moving(leaf) & (leaf.size <= LARGEST_PRODUCT)
+
+
+def is_moving(leaf: np.ndarray) -> np.ndarray:
+    """Return true where a number is not zero, or is going to move."""
+    return (leaf != 0.0) | np.signbit(leaf)
+
+
+def with_moving(leaf: np.ndarray, moving: np.ndarray) -> np.ndarray:
+    """Return a parameter, or its tangents, with zeros that are going to move: one code serves all values."""
+    return np.where(moving & (leaf == 0.0), -0.0, leaf)
 
 
 class Equations:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Module
-from knode_cosserat.engine.equations import MOST_OPERATIONS, PLACE, RUN, STEP, constant_zeros
+from knode_cosserat.engine.equations import MOST_OPERATIONS, PLACE, RUN, STEP, constant_zeros, is_moving
 from knode_cosserat.engine.program import EngineError, Program
 from knode_cosserat.rods.system import System, is_traced
 
@@ -40,7 +40,8 @@ class Pattern:
         axis, zeros = np.ndim(system.length), []
         for leaf in leaves:
             known = np.ones(np.shape(leaf)) if is_traced(leaf) else np.asarray(leaf, float)
-            zeros.append(constant_zeros(np.max(np.abs(known), axis=tuple(range(axis)))))
+            # any number for a parameter that is not zero in all robots of a batch
+            zeros.append(constant_zeros(np.any(is_moving(known), axis=tuple(range(axis))).astype(float)))
         return cls(structure, masks_of(zeros))
 
     @property

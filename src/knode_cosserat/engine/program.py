@@ -1039,6 +1039,7 @@ def _rounded_to_even(x: _Scalar) -> _Scalar:
 #: functions of one number by other operations
 FORMULAS: dict[str, Callable[[_Scalar], _Scalar]] = {
     "square": lambda x: x * x,
+    "one_minus_square": lambda x: (1.0 - x) * (1.0 + x),
     "rsqrt": lambda x: 1.0 / x.of("sqrt"),
     "cbrt": _cbrt,
     "exp2": lambda x: (x * math.log(2.0)).of("exp"),
@@ -1230,6 +1231,9 @@ class _Evaluation:
 
     def _do_split(self, e: Any, x: Nodes) -> list[Nodes]:
         return list(np.split(x, np.cumsum(e.params["sizes"])[:-1], e.params["axis"]))
+
+    def _do_unstack(self, e: Any, x: Nodes) -> list[Nodes]:
+        return list(np.moveaxis(x, e.params["axis"], 0))
 
     def _do_iota(self, e: Any) -> Nodes:
         shape, dimension = e.params["shape"], e.params["dimension"]
@@ -1633,8 +1637,11 @@ class _Evaluation:
         return self.by_index(e, [int(index)], [(0, last)], lambda k: self.closed(branches[k], arguments))
 
     def _do_scan(self, e: Any, *arguments: Nodes) -> list[Nodes]:
-        length, num_consts, num_carry = (e.params[key] for key in ("length", "num_consts", "num_carry"))
-        reverse = e.params["reverse"]
+        length, reverse = e.params["length"], e.params["reverse"]
+        if "ft_in" in e.params:  # JAX 0.11 and later
+            num_consts, num_carry, _ = (len([*part]) for part in e.params["ft_in"].unpack())
+        else:
+            num_consts, num_carry = e.params["num_consts"], e.params["num_carry"]
         if length > LONGEST_SCAN:
             raise self.error(e, f"of {length} turns is too long for the engine", "use fewer turns")
         constants, carry = arguments[:num_consts], list(arguments[num_consts : num_consts + num_carry])

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
@@ -22,9 +23,6 @@ from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
-
-#: in the place of zero
-TINY = 1e-200
 
 
 class Spread(NamedTuple):
@@ -86,17 +84,15 @@ class OnlineModel(eqx.Module):
     def moved(self, x: Any) -> tuple[System, Any]:
         """Return the robot, and its tangents by each parameter, stacked; None if there are none.
 
-        Zeros that are adapted are tiny numbers: others are constants of the machine code, which would be
-        compiled again, in the loop, as soon as they move.
+        Zeros that are adapted are no constants of the machine code, which would be compiled again, in the
+        loop, as soon as they move.
         """
         if not self.parameters.size:
             return self.robot, None
         system, directions = jax.tree.map(np.asarray, _moved(self, x))
-
-        def adapted(leaf: Any, moves: Any) -> Any:
-            return np.where((leaf == 0.0) & np.any(moves != 0.0, axis=0), TINY, leaf)
-
-        return jax.tree.map(adapted, system, directions), directions
+        return jax.tree.map(
+            lambda leaf, moves: with_moving(leaf, np.any(moves != 0.0, axis=0)), system, directions
+        ), directions
 
     def rollout(
         self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]
@@ -186,15 +182,18 @@ def split_record(system: System, record: Any) -> tuple[Any, Any]:
 @functools.partial(jax.jit, static_argnames="output")
 def errors_along(
     system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T N x k"],
-    references: Float[Any, "T p"],
+    references: Float[Any, "T p"], directions: Any = None,
 ) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
-    """Return the errors of an output in every row, and their tangents."""
+    """Return the errors of an output in every row, and their tangents; `directions` are k of the system."""
+    leaves, tree = jax.tree.flatten(system)
+    moves = jax.tree.leaves(directions)
 
-    def errors(records: Any) -> Any:
-        return output.errors(system, *split_record(system, records), references)
+    def errors(records: Any, *moving: Any) -> Any:
+        robot = jax.tree.unflatten(tree, moving or leaves)
+        return output.errors(robot, *split_record(system, records), references)
 
-    value, moved = jax.linearize(errors, records)
-    return value, jax.vmap(moved, in_axes=-1)(d_records)
+    value, moved = jax.linearize(errors, records, *leaves[: len(moves)])
+    return value, jax.vmap(moved, in_axes=(-1, *(0 for _ in moves)))(d_records, *moves)
 
 
 @functools.partial(jax.jit, static_argnames="output")

@@ -17,9 +17,6 @@ from knode_cosserat.rotation import conjugate, quaternion_product, rotation_matr
 from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
 from knode_cosserat.trajectory import Trajectory
 
-#: in the place of zero, where a root has no derivative
-TINY = 1e-30
-
 
 @dataclasses.dataclass(frozen=True)
 class Output(abc.ABC):
@@ -126,9 +123,8 @@ class TipPosition(BodyPositions):
 class Orientations(_AtFractions):
     """Unit quaternions (scalar first) at fractions of the length, such as those of an inertial sensor.
 
-    Rows of data are compared by the rotations since the first one that was seen: the mounting of the sensor
-    need not be known. An error is a rotation vector (rad), of one row from the reference in its own frame, of
-    rows in the global frame.
+    An error is a rotation vector (rad) from the reference, in its own frame. Rows are compared by rotations
+    since the first one that was seen, in the global frame: the sensor's mounting need not be known.
     """
 
     #: standard deviation of a rotation (rad)
@@ -158,18 +154,16 @@ class Orientations(_AtFractions):
         self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
     ) -> Float[Any, "T e"]:
         """Return differences of the rotations since the first row that was seen."""
-        h, wanted = (
-            quaternions_at(system, y, places_on(system, self.fractions)),
-            references.reshape(len(y), -1, 4),
-        )
-        size = jnp.linalg.norm(wanted, axis=-1, keepdims=True)
-        known = jnp.isfinite(size)
+        h = quaternions_at(system, y, places_on(system, self.fractions))
+        wanted = references.reshape(h.shape)
+        wanted /= jnp.linalg.norm(wanted, axis=-1, keepdims=True)
+        known = jnp.isfinite(wanted[..., :1])
         row = jnp.argmax(known, axis=0)[None]
 
         def since(turns: Any) -> Any:
             return _product(turns, conjugate(jnp.take_along_axis(turns, row, 0)))
 
-        off = _rotation_vectors(since(h), conjugate(since(jnp.where(known, wanted / size, 1.0))))
+        off = _rotation_vectors(since(h), conjugate(since(jnp.where(known, wanted, 1.0))))
         return jnp.where(jnp.repeat(known[..., 0], 3, axis=1), off, jnp.nan)
 
 
@@ -255,7 +249,8 @@ class BendingAngles(_AtFractions):
         """Return the angles, one pair after the other."""
         h = quaternions_at(system, y[None], places_on(system, self.fractions))[0]
         axis = jax.vmap(rotation_matrix)(h)[:, :, 2]
-        sine = jnp.sqrt(jnp.sum(axis[:, :2] ** 2, axis=1, keepdims=True) + TINY)
+        # the root of zero has no derivative
+        sine = jnp.sqrt(jnp.sum(axis[:, :2] ** 2, axis=1, keepdims=True) + 1e-30)
         return (axis[:, :2] * jnp.arctan2(sine, axis[:, 2:]) / sine).ravel()
 
 

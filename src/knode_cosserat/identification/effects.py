@@ -105,6 +105,10 @@ def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Effec
     numbers = tuple(Number(f"place[{it:g}]", "", it, places[it], 0.0, 1.0, flat=flat) for it in stated)
 
     def placed(robot: Any, at: Any) -> Any:
+        if not hasattr(robot, "effects"):
+            raise ParameterError(
+                f"places of bodies are not known, and a {type(robot).__name__} has no `effects`"
+            )
         others = [part for part in robot.effects if not isinstance(part, Markers)]
         return robot.replace(effects=(*others, Markers(at=at, stated=stated)))
 

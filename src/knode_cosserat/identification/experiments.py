@@ -237,6 +237,8 @@ def _measured(measured: Measurements, robot: System) -> tuple[Output, np.ndarray
         try:
             Drawing.of(robot).quaternions(np.asarray(robot.rest(0.0)[0]))
         except AttributeError:
+            if measured.sensors:
+                raise DataError("sensors beside motion capture need a robot with orientations") from None
             return BodyPositions(fractions, 1.0), np.array(measured.position.reshape(rows, -1))
         outputs.append(BodyMotions(fractions, 1.0, 1.0 / (ARM * length)))
         data.append(np.concatenate([measured.position, measured.quaternion], axis=-1).reshape(rows, -1))

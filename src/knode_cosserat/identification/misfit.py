@@ -1,7 +1,7 @@
 """Differences between simulated and measured rows of experiments, and their derivatives.
 
-Every solved step is differentiated by the implicit function theorem (`solvers.sensitivity`), and outputs by
-rows and by the parameters that they depend on, such as the length or the places of bodies.
+Every solved step is differentiated by the implicit function theorem (`solvers.sensitivity`), and outputs as
+in the online observers (`estimation.online.errors_along`), also by parameters such as places of bodies.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat.estimation.online import errors_of, split_record
-from knode_cosserat.estimation.outputs import Output
+from knode_cosserat.engine.equations import with_moving
+from knode_cosserat.estimation.online import errors_along, errors_of
 from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import stepped
@@ -85,6 +85,9 @@ class Misfit:
     def __init__(self, model: Model, data: Sequence[Experiment]):
         self.model, self.data = model, tuple(data)
         self._first = True
+        # no value of a number, such as an effect that a robot lacks, needs machine code of its own
+        directions, _ = _directions(model.robot, np.where(model.begin == 0.0, 0.1, model.begin))
+        self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
 
     def differences(
         self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None
@@ -115,7 +118,7 @@ class Misfit:
     def _of_one(self, x: np.ndarray, data: Experiment, rows: int | None) -> Rollout | None:
         seen = len(data.control) if rows is None else min(len(data.control), data.moves + rows)
         steps = seen * data.steps
-        system = _system(self.model.robot, x)
+        system = jax.tree.map(with_moving, _system(self.model.robot, x), self._moving)
         start = self._start(system, x, data)
         if start is None:
             return None
@@ -140,6 +143,7 @@ class Misfit:
 
         def tangents(which: Any) -> np.ndarray:
             directions, by_latency = _directions(self.model.robot, x)
+            directions = jax.tree.map(with_moving, directions, self._moving)
             weights = np.eye(len(x))[:, which]
             d_first, past, d_past = start.tangents(directions, weights)
             controls = acting[:steps]
@@ -161,7 +165,7 @@ class Misfit:
             # zeros in all other columns: one compiled program serves any coordinates
             whole = np.zeros((*records.shape, len(x)))
             whole[..., which] = np.concatenate([d_first[None, :, :size], d_records])
-            slopes = _slopes(self.model.robot, x, data.output, every(records), every(whole), data.data)
+            _, slopes = errors_along(system, data.output, every(records), every(whole), data.data, directions)
             return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, every(records), data.data))
@@ -249,21 +253,6 @@ def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
         return d_system, jnp.zeros(()) if cells is None else cells.latency
 
     return jax.vmap(along)(jnp.eye(len(x)))
-
-
-@functools.partial(jax.jit, static_argnames="output")
-def _slopes(
-    robot: ParametrisedRobot, x: Any, output: Output, records: Float[Any, "T N x"],
-    d_records: Float[Any, "T N x n"], data: Float[Any, "T p"],
-) -> Float[Any, "n T e"]:  # fmt: skip
-    """Return the tangents of the errors of an output by each coordinate, of rows and of the robot itself."""
-
-    def errors(x: Any, records: Any) -> Any:
-        system = robot(x)
-        return output.errors(system, *split_record(system, records), data)
-
-    _, moved = jax.linearize(errors, x, records)
-    return jax.vmap(moved, in_axes=(0, -1))(jnp.eye(len(x)), d_records)
 
 
 @functools.partial(jax.jit, static_argnames="settings")

@@ -64,10 +64,15 @@ class _Rows:
         large = ~np.all(np.abs(np.nan_to_num(self.values, nan=np.inf)) < 1e9, axis=1)
         self.drop(wrong | large, words, "warning")
 
-    def drop_repeats(self, what: str) -> None:
-        """Remove rows that repeat the one before."""
-        again = np.concatenate([[False], np.all(np.diff(self.values, axis=0) == 0.0, axis=1)])
-        self.drop(again[: len(self.time)], (f"{what} repeats", f"{what}s repeat", "the one before"), "note")
+    def require(self, config: RecordingConfig, what: str, name: str, path: str) -> None:
+        """Remove repeated rows, unless they are kept; `RecordingError` with fewer than two rows."""
+        if config.repeats == "drop":
+            again = np.concatenate([[False], np.all(np.diff(self.values, axis=0) == 0.0, axis=1)])
+            words = f"{what} repeats", f"{what}s repeat", "the one before"
+            self.drop(again[: len(self.time)], words, "note")
+        if len(self.time) < FEWEST_FRAMES:
+            count = f"{len(self.time)} usable {what}s of {name}; required is {FEWEST_FRAMES} or more"
+            raise RecordingError(f"{path}: topic {self.topic}: {count}")
 
     def add(self, message: str, severity: Severity, rows: Bool[np.ndarray, " n"]) -> None:
         """Add a finding on rows."""
@@ -109,13 +114,7 @@ def cleaned_body(
         with np.errstate(all="ignore"):
             no_rotation = ~(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) < 0.05)
     rows.drop_unusable(no_rotation, ("pose is", "poses are", "not finite, or no rotation"))
-    if config.repeats == "drop":
-        rows.drop_repeats("pose")
-    if len(rows.time) < FEWEST_FRAMES:
-        raise RecordingError(
-            f"{path}: topic {topic}: {len(rows.time)} usable poses of {name}; required is {FEWEST_FRAMES} or "
-            "more"
-        )
+    rows.require(config, "pose", name, path)
     unclear: list[int] = []
     if is_oriented:
         quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
@@ -163,16 +162,10 @@ def cleaned_sensor(
         words = f"allowed for {source.kind} is {' or '.join(map(str, counts))}"
         raise RecordingError(f"{path}: {source.topic} has {count} numbers in a row; {words}")
     rows = _Rows(source.topic, time, numbers)
-    length = np.ones(len(time))
-    if source.kind == "orientation" and count == 4:
-        length = np.linalg.norm(numbers, axis=1)
+    is_turn = source.kind == "orientation" and count == 4
+    length = np.linalg.norm(numbers, axis=1) if is_turn else np.ones(len(time))
     rows.drop_unusable(~(np.abs(length - 1.0) < 0.05), ("row is", "rows are", "not finite, or no rotation"))
-    if config.repeats == "drop":
-        rows.drop_repeats("row")
-    if len(rows.time) < FEWEST_FRAMES:
-        raise RecordingError(
-            f"{path}: {source.topic}: {len(rows.time)} usable rows; required is {FEWEST_FRAMES} or more"
-        )
+    rows.require(config, "row", source.kind, path)
     units = SENSOR_UNITS[source.kind]
     values = rows.values * units[source.unit or next(iter(units))]
     frame = Rotation.from_quat(source.rotation or (1.0, 0.0, 0.0, 0.0), scalar_first=True)

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import count_of, wrapped
-from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.streams import Body, Sensor, Tensions
@@ -77,21 +74,18 @@ class Measurements:
         )
 
     @classmethod
-    def of(
-        cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,), outputs: Sequence[Output] = ()
-    ) -> Self:
+    def of(cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,)) -> Self:
         """Return noise-free measurements of a trajectory of one robot.
 
         Args:
             trajectory: a whole trajectory, or consecutive rows, of a system with positions.
             fractions: places of the bodies, as fractions of the rod's length, from base to tip.
-            outputs: outputs that other sensors measure.
 
         Raises:
             AttributeError: the system has no positions.
             ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
         """
-        y, z, system = np.asarray(trajectory.y), np.asarray(trajectory.z), trajectory.system
+        y, system = np.asarray(trajectory.y), trajectory.system
         if y.ndim == 4:
             raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
         held, initial = np.array(trajectory.held_control), np.asarray(trajectory.control)[0]
@@ -101,15 +95,14 @@ class Measurements:
         held[-1] = held[-2] if len(held) > 1 else initial
         along = np.array(fractions, dtype=float)
         places = places_at(along, system.nodes)
-        position = np.asarray(positions_at(system, y, places, z))
+        position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
         try:
             quaternion = np.asarray(quaternions_at(system, y, places))
         except AttributeError:
             # the system has no orientations
             quaternion = np.full((*position.shape[:2], 4), np.nan)
-        time = np.asarray(trajectory.time, dtype=float)
         return cls(
-            time=time,
+            time=np.asarray(trajectory.time, dtype=float),
             tension=held,
             fractions=along,
             position=position,
@@ -118,12 +111,6 @@ class Measurements:
             simulated=True,
             source=f"simulated {type(system).__name__}",
             initial_tension=initial,
-            sensors=tuple(
-                Sensor(
-                    time, np.asarray(jax.vmap(functools.partial(it.value, system))(y, z)), it, it.fields[0]
-                )
-                for it in outputs
-            ),
         )
 
     def save(self, path: str | Path) -> None:

@@ -15,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.engine.equations import is_moving
 from knode_cosserat.engine.loops import at_all_stages, table_of, tangents_for
 from knode_cosserat.engine.pattern import Pattern, parameters_of
 from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
@@ -78,7 +79,7 @@ def tangent_time_loop(
         weights = np.zeros((0, d_controls.shape[-1]))
     else:
         stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
-    moving = [np.any(leaf != 0.0, axis=0) for leaf in stacked]
+    moving = [np.any(is_moving(leaf), axis=0) for leaf in stacked]
     core = tangents_for(TangentCore, Pattern.of(system), settings, moving)
     moved = np.concatenate(
         [
