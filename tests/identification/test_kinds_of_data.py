@@ -15,7 +15,7 @@ from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatu
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import Measurements, RecordingConfig, RecordingError
 from knode_cosserat.recordings.streams import Sensor
-from knode_cosserat.rods.parts import Markers
+from knode_cosserat.rods.tendons import Markers
 from knode_cosserat.rotation import quaternion_product
 
 DT = 0.025

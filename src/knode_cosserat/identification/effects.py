@@ -26,9 +26,9 @@ from knode_cosserat.rods.parameters import (
     unknown_parameter,
     value_at,
 )
-from knode_cosserat.rods.parts import Markers
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
+from knode_cosserat.rods.tendons import Markers
 from knode_cosserat.rods.wrapped import nominal_model
 
 #: tendon offset of a robot that states none, over its radius

@@ -321,17 +321,14 @@ class SensorSource(_Settings):
     """Sensor beside motion capture.
 
     Attributes:
-        kind: "orientation" of a place since the first row: quaternions, scalar first, or roll, pitch and yaw
-            in the order z, y, x; "bending_angle" from the z axis and its direction about z from x;
-            "curvature" about the local x and y axes, in turn for each place; "base_wrench": force and moment
-            of the base on the rod.
+        kind: "orientation" (quaternion, scalar first, or roll, pitch, yaw), "bending_angle" (from the z axis,
+            and its direction about z from x), "curvature" (about the local x and y axes, in turn for each
+            place) or "base_wrench" (force and moment of the base on the rod).
+        topic: topic in a bag (Imu, QuaternionStamped, PoseStamped, WrenchStamped, arrays); name in reports.
         columns: titles of its numbers in a table.
-        topic: topic in a bag (Imu, QuaternionStamped, PoseStamped, WrenchStamped or arrays), or name in
-            reports; by default the kind.
-        fractions: places, as fractions of the rod's length; a single number is one place.
+        fractions: places, as fractions of the rod's length.
         unit: "rad" or "deg"; "1/m", "1/cm" or "1/mm"; "N" (and N m) or "mN" (and mN m).
-        rotation: rotation from its frame to the robot's, of orientations and wrenches; a quaternion, scalar
-            first.
+        rotation: quaternion from its global frame to the robot's, of orientations and wrenches.
     """
 
     kind: Annotated[str, _choice(SENSOR_UNITS)]

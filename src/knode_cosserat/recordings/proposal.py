@@ -51,8 +51,6 @@ _COMMAND = re.compile(r"cmd|command|desired|target|ref|set|soll|goal|ctrl", re.I
 _MOTOR = re.compile(r"motor|phi|encoder|angle|servo|present.?position", re.IGNORECASE)
 #: names of numbers of motors that are no tensions, or not all of them
 _CURRENT, _STATE = (re.compile(words, re.IGNORECASE) for words in ("current", "current|position|velocity"))
-#: degrees of one tick of a Dynamixel motor
-_TICK = 360.0 / 4096.0
 #: beginnings of titles of turns, speeds and forces along x, y, z
 _NO_PLACE = re.compile(
     r"(q|quat|quaternion|rot|rotation|orientation|vel|speed|acc|(^|[_ .])[vrawfm])[_ .]?$", re.I
@@ -238,21 +236,16 @@ def _number_columns(
         order = tuple(range(1, len(columns) + 1))
         values = table.numbers[columns].to_numpy(dtype=float)
         gain = None
-        if (
-            kind == "motors"
-            and np.nanmax(np.abs(values)) > 360.0
-            and np.all(np.nan_to_num(values) % 1.0 == 0.0)
-        ):
-            gain = _TICK
+        whole = np.all(np.nan_to_num(values) % 1.0 == 0.0)
+        if kind == "motors" and whole and np.nanmax(np.abs(values)) > 360.0:
+            gain = 360.0 / 4096.0
             remarks.append("positions of motors are taken to be ticks, 4096 in a turn (`gain`, in degrees)")
         elif kind != "motors" and np.all(np.nan_to_num(values) <= 0.0):
             gain = -1.0
             remarks.append(f"{kind} are never positive: `gain` turns their sign")
         elif kind == "tensions" and is_current:
             gain = 1.0
-            remarks.append(
-                "tensions are currents: `gain` has to state the tension (N) of one unit of current"
-            )
+            remarks.append("tensions are currents: `gain` has to state the tension (N) of one unit")
         if kind == "tensions":
             gram = any(re.search(r"\[(gf|g)\]|\((gf|g)\)|_gf?$", title) for title in columns)
             sources["tension"] = TensionSource(MAPPED[kind], order, "gf" if gram else "N", gain=gain)

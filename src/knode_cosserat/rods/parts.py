@@ -12,19 +12,11 @@ from __future__ import annotations
 import functools
 from typing import Any, ClassVar, NamedTuple, Self
 
-import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import (
-    ParameterError,
-    Parametrised,
-    check_fields,
-    parameter,
-    places,
-    slots_of,
-)
+from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields, slots_of
 
 
 class Wrench(NamedTuple):
@@ -181,20 +173,6 @@ class Part(Contribution, Parametrised):
 
 class Effect(Part):
     """Further physics of a rod, such as an added mass or a layer with internal variables."""
-
-
-class Markers(Effect):
-    """Identified places of tracked bodies; they do not change the motion."""
-
-    kind: ClassVar[str] = "markers"
-
-    at: Any = parameter("", "places as parts of the length", shape="list", low=0.0, high=1.0)
-    stated: tuple[float, ...] | None = places("places in the recordings")
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        if np.size(self.at) != len(self.stated or ()):
-            raise ParameterError("markers have not as many places `at` as `stated`; allowed is one for each")
 
 
 @functools.singledispatch

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.aspects import Drawing
-from knode_cosserat.rods.parts import Markers
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendons import Markers
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
 
