@@ -74,6 +74,26 @@ def test_no_motion_capture_is_needed(motion, output):
     assert all(errors[0][name] < 1e-3 * errors[1][name] for name in errors[1])
 
 
+def test_positions_of_the_tip_alone_are_enough(motion):
+    seen = Measurements.of(motion)
+    found, parts = recovered([dataclasses.replace(seen, quaternion=np.full_like(seen.quaternion, np.nan))])
+    np.testing.assert_allclose(parts, 1.0, rtol=1e-6)
+    assert found.error[seen.source] < 1e-8
+
+
+@pytest.mark.slow
+def test_an_unknown_heading_of_the_global_frame_is_found(motion):
+    seen = sensed(motion, (), [Orientations((1.0,))])
+    (sensor,) = seen.sensors
+    turned = Rotation.from_rotvec([0.0, 0.0, 0.15]) * Rotation.from_quat(sensor.values, scalar_first=True)
+    rotated = dataclasses.replace(sensor, values=turned.as_quat(scalar_first=True))
+    found = kc.identify(NOMINAL, [dataclasses.replace(seen, sensors=(rotated,))], ["base rotation"])
+    values = {it.label: it.value for it in found.estimates}
+    assert values["youngs_modulus"] == pytest.approx(1.5e9, rel=0.01)
+    turns = [values[f"base_rotation.{axis}"] for axis in "xyz"]
+    np.testing.assert_allclose(turns, [0.0, 0.0, 0.15], atol=3e-3)
+
+
 def test_few_markers_at_unknown_places_are_enough(motion):
     seen = Measurements.of(motion, (0.37, 0.68))
     unsure = dataclasses.replace(
