@@ -99,7 +99,7 @@ def quaternion_product(a: Float[Any, "4"], b: Float[Any, "4"]) -> Float[Any, "4"
     )
 
 
-def conjugate(h: Float[Any, "4"]) -> Float[Any, "4"]:
+def conjugate(h: Float[Any, "*rows 4"]) -> Float[Any, "*rows 4"]:
     """Return the inverse rotation of a unit quaternion."""
     return h * np.array([1.0, -1.0, -1.0, -1.0])
 

@@ -8,15 +8,18 @@ import knode_cosserat as kc
 from knode_cosserat.estimation import (
     Adapted,
     BaseWrench,
+    BendingAngles,
     BodyPoses,
     BodyPositions,
     BoundaryObserver,
     Curvatures,
     KalmanObserver,
     MovingHorizonObserver,
+    Orientations,
     TipPose,
     TipPosition,
 )
+from knode_cosserat.estimation.outputs import Several
 from knode_cosserat.estimation.parameters import adapted_model
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
@@ -43,6 +46,8 @@ def still():
         BodyPoses((0.25, 1.0)),
         Curvatures((0.1, 0.5)),
         BaseWrench(),
+        BendingAngles((0.5, 1.0)),
+        Several((TipPosition(), Orientations((0.5, 1.0)))),
     ],
 )
 def test_outputs_have_names_and_no_error_from_themselves(output, still):

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording, proposed_config
-from knode_cosserat.recordings.config import ColumnMap, MarkerSource, TensionSource
+from knode_cosserat.recordings.config import UP, ColumnMap, MarkerSource, TensionSource
 from tests.commands import run, succeeded
 from tests.recordings.formats import exported
 
@@ -281,6 +282,52 @@ def test_inspect_proposes_a_map_that_reads_the_table(tmp_path, name):
     # the same without the proposal, now that there is a file of it
     assert "proposed" not in succeeded("inspect", path, "--config", tmp_path / "map.yaml")
     assert json.loads(succeeded("inspect", path, "--json"))["proposed_config"] in proposed + "\n"
+
+
+#: logs of MuJoCo and of Dynamixel motors: numbers that drive the robot, and what is proposed of them
+LOGS = {
+    "actuator_force_{}": (-PULLS, "tension", -1.0),
+    "ctrl[{}]": (PULLS, "command", None),
+    "present_current_{}": (PULLS, "tension", 1.0),
+    "[ID:00{}] Present Position": (np.round(512.0 * PULLS), "motors", 360.0 / 4096.0),
+}
+
+
+@pytest.mark.parametrize("title", LOGS)
+def test_inspect_proposes_a_map_of_logs_of_simulators_and_motors(tmp_path, title):
+    values, source, gain = LOGS[title]
+    content = {"time": TIME} | {title.format(k + 1): values[:, k] for k in range(6)}
+    content |= {f"[ID:00{k}] Goal Position": TIME for k in range(1, 7)}
+    content |= {f"tip_pos_{k}": POSITION[:, k] for k in range(3)}
+    content |= {f"tip_quat_{k}": QUATERNION[:, k] for k in range(4)}
+    path = tmp_path / "log.csv"
+    path.write_bytes(table(content))
+    text = succeeded("inspect", path)
+    config = written(tmp_path, text.partition("proposed configuration, for a file of --config:\n")[2])
+    assert (config.measured or config.command) == getattr(config, source)
+    assert getattr(config, source).gain == gain and ("gain" in text) == (gain is not None)
+    recording = load_recording(path, config)
+    (body,) = recording.bodies
+    np.testing.assert_allclose(body.position, POSITION, atol=1e-7)
+    assert body.quaternion is not None
+    driver = recording.command if source == "command" else recording.tension
+    expected = np.radians(values * gain) if source == "motors" else values * (gain or 1.0)
+    np.testing.assert_allclose(driver.tension, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("axis", ["x", "-x", "y", "-y", "-z"])
+def test_inspect_says_that_the_frame_is_rotated(tmp_path, axis):
+    upright = Rotation.from_rotvec(UP[axis])
+    placed = 0.3 + upright.inv().apply(POSITION)
+    content = {"time": TIME} | dict(zip(("tip_x", "tip_y", "tip_z"), placed.T, strict=True))
+    content |= {f"base_{k}": np.full(len(TIME), 0.3) for k in "xyz"}
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(content))
+    text = succeeded("inspect", path)
+    assert "`rotation` turns this axis to z" in text
+    config = written(tmp_path, text.partition("proposed configuration, for a file of --config:\n")[2])
+    (body,) = load_recording(path, config).bodies
+    np.testing.assert_allclose(body.position, POSITION, atol=1e-7)
 
 
 def test_inspect_proposes_places_of_bodies_in_exports(tmp_path):

@@ -546,3 +546,38 @@ def test_parts_and_topics_of_tendons_are_proposed(tmp_path):
         RecordingError, match=r"no topic has poses; the bag has /cell1/force \(std_msgs/Float64\)"
     ):
         proposed_config(write(tmp_path / "cells", cells))
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_sensors_beside_motion_capture_are_read_from_bags(tmp_path, ros):
+    it = Messages(ros)
+    zero, no = it.vector(np.zeros(3)), np.zeros(9)
+
+    def imu(at, row):
+        return it.make(
+            "sensor_msgs/msg/Imu", header=it.header(at), orientation=it.quaternion(QUATERNION[row]),
+            orientation_covariance=no, angular_velocity=zero, angular_velocity_covariance=no,
+            linear_acceleration=zero, linear_acceleration_covariance=no,
+        )  # fmt: skip
+
+    def wrench(at, row):
+        made = it.make(
+            "geometry_msgs/msg/Wrench", force=it.vector(PULLS[row, :3]), torque=it.vector(PULLS[row, 1:])
+        )
+        return it.make("geometry_msgs/msg/WrenchStamped", header=it.header(at), wrench=made)
+
+    entries = series("/imu", "sensor_msgs/msg/Imu", imu)
+    entries += series("/wrench", "geometry_msgs/msg/WrenchStamped", wrench)
+    entries += series("/pull", "sensor_msgs/msg/JointState", lambda at, row: it.joints(at, NAMES, PULLS[row]))
+    path = write(tmp_path / ("it.bag" if ros == 1 else "it"), entries, ros)
+    kinds = {"orientation": "/imu", "base_wrench": "/wrench"}
+    config = RecordingConfig(
+        tension=TensionSource("/pull", (1, 2, 3, 4)),
+        sensors=[{"kind": kind, "topic": topic} for kind, topic in kinds.items()],
+    )
+    turned, force = load_recording(path, config).sensors
+    np.testing.assert_allclose(np.abs(np.sum(turned.values * QUATERNION, axis=1)), 1.0, rtol=1e-12)
+    np.testing.assert_allclose(force.values, np.hstack([PULLS[:, :3], PULLS[:, 1:]]), rtol=1e-12)
+    wrong = [{"kind": "orientation", "topic": "/pull"}]
+    with pytest.raises(RecordingError, match="topic /pull"):
+        load_recording(path, RecordingConfig(sensors=wrong, tensions="none"))

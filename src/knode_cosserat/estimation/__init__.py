@@ -4,9 +4,11 @@ from knode_cosserat.estimation.boundary import BoundaryObserver
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError, StateEstimate
 from knode_cosserat.estimation.outputs import (
     BaseWrench,
+    BendingAngles,
     BodyPoses,
     BodyPositions,
     Curvatures,
+    Orientations,
     Output,
     TipPose,
     TipPosition,
@@ -17,6 +19,7 @@ from knode_cosserat.estimation.window import MovingHorizonObserver
 __all__ = [
     "Adapted",
     "BaseWrench",
+    "BendingAngles",
     "BodyPoses",
     "BodyPositions",
     "BoundaryObserver",
@@ -24,6 +27,7 @@ __all__ = [
     "KalmanObserver",
     "MovingHorizonObserver",
     "ObserverError",
+    "Orientations",
     "Output",
     "StateEstimate",
     "TipPose",

@@ -182,15 +182,18 @@ def split_record(system: System, record: Any) -> tuple[Any, Any]:
 @functools.partial(jax.jit, static_argnames="output")
 def errors_along(
     system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T N x k"],
-    references: Float[Any, "T p"],
+    references: Float[Any, "T p"], directions: Any = None,
 ) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
-    """Return the errors of an output in every row, and their tangents."""
+    """Return the errors of an output in every row, and their tangents; `directions` are k of the system."""
+    leaves, tree = jax.tree.flatten(system)
+    moves = jax.tree.leaves(directions)
 
-    def errors(records: Any) -> Any:
-        return output.errors(system, *split_record(system, records), references)
+    def errors(records: Any, *moving: Any) -> Any:
+        robot = jax.tree.unflatten(tree, moving or leaves)
+        return output.errors(robot, *split_record(system, records), references)
 
-    value, moved = jax.linearize(errors, records)
-    return value, jax.vmap(moved, in_axes=-1)(d_records)
+    value, moved = jax.linearize(errors, records, *leaves[: len(moves)])
+    return value, jax.vmap(moved, in_axes=(-1, *(0 for _ in moves)))(d_records, *moves)
 
 
 @functools.partial(jax.jit, static_argnames="output")

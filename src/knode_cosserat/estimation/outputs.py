@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import re
 from typing import Any, Self
 
 import jax
@@ -12,8 +13,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.rotation import conjugate, quaternion_product
-from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.rotation import conjugate, quaternion_product, rotation_matrix
+from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -55,9 +56,24 @@ class Output(abc.ABC):
         """Number of numbers in a value."""
         return len(self.labels)
 
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Kind of every number of an error; by default all are of one kind, with the name of the class."""
+        words = re.sub(r"(?<!^)(?=[A-Z])", " ", type(self).__name__)
+        return (words.lower(),) * len(self.noise)
+
 
 def _xyz(name: str, unit: str) -> tuple[str, ...]:
     return tuple(f"{name}.{axis} ({unit})" for axis in "xyz")
+
+
+_product = jnp.vectorize(quaternion_product, signature="(4),(4)->(4)")
+
+
+def _rotation_vectors(a: Float[Any, "... M 4"], b: Float[Any, "... M 4"]) -> Float[Any, "... e"]:
+    """Return the rotation vectors (rad) of a ∘ b, which are small, one after the other."""
+    off = _product(a, b)
+    return (2.0 * off[..., 1:] * jnp.where(off[..., :1] < 0.0, -1.0, 1.0)).reshape(*off.shape[:-2], -1)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -93,8 +109,7 @@ class BodyPositions(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the positions, one after the other."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
-        return positions_at(system, y[None], places, z[None])[0].ravel()
+        return positions_at(system, y[None], places_on(system, self.fractions), z[None])[0].ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,6 +117,54 @@ class TipPosition(BodyPositions):
     """Position (m) of the tip, global frame."""
 
     fractions: tuple[float, ...] = (1.0,)
+
+
+@dataclasses.dataclass(frozen=True)
+class Orientations(_AtFractions):
+    """Unit quaternions (scalar first) at fractions of the length, such as those of an inertial sensor.
+
+    An error is a rotation vector (rad) from the reference, in its own frame. Rows are compared by rotations
+    since the first one that was seen, in the global frame: the sensor's mounting need not be known.
+    """
+
+    #: standard deviation of a rotation (rad)
+    sigma: float = 5e-3
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(f"quaternion[{part:g}].{k}" for part in self.fractions for k in "wxyz")
+
+    @property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Standard deviation of every number of an error."""
+        return np.full(3 * len(self.fractions), self.sigma)
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return the orientations, one after the other."""
+        return quaternions_at(system, y[None], places_on(system, self.fractions))[0].ravel()
+
+    def error(
+        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
+    ) -> Float[Any, " e"]:
+        """Return rotation vectors from the reference."""
+        return _rotation_vectors(conjugate(reference.reshape(-1, 4)), self.value(system, y, z).reshape(-1, 4))
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return differences of the rotations since the first row that was seen."""
+        h = quaternions_at(system, y, places_on(system, self.fractions))
+        wanted = references.reshape(h.shape)
+        wanted /= jnp.linalg.norm(wanted, axis=-1, keepdims=True)
+        known = jnp.isfinite(wanted[..., :1])
+        row = jnp.argmax(known, axis=0)[None]
+
+        def since(turns: Any) -> Any:
+            return _product(turns, conjugate(jnp.take_along_axis(turns, row, 0)))
+
+        off = _rotation_vectors(since(h), conjugate(since(jnp.where(known, wanted, 1.0))))
+        return jnp.where(jnp.repeat(known[..., 0], 3, axis=1), off, jnp.nan)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +193,7 @@ class BodyPoses(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return position and quaternion of each place."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
+        places = places_on(system, self.fractions)
         p, h = positions_at(system, y[None], places, z[None])[0], quaternions_at(system, y[None], places)[0]
         return jnp.concatenate([p, h], axis=1).ravel()
 
@@ -139,12 +202,8 @@ class BodyPoses(_AtFractions):
     ) -> Float[Any, " e"]:
         """Return differences of positions (m) and rotation vectors (rad)."""
         value, wanted = (it.reshape(-1, 7) for it in (self.value(system, y, z), reference))
-        parts = []
-        for k in range(len(self.fractions)):
-            turned = quaternion_product(conjugate(wanted[k, 3:]), value[k, 3:])
-            shorter = jnp.where(turned[0] < 0.0, -1.0, 1.0)
-            parts += [value[k, :3] - wanted[k, :3], 2.0 * shorter * turned[1:]]
-        return jnp.concatenate(parts)
+        turned = _rotation_vectors(conjugate(wanted[:, 3:]), value[:, 3:]).reshape(-1, 3)
+        return jnp.concatenate([value[:, :3] - wanted[:, :3], turned], axis=1).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,16 +224,34 @@ class BodyMotions(BodyPoses):
         self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
     ) -> Float[Any, "T e"]:
         """Return differences of positions (m), and of rotations since the first row (rad, global frame)."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
-        h, reference = quaternions_at(system, y, places), references.reshape(len(references), -1, 7)
-        product, inverse = jax.vmap(jax.vmap(quaternion_product)), jax.vmap(jax.vmap(conjugate))
-        since = product(h, inverse(jnp.broadcast_to(h[:1], h.shape)))
-        known = jnp.isfinite(reference[..., 3:4])
-        turned = product(since, inverse(jnp.where(known, reference[..., 3:], 1.0)))
-        turned = 2.0 * turned[..., 1:] * jnp.where(turned[..., :1] < 0.0, -1.0, 1.0)
-        moved = positions_at(system, y, places, z) - reference[..., :3]
-        both = jnp.concatenate([moved, jnp.where(known, turned, jnp.nan)], axis=-1)
-        return both.reshape(len(references), -1)
+        count, reference = len(references), references.reshape(len(references), -1, 7)
+        moved = positions_at(system, y, places_on(system, self.fractions), z) - reference[..., :3]
+        turned = Orientations(self.fractions).errors(system, y, z, reference[..., 3:].reshape(count, -1))
+        return jnp.concatenate([moved, turned.reshape(count, -1, 3)], axis=-1).reshape(count, -1)
+
+
+@dataclasses.dataclass(frozen=True)
+class BendingAngles(_AtFractions):
+    """Bending angle of the rod's axis from the z axis, times the cosine and the sine of its direction (rad).
+
+    The direction is the angle about z from x. A product has no singularity where the rod is straight.
+    """
+
+    #: standard deviation (rad)
+    sigma: float = 5e-3
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(f"bending[{part:g}].{axis} (rad)" for part in self.fractions for axis in "xy")
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return the angles, one pair after the other."""
+        h = quaternions_at(system, y[None], places_on(system, self.fractions))[0]
+        axis = jax.vmap(rotation_matrix)(h)[:, :, 2]
+        # the root of zero has no derivative
+        sine = jnp.sqrt(jnp.sum(axis[:, :2] ** 2, axis=1, keepdims=True) + 1e-30)
+        return (axis[:, :2] * jnp.arctan2(sine, axis[:, 2:]) / sine).ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -200,6 +277,11 @@ class States(Output):
         fields = self.y_names, self.z_names
         parts = ([name for name, size in names for _ in range(size)] for names in fields)
         return tuple(label for part in parts for label in part * self.nodes)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Field of y or z of every number."""
+        return self.labels
 
     @property
     def noise(self) -> Float[np.ndarray, " e"]:
@@ -241,7 +323,7 @@ class Curvatures(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the curvatures, interpolated linearly between nodes."""
-        places = places_at(np.asarray(self.fractions), system.nodes)
+        places = places_on(system, self.fractions)
         u = system.z_layout.get(z, "u")[..., :2]
         part = jnp.asarray(places.part)[:, None]
         return ((1.0 - part) * u[places.node] + part * u[places.node + 1]).ravel()
@@ -268,6 +350,50 @@ class BaseWrench(Output):
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the internal force and moment at the base."""
         return jnp.concatenate([system.y_layout.get(y[0], "n"), system.y_layout.get(y[0], "m")])
+
+
+@dataclasses.dataclass(frozen=True)
+class Several(Output):
+    """Several outputs, one after the other."""
+
+    outputs: tuple[Output, ...]
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Name and unit of every number of a value."""
+        return tuple(label for it in self.outputs for label in it.labels)
+
+    @property
+    def fields(self) -> tuple[str, ...]:
+        """Kind of every number of an error."""
+        return tuple(field for it in self.outputs for field in it.fields)
+
+    @property
+    def noise(self) -> Float[np.ndarray, " e"]:
+        """Standard deviation of every number of an error."""
+        return np.concatenate([it.noise for it in self.outputs])
+
+    def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
+        """Return all values."""
+        return jnp.concatenate([it.value(system, y, z) for it in self.outputs])
+
+    def parts(self, values: Float[Any, "... p"]) -> list[Float[Any, "... q"]]:
+        """Return the values of each output."""
+        return jnp.split(values, np.cumsum([it.size for it in self.outputs])[:-1], axis=-1)
+
+    def error(
+        self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
+    ) -> Float[Any, " e"]:
+        """Return all differences."""
+        pairs = zip(self.outputs, self.parts(reference), strict=True)
+        return jnp.concatenate([it.error(system, y, z, part) for it, part in pairs])
+
+    def errors(
+        self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
+    ) -> Float[Any, "T e"]:
+        """Return the errors of consecutive rows."""
+        pairs = zip(self.outputs, self.parts(references), strict=True)
+        return jnp.concatenate([it.errors(system, y, z, part) for it, part in pairs], axis=-1)
 
 
 def final_output(system: System, trajectory: Trajectory, output: Output) -> Float[np.ndarray, " p"]:

@@ -11,10 +11,12 @@ import pkgutil
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Literal, NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.parameters import Effect, Model, Number, Replace
+from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.parameters import (
     Parameter,
     ParameterError,
@@ -26,6 +28,7 @@ from knode_cosserat.rods.parameters import (
 )
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
+from knode_cosserat.rods.tendons import Markers
 from knode_cosserat.rods.wrapped import nominal_model
 
 #: tendon offset of a robot that states none, over its radius
@@ -91,6 +94,30 @@ def library_model(
         tuple(float(at) for at in bodies if at > 0.0),
     )  # fmt: skip
     return Model(nominal, [*effects_of(nominal, usual), *more])
+
+
+def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Effect]:
+    """Return the places of bodies that are not well known, as an effect; `flat` ones have no priors."""
+    places: dict[float, float] = {}
+    for rows in measured:
+        places |= zip(map(float, rows.fractions), rows.deviations, strict=False)
+    stated = tuple(sorted(place for place, deviation in places.items() if deviation > 0.0))
+    numbers = tuple(Number(f"place[{it:g}]", "", it, places[it], 0.0, 1.0, flat=flat) for it in stated)
+
+    def placed(robot: Any, at: Any) -> Any:
+        if not hasattr(robot, "effects"):
+            raise ParameterError(
+                f"places of bodies are not known, and a {type(robot).__name__} has no `effects`"
+            )
+        others = [part for part in robot.effects if not isinstance(part, Markers)]
+        return robot.replace(effects=(*others, Markers(at=at, stated=stated)))
+
+    effect = Effect(
+        "marker places", "places of bodies as parts of the length", numbers,
+        lambda robot, values: placed(robot, jnp.stack(values)), lambda robot: placed(robot, np.array(stated)),
+        basic=True, of_recordings=True,
+    )  # fmt: skip
+    return [effect] if stated else []
 
 
 def along_axes(label: str, unit: str, width: float, axes: str = "xyz") -> tuple[Number, ...]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
@@ -18,7 +18,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
-from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -39,6 +39,7 @@ class Evaluation:
         failed: why there is no prediction, or None.
         tip: predicted positions of the last body (m), or None.
         extrapolated: part of the rows outside the range that the robot was identified in; None: not known.
+        sensors: root mean square error of each sensor beside motion capture, by its name and unit.
     """
 
     tip_dtw: float | None = None
@@ -48,11 +49,12 @@ class Evaluation:
     failed: str | None = None
     tip: Float[np.ndarray, "T 3"] | None = None
     extrapolated: float | None = None
+    sensors: Mapping[str, float] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return the errors, or the reason of a failure, as plain JSON values."""
         errors = {name: getattr(self, name) for name in ("tip_dtw", "pose_mse", "tip_rmse", "rotation_rmse")}
-        more = {name: getattr(self, name) for name in ("extrapolated", "failed")}
+        more = {name: getattr(self, name) for name in ("extrapolated", "failed", "sensors")}
         return errors | {name: value for name, value in more.items() if value is not None}
 
     def __repr__(self) -> str:
@@ -61,13 +63,16 @@ class Evaluation:
     def __str__(self) -> str:
         if self.failed is not None:
             return f"no prediction: {self.failed}"
-        assert self.tip_rmse is not None
-        turned = ""
+        parts = []
+        if self.tip_rmse is not None:
+            parts.append(f"tip RMSE {1e3 * self.tip_rmse:.2f} mm")
         if self.pose_mse is not None and self.rotation_rmse is not None:
             degrees = np.degrees(self.rotation_rmse)
-            turned = f", pose MSE {self.pose_mse:.3g}e-3, orientations {degrees:.3g} degrees off"
-        outside = f", {self.extrapolated:.0%} of the rows extrapolated" if self.extrapolated else ""
-        return f"tip RMSE {1e3 * self.tip_rmse:.2f} mm{turned}{outside}"
+            parts.append(f"pose MSE {self.pose_mse:.3g}e-3, orientations {degrees:.3g} degrees off")
+        parts += [f"RMSE of {name} {error:.3g}" for name, error in (self.sensors or {}).items()]
+        if self.extrapolated:
+            parts.append(f"{self.extrapolated:.0%} of the rows extrapolated")
+        return ", ".join(parts)
 
 
 def coverage(
@@ -92,7 +97,7 @@ def coverage(
     predicted = []
     for robot in members:
         moved = predict(robot, measured, space=space, recovery=RECOVERY)
-        places = places_at(measured.fractions, robot.nodes)
+        places = places_on(robot, measured.fractions)
         predicted.append(np.asarray(positions_at(robot, np.asarray(moved.y), places)))
     count = len(predicted)
     if count < 2:
@@ -166,28 +171,39 @@ def compared(
     """Return the errors of a motion in the rows of a recording; arguments as in `evaluate`."""
     rows = np.arange(len(measured.time))[::every][:last]
     y, z = np.asarray(moved.y)[rows], np.asarray(moved.z)[rows]
-    places = places_at(measured.fractions, robot.nodes)
+    places = places_on(robot, measured.fractions)
     position = np.asarray(positions_at(robot, y, places, z))
     quaternion = np.asarray(quaternions_at(robot, y, places))
     seen, known = measured.position[rows], measured.complete[rows]
-    off = position[known, -1] - seen[known, -1]
     # the mounting of bodies is unknown: rotations are relative to the first row, where the robot is at rest
     begun = jnp.broadcast_to(quaternion[0], quaternion.shape)
     since = jnp.asarray(since_first(measured.quaternion[rows]))
     turned = np.asarray(jax.vmap(jax.vmap(quaternion_product))(since, begun))
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
-    mse = rotation = None
-    if oriented.any():
+    mse = rotation = tip = None
+    if len(measured.fractions):
+        tip = position[known, -1], seen[known, -1]
+    if tip and oriented.any():
         poses = [
             types.SimpleNamespace(position=p[oriented], quaternion=h[oriented])
             for p, h in ((position, quaternion), (seen, turned))
         ]
         mse, rotation = pose_mse(*poses), rotation_rmse(*poses)
+    sensors = {}
+    for sensor in measured.sensors:
+        output = sensor.output
+        errors = np.asarray(output.errors(robot, y, z, sensor.values[rows]))
+        known_units = [label.partition("(")[2].rstrip(")") or "rad" for label in output.labels]
+        units = np.array(known_units if len(known_units) == errors.shape[1] else ["rad"] * errors.shape[1])
+        for unit in dict.fromkeys(units.tolist()):
+            off = errors[:, units == unit]
+            sensors[f"{sensor.topic} ({unit})"] = float(np.sqrt(np.nanmean(off**2)))
     return Evaluation(
-        tip_dtw=dtw_distance(position[known, -1], seen[known, -1]),
-        tip_rmse=float(np.sqrt(np.mean(np.sum(off**2, axis=1)))),
+        tip_dtw=tip and dtw_distance(*tip),
+        tip_rmse=tip and float(np.sqrt(np.mean(np.sum((tip[0] - tip[1]) ** 2, axis=1)))),
         pose_mse=mse,
         rotation_rmse=rotation,
-        tip=position[:, -1],
+        tip=tip and position[:, -1],
         extrapolated=None if moved.extrapolated is None else float(np.mean(moved.extrapolated[rows])),
+        sensors=sensors or None,
     )

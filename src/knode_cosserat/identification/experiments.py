@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import re
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -13,14 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, States
+from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, Several, States
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System
-from knode_cosserat.rotation import since_first
 from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.places import Places, places_at, positions_at
@@ -77,18 +75,14 @@ class Experiment:
     @functools.cached_property
     def fields(self) -> tuple[str, ...]:
         """Names of the data's fields; each has its own size of differences."""
-        if isinstance(self.output, States):
-            return tuple(dict.fromkeys(self.output.labels))
-        words = re.sub(r"(?<!^)(?=[A-Z])", " ", type(self.output).__name__)
-        return (words.lower(),)
+        return tuple(dict.fromkeys(self.output.fields))
 
     @functools.cached_property
     def groups(self) -> np.ndarray:
         """Index in `fields` of every number of an error."""
-        if isinstance(self.output, States):
-            number = {field: k for k, field in enumerate(self.fields)}
-            return np.array([number[label] for label in self.output.labels])
-        return np.zeros(len(self.noise), dtype=int)
+        if len(self.fields) == 1:
+            return np.zeros(len(self.noise), dtype=int)
+        return np.array([self.fields.index(name) for name in self.output.fields])
 
     @functools.cached_property
     def noise(self) -> Float[np.ndarray, " e"]:
@@ -130,7 +124,7 @@ def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto4
     Raises:
         DataError: data that do not fit the robot or each other, are too short or not finite.
     """
-    rows = _listed(data)
+    rows = listed_rows(data)
     measured = [it for it in rows if isinstance(it, Measurements)]
     same_steps(measured)
     names = iter(names_of(measured))
@@ -146,7 +140,7 @@ def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto4
     return [it.padded(longest) for it in experiments]
 
 
-def _listed(data: Any) -> list[Any]:
+def listed_rows(data: Any) -> list[Any]:
     """Return data in a list, recordings as rows with mean tensions; `DataError` for anything else."""
     if isinstance(data, str | Recording | Measurements | Trajectory | Experiment) or not isinstance(
         data, Sequence
@@ -166,7 +160,7 @@ def _listed(data: Any) -> list[Any]:
 
 def measured_rows(data: Any) -> list[Measurements]:
     """Return the rows of recordings; `DataError` for anything else."""
-    rows = _listed(data)
+    rows = listed_rows(data)
     for it in rows:
         if not isinstance(it, Measurements):
             raise DataError(f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of")
@@ -212,15 +206,16 @@ def of_measurements(
         raise DataError(
             f"{name}: no tension is known at {measured.time[row]:g} s; use the part before (`parts`)"
         )
-    if not np.any(np.isfinite(measured.position[1:])):
-        raise DataError(f"{name}: no position was seen after the first row")
+    seen = [measured.position, measured.quaternion, *(it.values for it in measured.sensors)]
+    if not any(np.any(np.isfinite(rows[1:])) for rows in seen):
+        raise DataError(f"{name}: nothing was measured after the first row")
     control = measured.tension[:-1]
     held = np.asarray(control[0] if measured.initial_tension is None else measured.initial_tension)
     swing = np.max(np.abs(control - held), axis=1)
     moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
     scheme = time_scheme(measured.dt, measured.continuous)
     settings = dataclasses.replace(Settings.of(None, space, "paper", NewtonOptions()), time=scheme)
-    output, data = _poses(measured, robot)
+    output, data = _measured(measured, robot)
     at_rest = True
     if not measured.static and np.all(model.prior == 0.0):
         shapes = _Shapes(places_at(measured.fractions, robot.nodes), measured.position[0])
@@ -234,16 +229,34 @@ def of_measurements(
     )  # fmt: skip
 
 
-def _poses(measured: Measurements, robot: System) -> tuple[Output, np.ndarray]:
-    """Return positions, and rotations since row 0 if the robot has orientations, as numbers in rows."""
-    fractions, rows = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist()), len(measured.position)
-    try:
-        Drawing.of(robot).quaternions(np.asarray(robot.rest(0.0)[0]))
-    except AttributeError:
-        return BodyPositions(fractions, 1.0), np.array(measured.position.reshape(rows, -1))
-    turned = np.asarray(since_first(measured.quaternion))
-    data = np.concatenate([measured.position, turned], axis=-1).reshape(rows, -1)
-    return BodyMotions(fractions, 1.0, 1.0 / (ARM * float(np.asarray(robot.length)))), data
+def _measured(measured: Measurements, robot: System) -> tuple[Output, np.ndarray]:
+    """Return everything that was measured, as numbers in rows.
+
+    These are positions, rotations if the robot has orientations, and values of other sensors. A rotation
+    counts as a displacement of a part of the length, a usual value of another sensor as the length.
+    """
+    rows, length = len(measured.time), float(np.asarray(robot.length))
+    outputs, data = list[Output](), list[np.ndarray]()
+    if len(measured.fractions):
+        fractions = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist())
+        try:
+            Drawing.of(robot).quaternions(np.asarray(robot.rest(0.0)[0]))
+        except AttributeError:
+            if measured.sensors:
+                raise DataError("sensors beside motion capture need a robot with orientations") from None
+            return BodyPositions(fractions, 1.0), np.array(measured.position.reshape(rows, -1))
+        outputs.append(BodyMotions(fractions, 1.0, 1.0 / (ARM * length)))
+        data.append(np.concatenate([measured.position, measured.quaternion], axis=-1).reshape(rows, -1))
+    for sensor in measured.sensors:
+        output, values = sensor.output, sensor.values
+        known = np.isfinite(values)
+        sizes = (values / np.resize(output.noise, values.shape[1]))[known]
+        usual = float(np.sqrt(np.mean(sizes**2))) if len(sizes) else 0.0
+        sigmas = [it.name for it in dataclasses.fields(output) if it.name.startswith("sigma")]
+        unit = (usual or 1.0) / length
+        outputs.append(dataclasses.replace(output, **{it: unit * getattr(output, it) for it in sigmas}))
+        data.append(values)
+    return (outputs[0], data[0]) if len(outputs) == 1 else (Several(tuple(outputs)), np.hstack(data))
 
 
 def _as_steps(measured: Measurements) -> Measurements:
@@ -257,6 +270,7 @@ def _as_steps(measured: Measurements) -> Measurements:
         tension=np.concatenate([measured.tension, measured.tension[-1:]]),
         position=late(measured.position),
         quaternion=late(measured.quaternion),
+        sensors=tuple(dataclasses.replace(it, values=late(it.values)) for it in measured.sensors),
         initial_tension=measured.tension[0],
     )
 

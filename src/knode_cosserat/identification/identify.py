@@ -13,10 +13,10 @@ import numpy as np
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.estimation.outputs import States
+from knode_cosserat.estimation.outputs import Several, States
 from knode_cosserat.estimation.parameters import Model
-from knode_cosserat.identification.effects import library_model, parameter_effects
-from knode_cosserat.identification.experiments import Experiment, experiments_of, measured_rows
+from knode_cosserat.identification.effects import library_model, parameter_effects, place_effects
+from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.result import Estimate, Identified, estimates_of
@@ -109,7 +109,10 @@ def identify(
     if not isinstance(system, System) or np.ndim(robot.length):
         raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")
     tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
+    data = listed_rows(data)
     plain = [] if parameters is None else parameter_effects(robot, parameters)
+    rows = [it for it in data if isinstance(it, Measurements)]
+    plain += place_effects(rows, flat=effects is None and parameters is not None)
     if effects is None and parameters is not None:
         model = Model(robot, plain)
         search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
@@ -288,9 +291,9 @@ def _accepted(
     folds = []
     if len(data) > 1:
         ends = [search.without(point, k, FOLD) for k in range(len(data))]
-        errors = [None if end is None else _errors(search, end.x, [k])[0] for k, end in enumerate(ends)]
+        errors = [None if it is None else _errors(search, it.x, [k], False)[0] for k, it in enumerate(ends)]
         folds = [end.x for end in ends if end is not None]
-        nominal = _errors(search, np.zeros(model.size))
+        nominal = _errors(search, np.zeros(model.size), tip=False)
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
         if np.mean(unseen) >= np.mean(before):
             reason = "the nominal robot is returned: it predicts held-out recordings as well"
@@ -298,7 +301,8 @@ def _accepted(
     robot = robot.replace(trained=trained_range(robot, data, space))
     result = _result(search, robot, x, estimates_of(point, posterior, x, folds), posterior, steps)
     return dataclasses.replace(
-        result, held_out_error={it.name: error for it, error in zip(data, errors, strict=True)}
+        result,
+        held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
     )
 
 
@@ -339,11 +343,12 @@ def _places(data: Experiment) -> Callable[[np.ndarray], np.ndarray] | None:
         return lambda rows: rows[:, : output.nodes * count].reshape(len(rows), output.nodes, count)[
             ..., first : first + size
         ]
-    bodies = len(getattr(output, "fractions", ()))
-    if not bodies or not output.labels[0].startswith("position"):
+    poses = output.outputs[0] if isinstance(output, Several) else output
+    bodies = len(getattr(poses, "fractions", ()))
+    if not bodies or not poses.labels[0].startswith("position"):
         return None
-    dimension = 3 if hasattr(output, "sigma_rotation") else data.data.shape[1] // bodies
-    return lambda rows: rows.reshape(len(rows), bodies, -1)[..., :dimension]
+    last = 6 * bodies if hasattr(poses, "sigma_rotation") else data.data.shape[1]
+    return lambda rows: rows[:, :last].reshape(len(rows), bodies, -1)[..., :3]
 
 
 def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:
@@ -352,16 +357,22 @@ def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:
     return places(rollout.values * data.noise)
 
 
-def _errors(search: Search, x: np.ndarray, which: Sequence[int] | None = None) -> list[float | None]:
-    """Return the root mean square error of the last body's position (m), by experiment."""
+def _errors(
+    search: Search, x: np.ndarray, which: Sequence[int] | None = None, tip: bool = True
+) -> list[float | None]:
+    """Return the root mean square error of the last body's position (m), by experiment.
+
+    Without positions it is None if `tip`, or else that of all differences.
+    """
     chosen = [search.misfit.data[k] for k in (range(len(search.misfit.data)) if which is None else which)]
     errors: list[float | None] = []
     for data, rollout in zip(chosen, search.misfit.whole(x, which), strict=True):
-        if rollout is None or _places(data) is None:
+        seen = _places(data) is not None
+        if rollout is None or (tip and not seen):
             errors.append(None)
             continue
-        tip = np.sum(_positions(rollout, data)[:, -1] ** 2, axis=-1)
-        errors.append(float(np.sqrt(np.nanmean(tip))))
+        squares = np.sum(_positions(rollout, data)[:, -1] ** 2, axis=-1) if seen else rollout.values**2
+        errors.append(float(np.sqrt(np.nanmean(squares))))
     return errors
 
 

@@ -1,7 +1,7 @@
 """Differences between simulated and measured rows of experiments, and their derivatives.
 
 Every solved step is differentiated by the implicit function theorem (`solvers.sensitivity`), and outputs as
-in the online observers (`estimation.online.errors_along`).
+in the online observers (`estimation.online.errors_along`), also by parameters such as places of bodies.
 """
 
 from __future__ import annotations
@@ -213,7 +213,7 @@ class Misfit:
             # zeros in all other columns: one compiled program serves any coordinates
             whole = np.zeros((*records.shape, len(x)))
             whole[..., which] = np.concatenate([d_first[None, :, :size], d_records])
-            _, slopes = errors_along(system, data.output, every(records), every(whole), data.data)
+            _, slopes = errors_along(system, data.output, every(records), every(whole), data.data, directions)
             return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, every(records), data.data))

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 
 from knode_cosserat._files.writing import package_version
 from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.estimation.outputs import States
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.information import ROBUST, Problem, dispersion, huber, normal_equations
 from knode_cosserat.identification.misfit import Misfit, Rollout
@@ -137,8 +138,8 @@ class Search:
         fields, groups = data.fields, data.groups
         if not self.exact:
             return np.full(len(fields), LEAST_SCALE * self.length)
-        if len(fields) == 1:
-            return np.array([LEAST * self.length])
+        if not isinstance(data.output, States):
+            return np.full(len(fields), LEAST * self.length)
         count = np.maximum(np.isfinite(data.data[1:]).sum(axis=0), 1)
         usual = np.sqrt(np.nansum(np.square(data.data[1:]), axis=0) / count)
         sizes = np.array([np.max(usual[groups == k]) for k in range(len(fields))])
@@ -369,6 +370,8 @@ class _Descent:
         parts = zip(rollouts, self.units, self.known, strict=True)
         rows = [(rollout.derivatives_by(self.free) / unit)[:, known].T for rollout, unit, known in parts]
         scaled_rows = np.concatenate(rows) * (factor / self.thinned)[:, None]
+        if not np.isfinite(scaled_rows).all():
+            raise SearchError("the search left the range of robots whose motion has derivatives")
         return np.concatenate([scaled_rows, np.diag(self.prior)]) * self.reach
 
     def _scaled(self, rollouts: list[Rollout]) -> np.ndarray:

@@ -11,19 +11,22 @@ import scipy.ndimage
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.controls import TENSION_UNITS
+from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations, Output
 from knode_cosserat.recordings.config import (
-    MOTOR_UNITS,
     POSITION_UNITS,
+    SENSOR_UNITS,
     MotorSource,
     RecordingConfig,
+    SensorSource,
     TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
-from knode_cosserat.recordings.recording import bridge
-from knode_cosserat.recordings.streams import SLOW, Body, Tensions, period
+from knode_cosserat.recordings.recording import bridge, continuous
+from knode_cosserat.recordings.streams import SLOW, Body, Sensor, Tensions, period
 
+#: allowed numbers in a row of a sensor, by its kind; of curvatures two for each place
+SENSOR_COUNTS = {"orientation": (4, 3), "bending_angle": (2,), "base_wrench": (6,)}
 #: smallest jumps that are removed (m, rad, N)
 SMALLEST_SHIFT, SMALLEST_TURN, SMALLEST_PULL = 5e-3, np.radians(8.0), 0.5
 #: longest spike of a load cell (s): spikes last one or two messages, a longer change can be a command
@@ -38,8 +41,6 @@ SHORT, LONG = 0.02, 20.0
 FACTOR = 20.0
 #: largest share of rows with implausible tensions; more of them are no accidents
 RARE = 0.05
-
-_UNITS = {**TENSION_UNITS, **MOTOR_UNITS}
 
 
 @dataclasses.dataclass
@@ -62,6 +63,16 @@ class _Rows:
         """Remove rows with numbers that are not finite or implausibly large, and others that are wrong."""
         large = ~np.all(np.abs(np.nan_to_num(self.values, nan=np.inf)) < 1e9, axis=1)
         self.drop(wrong | large, words, "warning")
+
+    def require(self, config: RecordingConfig, what: str, name: str, path: str) -> None:
+        """Remove repeated rows, unless they are kept; `RecordingError` with fewer than two rows."""
+        if config.repeats == "drop":
+            again = np.concatenate([[False], np.all(np.diff(self.values, axis=0) == 0.0, axis=1)])
+            words = f"{what} repeats", f"{what}s repeat", "the one before"
+            self.drop(again[: len(self.time)], words, "note")
+        if len(self.time) < FEWEST_FRAMES:
+            count = f"{len(self.time)} usable {what}s of {name}; required is {FEWEST_FRAMES} or more"
+            raise RecordingError(f"{path}: topic {self.topic}: {count}")
 
     def add(self, message: str, severity: Severity, rows: Bool[np.ndarray, " n"]) -> None:
         """Add a finding on rows."""
@@ -103,14 +114,7 @@ def cleaned_body(
         with np.errstate(all="ignore"):
             no_rotation = ~(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) < 0.05)
     rows.drop_unusable(no_rotation, ("pose is", "poses are", "not finite, or no rotation"))
-    if config.repeats == "drop":
-        again = np.concatenate([[False], np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)])
-        rows.drop(again[: len(rows.time)], ("pose repeats", "poses repeat", "the one before"), "note")
-    if len(rows.time) < FEWEST_FRAMES:
-        raise RecordingError(
-            f"{path}: topic {topic}: {len(rows.time)} usable poses of {name}; required is {FEWEST_FRAMES} or "
-            "more"
-        )
+    rows.require(config, "pose", name, path)
     unclear: list[int] = []
     if is_oriented:
         quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
@@ -140,6 +144,46 @@ def cleaned_body(
     rows.add_pauses(config.longest_gap)
     orientation = rows.values[:, 3:] if is_oriented else None
     return Body(rows.time, rows.values[:, :3], orientation, name, topic, fraction), rows.findings
+
+
+# other sensors
+
+
+def cleaned_sensor(
+    config: RecordingConfig, source: SensorSource, time: np.ndarray, numbers: np.ndarray, path: str
+) -> tuple[Sensor, list[Finding]]:
+    """Return a sensor's usable rows in SI units and in the robot's frame, and the findings.
+
+    Raises:
+        RecordingError: another number of numbers than its kind has, or too few usable rows.
+    """
+    counts = SENSOR_COUNTS.get(source.kind, (2 * len(source.fractions),))
+    if (count := numbers.shape[1]) not in counts:
+        words = f"allowed for {source.kind} is {' or '.join(map(str, counts))}"
+        raise RecordingError(f"{path}: {source.topic} has {count} numbers in a row; {words}")
+    rows = _Rows(source.topic, time, numbers)
+    is_turn = source.kind == "orientation" and count == 4
+    length = np.linalg.norm(numbers, axis=1) if is_turn else np.ones(len(time))
+    rows.drop_unusable(~(np.abs(length - 1.0) < 0.05), ("row is", "rows are", "not finite, or no rotation"))
+    rows.require(config, "row", source.kind, path)
+    units = SENSOR_UNITS[source.kind]
+    values = rows.values * units[source.unit or next(iter(units))]
+    frame = Rotation.from_quat(source.rotation or (1.0, 0.0, 0.0, 0.0), scalar_first=True)
+    output: Output = Curvatures(source.fractions)
+    if source.kind == "orientation":
+        output = Orientations(source.fractions)
+        if count == 3:
+            values = Rotation.from_euler("ZYX", values[:, ::-1]).as_quat(scalar_first=True)
+        turned = frame * Rotation.from_quat(values, scalar_first=True)
+        values = continuous(turned.as_quat(scalar_first=True))
+    elif source.kind == "bending_angle":
+        output = BendingAngles(source.fractions)
+        values = values[:, :1] * np.stack([np.cos(values[:, 1]), np.sin(values[:, 1])], axis=1)
+    elif source.kind == "base_wrench":
+        output = BaseWrench()
+        values = frame.apply(values.reshape(-1, 3)).reshape(values.shape)
+    rows.add_pauses(config.longest_gap)
+    return Sensor(rows.time, values, output, rows.topic), rows.findings
 
 
 # tensions
@@ -185,7 +229,7 @@ def _cleaned_rows(
             f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; "
             f"the configuration's order has {len(source.order)} tendons"
         )
-    rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * _UNITS[source.unit])
+    rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * source.factor)
     rows.drop_unusable(np.zeros(len(time), dtype=bool), ("tension is", "tensions are", "not finite"))
     if not isinstance(source, TensionSource):
         return rows
@@ -337,6 +381,8 @@ def implausible_sizes(
             f"measured tensions are {sizes[0]:.3g} N and commanded ones {sizes[1]:.3g} N: not the same unit?"
         )
         findings.append(Finding("problem", "", what))
+    if not bodies:
+        return findings
     places = [np.median(body.position, axis=0) for body in bodies] if at_rest is None else at_rest
     far = float(np.linalg.norm(places, axis=1).max())
     if not SHORT < far < LONG:

@@ -46,6 +46,13 @@ POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 #: units of motors: angles to rad, or wound-up lengths to m
 MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
+#: kinds of sensors beside motion capture: their units with factors to SI units, the default first
+SENSOR_UNITS: dict[str, dict[str, float]] = {
+    "orientation": {"rad": 1.0, "deg": math.pi / 180.0},
+    "bending_angle": {"rad": 1.0, "deg": math.pi / 180.0},
+    "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/cm": 1e2},
+    "base_wrench": {"N": 1.0, "mN": 1e-3},
+}
 #: axes of motion capture that point up, with the rotation vector (rad) that turns them to z
 UP: dict[str, Vector] = {
     "z": (0.0, 0.0, 0.0), "y": (math.pi / 2, 0.0, 0.0), "x": (0.0, -math.pi / 2, 0.0),
@@ -126,6 +133,10 @@ def _numbers(count: int, words: str) -> _Check:
         return tuple(numbers)
 
     return check
+
+
+def _fractions(value: Any, name: str) -> Vector:
+    return tuple(_number(0.0, 1.0)(place, name) for place in _listed(value) or [value])
 
 
 def _quaternion(value: Any, name: str) -> Vector:
@@ -274,12 +285,14 @@ class MarkerSource(_Settings):
         fraction: its place, as a fraction of the rod's length: 0 is the clamped end, 1 the tip.
         rotation: the body's axes in the rod's local frame, as a quaternion, scalar first; None: the axes
             are calibrated at rest, when the rod points up.
+        deviation: standard deviation of `fraction`, if it is not well known: it is identified with the robot.
     """
 
     name: Annotated[str, _text]
     topic: Annotated[str, _text]
     fraction: Annotated[float, _number(0.0, 1.0)]
     rotation: Annotated[Vector | None, _quaternion] = None
+    deviation: Annotated[float | None, _number(0.0, 1.0)] = None
 
 
 def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
@@ -293,15 +306,52 @@ def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
             named = {"topic": marker["name"]} if "name" in marker else {}
             marker = _part(MarkerSource)(named | marker, where)
         markers.append(marker)
-    if not markers:
-        refused = tuple(value) if isinstance(value, list) else value
-        raise _refused(refused, name, "a list of one marker or more")
+    if not markers and value not in ([], ()):
+        raise _refused(value, name, "a list of markers")
     places, names = [marker.fraction for marker in markers], [marker.name for marker in markers]
     if any(b <= a for a, b in itertools.pairwise(places)):
         raise RecordingError(f"markers have the fractions {shown(places)}; allowed is each above the last")
     if len(set(names)) < len(names):
         raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
     return tuple(markers)
+
+
+@dataclasses.dataclass(frozen=True)
+class SensorSource(_Settings):
+    """Sensor beside motion capture.
+
+    Attributes:
+        kind: "orientation" (quaternion, scalar first, or roll, pitch, yaw), "bending_angle" (from the z axis,
+            and its direction about z from x), "curvature" (about the local x and y axes, in turn for each
+            place) or "base_wrench" (force and moment of the base on the rod).
+        topic: topic in a bag (Imu, QuaternionStamped, PoseStamped, WrenchStamped, arrays); name in reports.
+        columns: titles of its numbers in a table.
+        fractions: places, as fractions of the rod's length.
+        unit: "rad" or "deg"; "1/m", "1/cm" or "1/mm"; "N" (and N m) or "mN" (and mN m).
+        rotation: quaternion from its global frame to the robot's, of orientations and wrenches.
+    """
+
+    kind: Annotated[str, _choice(SENSOR_UNITS)]
+    topic: Annotated[str, _text]
+    columns: Annotated[tuple[str, ...] | None, _titles()] = None
+    fractions: Annotated[Vector, _fractions] = (1.0,)
+    unit: str | None = None
+    rotation: Annotated[Vector | None, _quaternion] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.unit is not None:
+            _choice(SENSOR_UNITS[self.kind])(self.unit, "unit")
+        if self.kind != "curvature" and len(self.fractions) > 1:
+            raise _refused(self.fractions, "fractions", f"one place for {self.kind}: list a sensor for each")
+
+
+def _sensors(value: Any, name: str) -> tuple[SensorSource, ...]:
+    sensors = []
+    for k, sensor in enumerate(_listed(value)):
+        named = {"topic": sensor.get("kind")} | sensor if isinstance(sensor, dict) else sensor
+        sensors.append(_part(SensorSource)(named, f"{name}, number {k + 1}"))
+    return tuple(sensors)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -318,6 +368,13 @@ class _NumbersSource(_Settings):
     topic: str
     order: tuple[int, ...]
     names: tuple[str, ...] | None
+    unit: str
+    gain: float | None
+
+    @property
+    def factor(self) -> float:
+        """Tension (N), angle (rad) or length (m) over the numbers of the messages."""
+        return {**TENSION_UNITS, **MOTOR_UNITS}[self.unit] * (1.0 if self.gain is None else self.gain)
 
     def __post_init__(self) -> None:
         names = None
@@ -335,6 +392,8 @@ class _NumbersSource(_Settings):
                 f"names has {len(names)} names and order {len(self.order)} numbers; allowed is the same "
                 "number"
             )
+        if self.gain == 0.0:
+            raise _refused(self.gain, "gain", "any other number")
         if self.topic.count(PLACE) > 1:
             raise _refused(self.topic, "topic", f"one {PLACE} at most")
 
@@ -348,6 +407,8 @@ class TensionSource(_NumbersSource):
             tendons' names, or without names for 1, 2, 3, …
         order: tendon of each number in a message; tendons count from 1. Empty: that of `names`.
         unit: "N" or "gf" (grams-force).
+        gain: factor from a message's numbers to this unit, such as the tension of a motor current of 1 A; a
+            rough one will do where gains of load cells are identified. Negative if numbers pull below zero.
         held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
             at that instant, and tensions are interpolated linearly.
         names: names in the messages (joints of a JointState), or in the topics, of each number in `order`;
@@ -359,6 +420,7 @@ class TensionSource(_NumbersSource):
     unit: Annotated[Literal["N", "gf"], _choice(TENSION_UNITS)] = "N"
     held: Annotated[bool | None, _flag] = None
     names: tuple[str, ...] | None = None
+    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
 
 
 def _command_text(value: Any, name: str) -> str:
@@ -394,6 +456,7 @@ class MotorSource(_NumbersSource):
         topic: topic of the angles or lengths.
         order: motor of each number in a message; motors count from 1.
         unit: "rad" or "deg" for angles; "m" or "mm" for lengths.
+        gain: factor from a message's numbers to this unit, such as 360 / 4096 degrees for a motor's ticks.
         latency: delay from an angle's stamp until it acts on the robot (s): the offset between the clocks
             of motors and motion capture.
         names: names of the motors in messages or topics, as in `TensionSource`. Angles in a JointState are
@@ -405,6 +468,7 @@ class MotorSource(_NumbersSource):
     unit: Annotated[Literal["rad", "deg", "m", "mm"], _choice(MOTOR_UNITS)] = "rad"
     latency: Annotated[float, _number(-10.0, 10.0, "s")] = 0.0
     names: tuple[str, ...] | None = None
+    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -463,10 +527,12 @@ class RecordingConfig(_Settings):
     Parts may be mappings, as in a file: `RecordingConfig(markers=[{"name": "tip", "fraction": 1}], …)`.
 
     Attributes:
-        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, rotation.
+        markers: bodies on the rod, from base to tip: name, topic, fraction of the length, its deviation,
+            rotation.
         tension: measured tensions, or None: topic, order of the tendons, unit (N or gf), held, names.
         motors: measured motor angles in place of tensions, or None: topic, order, unit, latency (s), names.
         command: commanded tensions, or None: as `tension`, with text and latency (s).
+        sensors: sensors beside motion capture: kind, columns or topic, fractions, unit, rotation.
         base: body that locates the clamped end, or None (`origin` locates it): topic, height above it (m).
         tensions: default choice of the tensions that drive the robot, "measured" or "commanded"; "none" for
             a recording of poses only.
@@ -495,10 +561,11 @@ class RecordingConfig(_Settings):
         RecordingError: a value is not allowed.
     """
 
-    markers: Annotated[tuple[MarkerSource, ...], _markers]
+    markers: Annotated[tuple[MarkerSource, ...], _markers] = ()
     tension: Annotated[TensionSource | None, _part(TensionSource)] = None
     motors: Annotated[MotorSource | None, _part(MotorSource)] = None
     command: Annotated[CommandSource | None, _part(CommandSource)] = None
+    sensors: Annotated[tuple[SensorSource, ...], _sensors] = ()
     base: Annotated[BaseSource | None, _part(BaseSource)] = None
     table: Annotated[TableSource | None, _part(TableSource)] = None
     columns: Annotated[ColumnMap | None, _part(ColumnMap)] = None
@@ -521,6 +588,8 @@ class RecordingConfig(_Settings):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        if not self.markers and not self.sensors:
+            raise _refused(self.markers, "markers", "a list of one marker or more, or sensors")
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":
@@ -541,9 +610,8 @@ class RecordingConfig(_Settings):
             words = f"{self.tendons} numbers (N), one of each tendon"
             numbers = _numbers(self.tendons, words)(self.initial_tension, "initial_tension")
             self._set("initial_tension", numbers)
-        topics = [
-            source.topic for source in (*self.markers, self.base, self.measured, self.command) if source
-        ]
+        sources = (*self.markers, *self.sensors, self.base, self.measured, self.command)
+        topics = [source.topic for source in sources if source]
         repeated = next((topic for topic in topics if topics.count(topic) > 1), None)
         if repeated is not None:
             raise RecordingError(f"the topic {repeated} is there twice; allowed is one use of each topic")
@@ -613,8 +681,8 @@ class RecordingConfig(_Settings):
         defaults = {field.name: _plain(field.default) for field in dataclasses.fields(self)}
         lines = [f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
-            if name == "markers":
-                lines += ["markers:", *(f"  - {flow(marker)}" for marker in value)]
+            if name in ("markers", "sensors"):
+                lines += [f"{name}:", *(f"  - {flow(source)}" for source in value)] if value else []
             elif name == "columns":
                 lines += ["columns:", *(f"  {flow(key)}: {flow(titles)}" for key, titles in value.items())]
             elif not brief or value != defaults[name]:
@@ -657,6 +725,8 @@ def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
     if isinstance(base, dict) or (base is None and "base" in dict(columns.bodies)):
         values["base"] = {"topic": "base"} | (base or {})
     bodies = [name for name, _ in columns.bodies if name != "base"]
+    if not bodies and values.get("sensors"):
+        return values
     if not values.get("markers") and len(bodies) != 1:
         raise RecordingError(
             f"markers is missing; required with the columns of {len(bodies)} bodies: "

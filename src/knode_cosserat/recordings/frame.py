@@ -73,6 +73,9 @@ def bodies_in_robot_frame(
     The input bodies have their recorded positions and orientations.
     """
     findings: list[Finding] = []
+    if not bodies:
+        rest = None if config.rest is None else (config.rest[0], config.rest[1])
+        return [], base, rest, findings
     upright = Rotation.from_rotvec(UP[config.up or "z"])
     turn = Rotation.from_quat(config.rotation, scalar_first=True) * upright
     scale = POSITION_UNITS[config.position_unit]
@@ -173,7 +176,7 @@ def rest_positions(
 ) -> Float[np.ndarray, "M 3"] | None:
     """Return the mean positions of the bodies at rest (m), or None if one of them is not seen at rest."""
     means = [body.position[rest_mask(body.time, rest)] for body in bodies]
-    if any(len(positions) == 0 for positions in means):
+    if not means or any(len(positions) == 0 for positions in means):
         return None
     return np.array([positions.mean(axis=0) for positions in means])
 

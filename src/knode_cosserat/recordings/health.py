@@ -117,6 +117,7 @@ class Health:
 def health_of(recording: Recording) -> Health:
     """Return the quality report of a recording."""
     streams = [_of_body(body, recording) for body in (*recording.bodies, recording.base) if body is not None]
+    streams += [_stream(it.topic, it.output.fields[0], it.time, recording) for it in recording.sensors]
     for what, tensions in (("measured tensions", recording.tension), ("commands", recording.command)):
         if tensions is not None:
             streams.append(_of_tensions(what, tensions, recording))

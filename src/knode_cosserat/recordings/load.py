@@ -91,6 +91,7 @@ def proposed_config(path: str | Path) -> tuple[RecordingConfig, tuple[str, ...]]
 
 def _roles(config: RecordingConfig) -> dict[Any, Role]:
     roles: dict[Any, Role] = dict.fromkeys((*config.markers, config.base), "pose")
+    roles |= dict.fromkeys(config.sensors, "sensor")
     roles |= {config.measured: "tension", config.command: "command"}
     return {source: role for source, role in roles.items() if source is not None}
 
@@ -182,6 +183,12 @@ def _assembled(
         bodies.append(body)
     if config.base:
         base = bodies.pop()
+    sensors = []
+    for sensor in config.sensors:
+        numbers_of = seconds[sensor.topic], values[sensor.topic]
+        cleaned, about_sensor = checks.cleaned_sensor(config, sensor, *numbers_of, path)
+        findings += about_sensor
+        sensors.append(cleaned)
     tension, commanded, about_tensions = checks.cleaned_tensions(config, seconds, values, path)
     bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
     at_rest = frame.rest_positions(bodies, rest)
@@ -201,4 +208,5 @@ def _assembled(
         simulated=config.simulated,
         findings=tuple(sorted(findings, key=lambda finding: SEVERITIES.index(finding.severity))),
         delays=streams.offsets(list(numbers.values())),
+        sensors=tuple(sensors),
     )

@@ -14,7 +14,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, Sensor, Tensions
 from knode_cosserat.recordings.table import HELD
 from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
@@ -55,16 +55,21 @@ class Measurements:
     static: bool = False
     #: True if the tensions are samples of a continuous signal: row i's is then that at the time of row i + 1
     continuous: bool = False
+    #: orientations, bending angles, curvatures or wrenches by other sensors, in the same rows
+    sensors: tuple[Sensor, ...] = ()
+    #: standard deviations of `fractions`, zero where they are known; others are identified
+    deviations: tuple[float, ...] = ()
 
     def __repr__(self) -> str:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
         kind = "equilibria" if self.static else "rows"
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
-        places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions)
+        places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions) or "none"
+        more = "".join(f"; {it.topic}" for it in self.sensors)
         return wrapped(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
             f"{count_of(self.tension.shape[-1], 'tendon')}; "
-            f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length; "
+            f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length{more}; "
             f"source: {self.source}"
         )
 
@@ -123,6 +128,8 @@ class Measurements:
         """
         path = Path(path)
         writer_of(path)
+        if self.sensors:
+            raise RecordingError(f"{path}: {self.sensors[0].topic} cannot be written; only poses can")
         is_table = path.suffix in (".csv", ".parquet")
         root = "" if is_table else "/"
         position = self.position
@@ -196,6 +203,10 @@ class Measurements:
         """Return the rows from index `first` to before index `last`."""
         names = ("time", "tension", "position", "quaternion", "measured")
         changes: dict[str, Any] = {name: getattr(self, name)[first:last] for name in names}
+        changes["sensors"] = tuple(
+            dataclasses.replace(it, time=it.time[first:last], values=it.values[first:last])
+            for it in self.sensors
+        )
         if first:
             changes["initial_tension"] = None
         return dataclasses.replace(self, **changes)

@@ -24,7 +24,7 @@ from knode_cosserat.recordings.config import PLACE, MotorSource, TensionSource
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.streams import OutgoingStream, Stream
 
-Role = Literal["pose", "tension", "command"]
+Role = Literal["pose", "sensor", "tension", "command"]
 #: stamp and recording time (ns), and the numbers
 _Row = tuple[int, int, Any]
 
@@ -130,6 +130,14 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     **{f"std_msgs/msg/{kind}": lambda m: (m.data,) for kind in ("Float64", "Float32", "Int16", "Int32")},
     JOINTS: lambda m: m.effort,
 }
+#: reader of the numbers of other sensors, by message type
+SENSORS: dict[str, Callable[[Any], Any]] = {
+    **{kind: lambda m, read=read: read(m)[3:] for kind, read in POSES.items()},  # type: ignore[misc]
+    "sensor_msgs/msg/Imu": lambda m: _wxyz(m.orientation),
+    "geometry_msgs/msg/QuaternionStamped": lambda m: _wxyz(m.quaternion),
+    "geometry_msgs/msg/WrenchStamped": lambda m: (*_xyz(m.wrench.force), *_xyz(m.wrench.torque)),
+    **{kind: read for kind, read in NUMBERS.items() if kind.endswith("MultiArray")},
+}
 #: line of a log that marks a recording of a simulated robot
 SIMULATED = "Simulated: the robot of this recording is a simulation, and not a physical one"
 #: reader of the text, by message type
@@ -181,6 +189,8 @@ def decoded(bag: Bag, source: Any, role: Role, path: str) -> Stream:
     topic, part = bag.topics[names[0]], topic_and_part(source.topic)[1]
     if role == "pose":
         stream = _poses(bag, topic, part, path)
+    elif role == "sensor":
+        stream = _simple(topic, SENSORS, role, path)
     elif role == "command" and source.text is not None:
         kinds = {kind: functools.partial(_spoken, read, source.text) for kind, read in TEXTS.items()}
         stream = _simple(topic, kinds, "command in text", path)

@@ -45,13 +45,15 @@ _TIME = re.compile(
     re.IGNORECASE,
 )
 _TENSION = re.compile(
-    r"tension|tendon|force|load|cell|effort|pull|cable|wire|zug|kraft|^[tf]$", re.IGNORECASE
+    r"tension|tendon|force|load|cell|effort|pull|cable|wire|current|zug|kraft|^[tfi]$", re.IGNORECASE
 )
-_COMMAND = re.compile(r"cmd|command|desired|target|ref|set|soll|goal", re.IGNORECASE)
-_MOTOR = re.compile(r"motor|phi|encoder|angle|servo", re.IGNORECASE)
+_COMMAND = re.compile(r"cmd|command|desired|target|ref|set|soll|goal|ctrl", re.IGNORECASE)
+_MOTOR = re.compile(r"motor|phi|encoder|angle|servo|present.?position", re.IGNORECASE)
+#: names of numbers of motors that are no tensions, or not all of them
+_CURRENT, _STATE = (re.compile(words, re.IGNORECASE) for words in ("current", "current|position|velocity"))
 #: beginnings of titles of turns, speeds and forces along x, y, z
 _NO_PLACE = re.compile(
-    r"(q|quat|quaternion|rot|rotation|orientation|vel|speed|acc|(^|[_ .])[vrawf])[_ .]?$", re.I
+    r"(q|quat|quaternion|rot|rotation|orientation|vel|speed|acc|(^|[_ .])[vrawfm])[_ .]?$", re.I
 )
 #: spellings of the parts of an orientation, scalar first
 _QUATERNIONS = (
@@ -60,6 +62,7 @@ _QUATERNIONS = (
         for stem in ("q", "r", "o", "quat_", "orientation.", "orientation_")
     ),
     ("q0", "q1", "q2", "q3"),
+    *(tuple(f"quat{open}{k}{close}" for k in range(4)) for open, close in (("_", ""), ("[", "]"), ("", ""))),
 )
 #: rows at the start that a body's place is estimated from
 _ROWS = 20
@@ -148,14 +151,14 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
             places = [titles.index(title) for title in position_titles(name, "m")]
             bodies.append(_Body(name, name, columns_of(table.numbers, places, path)))
         others = [title for title in titles if not re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)]
-        mapped, sources = _number_columns([title for title in others if title != TIME], remarks)
+        mapped, sources = _number_columns(table, [title for title in others if title != TIME], remarks)
         columns = ColumnMap.from_dict(mapped) if mapped else None
         return _config(bodies, sources | {"columns": columns, "up": table.up}, remarks)
     time = next((title for title in titles if _TIME.match(title)), None)
     others = [title for title in titles if title != time]
     bodies = _bodies(table, others, path)
     used = {title for body in bodies for title in body.titles}
-    mapped, sources = _number_columns([title for title in others if title not in used], remarks)
+    mapped, sources = _number_columns(table, [title for title in others if title not in used], remarks)
     if time is None:
         sources["table"] = TableSource(rate=100.0)
         remarks.append("no column looks like times: the rate of 100 Hz is a guess")
@@ -168,20 +171,20 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
 
 
 def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
-    """Return the bodies whose coordinates have titles that differ in x, y and z only."""
+    """Return the bodies whose coordinates have titles that differ in x, y and z, or 0, 1 and 2, only."""
     columns = list(map(str, table.numbers.columns))
     spelling = {title.lower(): title for title in reversed(titles)}
     bodies: dict[str, _Body] = {}
     for title in titles:
-        for match in re.finditer("x", title.lower()):
+        for match in re.finditer("x|(?<=pos[_ .[])0", title.lower()):
             before, after = title[: match.start()], title[match.end() :]
-            axes = [before + axis + after for axis in "xyz"]
+            axes = [before + axis + after for axis in ("xyz" if match[0] == "x" else "012")]
             axes = [spelling.get(axis.lower(), axis) for axis in axes]
             # the x of a quaternion, or of a speed, is not that of a position
             if not set(axes) <= set(titles) or _NO_PLACE.search(before):
                 continue
             name = re.sub(r"\[.*?\]|\(.*?\)", "", before + after)
-            name = re.sub(r"(^|[_ .-])(pos(ition)?|p|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE)
+            name = re.sub(r"(^|[_ .-])(x?pos(ition)?|p|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE)
             name = name.strip("_ .-") or "tip"
             if name not in bodies:
                 position = columns_of(table.numbers, [columns.index(axis) for axis in axes], path)
@@ -199,7 +202,7 @@ def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
 def _quaternion(before: str, titles: Sequence[str], number: int) -> tuple[str, ...]:
     """Return the titles of the orientation that belongs to a position, scalar first; empty without one."""
     lower = {title.lower(): title for title in titles}
-    stem = re.sub(r"(p|pos|position|t)?[_ .-]?$", "", before, flags=re.IGNORECASE)
+    stem = re.sub(r"(p|x?pos|position|t)?[_ .[-]?$", "", before, flags=re.IGNORECASE)
     for parts, joint in itertools.product(_QUATERNIONS, ("", "_", ".", " ", "-")):
         names = [f"{stem}{joint}{part}".lower() for part in parts]
         if all(name in lower for name in names) and (stem or number == 0):
@@ -207,31 +210,49 @@ def _quaternion(before: str, titles: Sequence[str], number: int) -> tuple[str, .
     return ()
 
 
-def _number_columns(titles: Sequence[str], remarks: list[str]) -> tuple[dict[str, list[str]], dict[str, Any]]:
+def _number_columns(
+    table: Table, titles: Sequence[str], remarks: list[str]
+) -> tuple[dict[str, list[str]], dict[str, Any]]:
     """Return columns whose names differ in a number, of tensions, commands and motors, and their sources."""
     families: dict[str, list[tuple[int, str]]] = {}
     for title in titles:
         if match := re.fullmatch(r"(\D*?)[_ .-]?(\d+)(\D.*)?", title):
-            families.setdefault(match[1], []).append((int(match[2]), title))
+            families.setdefault(match[1] + (match[3] or ""), []).append((int(match[2]), title))
     kinds = {"commands": _COMMAND, "tensions": _TENSION, "motors": _MOTOR}
     mapped: dict[str, list[str]] = {}
     for stem, numbered in families.items():
         kind = next((kind for kind, pattern in kinds.items() if pattern.search(stem)), None)
-        if kind:
+        # goals of motors are no tensions
+        if kind and not (kind == "commands" and _STATE.search(stem)):
             mapped.setdefault(kind, [title for _, title in sorted(numbered)])
+    is_current = _CURRENT.search(mapped.get("tensions", [""])[0])
+    if is_current and "motors" in mapped:
+        remarks.append(f"currents ({mapped.pop('tensions')[0]}, …) are not used beside positions of motors")
     if len(mapped) > 1:
         mapped.pop("motors", None)
     sources: dict[str, Any] = {}
     for kind, columns in mapped.items():
         remarks.append(f"{kind} are taken to be the columns {', '.join(columns)}, in this order")
         order = tuple(range(1, len(columns) + 1))
+        values = table.numbers[columns].to_numpy(dtype=float)
+        gain = None
+        whole = np.all(np.nan_to_num(values) % 1.0 == 0.0)
+        if kind == "motors" and whole and np.nanmax(np.abs(values)) > 360.0:
+            gain = 360.0 / 4096.0
+            remarks.append("positions of motors are taken to be ticks, 4096 in a turn (`gain`, in degrees)")
+        elif kind != "motors" and np.all(np.nan_to_num(values) <= 0.0):
+            gain = -1.0
+            remarks.append(f"{kind} are never positive: `gain` turns their sign")
+        elif kind == "tensions" and is_current:
+            gain = 1.0
+            remarks.append("tensions are currents: `gain` has to state the tension (N) of one unit")
         if kind == "tensions":
             gram = any(re.search(r"\[(gf|g)\]|\((gf|g)\)|_gf?$", title) for title in columns)
-            sources["tension"] = TensionSource(MAPPED[kind], order, "gf" if gram else "N")
+            sources["tension"] = TensionSource(MAPPED[kind], order, "gf" if gram else "N", gain=gain)
         elif kind == "commands":
-            sources["command"] = CommandSource(MAPPED[kind], order)
+            sources["command"] = CommandSource(MAPPED[kind], order, gain=gain)
         else:
-            sources["motors"] = MotorSource(MAPPED[kind], order, "deg")
+            sources["motors"] = MotorSource(MAPPED[kind], order, "deg", gain=gain)
     return mapped, sources
 
 

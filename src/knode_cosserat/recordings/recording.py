@@ -18,7 +18,7 @@ from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.streams import Body, Tensions, period
+from knode_cosserat.recordings.streams import Body, Sensor, Tensions, period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.health import Health
@@ -47,6 +47,7 @@ class Recording:
         simulated: True if the robot was itself a simulation; None: not stated.
         findings: errors and repairs, the gravest first.
         delays: median delay from stamp to recording (s) by topic; NaN without stamps.
+        sensors: sensors beside motion capture.
     """
 
     source: str
@@ -59,14 +60,16 @@ class Recording:
     simulated: bool | None
     findings: tuple[Finding, ...]
     delays: Mapping[str, float]
+    sensors: tuple[Sensor, ...] = ()
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
-        bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies)
+        bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies) or "none"
+        sensors = "".join(f"; {sensor.topic}" for sensor in self.sensors)
         streams = [name for name in ("tension", "command") if getattr(self, name) is not None]
         return wrapped(
             f"Recording ({origin}): {self.end:.4g} s; {count_of(self.tendons, 'tendon')} "
-            f"({', '.join(streams)}); bodies {bodies} of the length; "
+            f"({', '.join(streams)}); bodies {bodies} of the length{sensors}; "
             f"{count_of(len(self.findings), 'finding')}; source: {self.source}"
         )
 
@@ -76,10 +79,15 @@ class Recording:
         return self.config.tendons
 
     @property
+    def _times(self) -> list[Float[np.ndarray, " n"]]:
+        """Times of all bodies and sensors (s)."""
+        return [*(it.time for it in self.bodies), *(it.time for it in self.sensors)]
+
+    @property
     def end(self) -> float:
         """End of the first stream to end (s): until then all poses and tensions are known."""
         driver = self._driver(self.config.tensions)
-        ends = [body.time[-1] for body in self.bodies]
+        ends = [time[-1] for time in self._times]
         if driver is self.tension:
             ends.append(driver.time[-1] + (period(driver.time) if self._is_held(driver) else 0.0))
         # a command holds until the next
@@ -138,18 +146,30 @@ class Recording:
             known &= np.isfinite(until)
             held = np.where(known, _averaged(driver, begin, dt, straight), np.nan)
         poses = [_interpolated(body, time, bridged) for body in self.bodies]
+
+        def rows(part: int, *shape: int) -> np.ndarray:
+            # without bodies, too
+            return np.reshape([it[part] for it in poses], (len(poses), len(time), *shape)).swapaxes(0, 1)
+
         return Measurements(
             time=time,
             tension=held,
             fractions=np.array([body.fraction for body in self.bodies]),
-            position=np.stack([position for position, _, _ in poses], axis=1),
-            quaternion=np.stack([quaternion for _, quaternion, _ in poses], axis=1),
-            measured=np.stack([measured for _, _, measured in poses], axis=1),
+            position=rows(0, 3),
+            quaternion=rows(1, 4),
+            measured=rows(2).astype(bool),
             simulated=self.simulated,
             source=self.source,
             initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
             static=self.config.static,
             continuous=mean and not self.config.static and not self._is_held(driver),
+            sensors=tuple(
+                dataclasses.replace(
+                    it, time=time, values=_interpolated(Body(it.time, it.values), time, bridged)[0]
+                )
+                for it in self.sensors
+            ),
+            deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
         )
 
     def _initial_tension(self, driver: Tensions, at: float, longest: float) -> Float[np.ndarray, " c"] | None:
@@ -174,7 +194,7 @@ class Recording:
         if kind not in ("measured", "commanded", "none"):
             raise RecordingError(f"tensions is {kind!r}; allowed is measured, commanded or none")
         if kind == "none":
-            time = self.bodies[0].time
+            time = self._times[0]
             return Tensions(time, np.zeros((len(time), 0)))
         driver = self.tension if kind == "measured" else self.command
         if driver is None:
@@ -194,7 +214,7 @@ class Recording:
         start = start if start is not None else trim[0]
         if start is None:
             # a lost frame at the beginning does not delay the first row
-            first = max(body.time[0] for body in self.bodies) - self.config.longest_gap
+            first = max(known[0] for known in self._times) - self.config.longest_gap
             start = max(0.0, math.ceil(first / dt - _SAME) * dt) if dt > 0 else 0.0
         last = min([self.end, *(limit for limit in (end, trim[1]) if limit is not None)])
         if not (dt > 0.0 and math.isfinite(dt)):
@@ -248,7 +268,7 @@ def _interpolated(
 ) -> tuple[Float[np.ndarray, "T 3"], Float[np.ndarray, "T 4"], Bool[np.ndarray, " T"]]:
     """Return positions, orientations, and a mask of the rows that are not bridged."""
     seen = body.time
-    position, quaternion = np.full((len(time), 3), np.nan), np.full((len(time), 4), np.nan)
+    position, quaternion = (np.full((len(time), size), np.nan) for size in (body.position.shape[1], 4))
     limit = bridge(seen, longest)
     ends = [0, *(np.flatnonzero(np.diff(seen) > limit) + 1).tolist(), len(seen)]
     for first, last in itertools.pairwise(ends):
@@ -263,7 +283,7 @@ def _interpolated(
         position[inside] = CubicSpline(seen[piece], body.position[piece], bc_type="natural")(at)
         if body.quaternion is not None and len(at):
             turns = Slerp(seen[piece], Rotation.from_quat(body.quaternion[piece], scalar_first=True))
-            quaternion[inside] = _continuous(turns(at).as_quat(scalar_first=True))
+            quaternion[inside] = continuous(turns(at).as_quat(scalar_first=True))
     following = np.clip(np.searchsorted(seen, time - _SAME), 0, len(seen) - 1)
     exact = np.abs(seen[following] - time) <= _SAME
     near = seen[following] - seen[np.maximum(following - 1, 0)] <= 1.5 * period(seen) + _SAME
@@ -271,7 +291,7 @@ def _interpolated(
     return position, quaternion, measured & np.isfinite(position).all(axis=1)
 
 
-def _continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
+def continuous(quaternion: Float[np.ndarray, "T 4"]) -> Float[np.ndarray, "T 4"]:
     """Return the same rotations with the signs that are continuous from row to row."""
     flips = np.cumprod(np.where(np.sum(quaternion[1:] * quaternion[:-1], axis=1) < 0.0, -1.0, 1.0))
     sign = 1.0 if quaternion[0, 0] >= 0.0 else -1.0

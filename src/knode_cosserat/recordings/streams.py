@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat._reprs import count_of
+from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, counted
 
@@ -74,6 +75,19 @@ class Body:
 
     def __repr__(self) -> str:
         return f"Body {self.name} at {self.fraction:.4g} of the length: {count_of(len(self.time), 'pose')}"
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Sensor:
+    """Sensor beside motion capture: times (s), values in SI units (NaN: none), and the output it measures."""
+
+    time: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, "n p"]
+    output: Output
+    topic: str
+
+    def __repr__(self) -> str:
+        return f"Sensor {self.topic}: {count_of(len(self.time), 'row')}"
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

@@ -242,6 +242,10 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> 
             usual = position or position_titles(topic, config.position_unit)
             usual = usual + (quaternion if quaternion[0] in columns else [])
             titles[topic] = list(dict(mapped.bodies).get(topic, usual))
+    for sensor in config.sensors:
+        if sensor.columns is None:
+            raise RecordingError(f"{path}: the columns of the sensor {sensor.topic} are missing; name them")
+        titles[sensor.topic] = list(sensor.columns)
     for tendons, named in zip(
         (config.tension, config.motors, config.command),
         (mapped.tensions, mapped.motors, mapped.commands),

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.config import (
     POSITION_UNITS,
     CommandSource,
@@ -94,6 +93,6 @@ def writer_of(path: Path) -> Any:
 
 def sent_tensions(source: TensionSource, newtons: Any) -> Any:
     """Return tensions (N), shape (n, tendons), in the unit and the order of a source's messages."""
-    sent = np.asarray(newtons)[:, np.array(source.order) - 1] / TENSION_UNITS[source.unit]
+    sent = np.asarray(newtons)[:, np.array(source.order) - 1] / source.factor
     in_text = isinstance(source, CommandSource) and source.text is not None
     return np.round(sent) if in_text and source.unit == "gf" else sent

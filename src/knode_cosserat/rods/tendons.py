@@ -48,7 +48,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, parameter, place, places
-from knode_cosserat.rods.parts import Contribution, Part, RodPoint
+from knode_cosserat.rods.parts import Contribution, Effect, Part, RodPoint
 from knode_cosserat.rods.routing import path_lengths
 from knode_cosserat.rods.tendon_law import Tendons, stretches
 from knode_cosserat.rods.wrapped import nominal_model
@@ -136,6 +136,20 @@ class Reels(Part):
         sides = jnp.where(jnp.abs(motors)[:, None] == numbers, jnp.sign(motors)[:, None], 0.0)
         taken_in = jnp.sum(sides * turned, axis=1)
         return taken_in if self.taken_in is None else taken_in + jnp.asarray(self.taken_in)
+
+
+class Markers(Effect):
+    """Identified places of tracked bodies; they do not change the motion."""
+
+    kind: ClassVar[str] = "markers"
+
+    at: Any = parameter("", "places as parts of the length", shape="list", low=0.0, high=1.0)
+    stated: tuple[float, ...] | None = places("places in the recordings")
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        if np.size(self.at) != len(self.stated or ()):
+            raise ParameterError("markers have not as many places `at` as `stated`; allowed is one for each")
 
 
 class LoadCells(Part):

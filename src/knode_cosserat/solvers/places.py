@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -11,6 +12,8 @@ from jaxtyping import Float, Int
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendons import Markers
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
 
 
@@ -21,11 +24,22 @@ class Places(NamedTuple):
     part: Float[Any, " M"]
 
 
-def places_at(fractions: Float[np.ndarray, " M"], nodes: int) -> Places:
+def places_at(fractions: Float[Any, " M"], nodes: int) -> Places:
     """Return the places at fractions of the rod's length; fractions are clipped to [0, 1]."""
-    along = np.clip(fractions, 0.0, 1.0) * (nodes - 1)
-    node = np.clip(np.ceil(along - 1e-9).astype(int) - 1, 0, nodes - 2)
+    xp: Any = np if isinstance(fractions, np.ndarray) else jnp
+    along = xp.clip(fractions, 0.0, 1.0) * (nodes - 1)
+    node = xp.clip(xp.ceil(along - 1e-9).astype(int) - 1, 0, nodes - 2)
     return Places(node, along - node)
+
+
+def places_on(robot: System, fractions: Iterable[float]) -> Places:
+    """Return the places of bodies on a robot: identified ones (`Markers`) in place of stated ones."""
+    known: dict[float, Any] = {}
+    for part in getattr(nominal_model(robot), "effects", ()):
+        if isinstance(part, Markers):
+            known |= zip(part.stated or (), part.at, strict=True)
+    along = [known.get(float(it), it) for it in fractions]
+    return places_at(jnp.stack(along) if known else np.array(along), robot.nodes)
 
 
 def positions_at(
