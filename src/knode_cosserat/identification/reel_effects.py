@@ -15,6 +15,7 @@ import numpy as np
 from knode_cosserat.estimation.parameters import Effect, Number, Replace
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.routing import Straight
+from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rods.tendons import Reels
 
@@ -72,6 +73,12 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
             _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
         ),
     ]  # fmt: skip
+    if len(levels) > 1:
+        effects.append(Effect(
+            "stiffness by section", "stiffness of the sections between the tendons' ends over the first one's",
+            tuple(Number(f"stiffness to {end:g} L", "", 1.0, 0.3, 0.01, 100.0, True) for end in levels[1:]),
+            _with_stiffness, _BySection(tuple(levels.tolist())),
+        ))  # fmt: skip
     if radii is not None:
         single = tuple(
             Number(f"reels.radius[{k}]", "m", float(at), 0.05, 1e-6, 1.0, True) for k, at in enumerate(radii)
@@ -131,6 +138,24 @@ class _ByLevel:
     def __call__(self, robot: Any, values: list[Any]) -> Any:
         """Return the robot with these values."""
         return robot.replace(**{self.parameter: jnp.stack([values[k] for k in self.level_of])})
+
+
+@dataclasses.dataclass(frozen=True)
+class _BySection:
+    """Divides the rod where tendons end; the last section extends to the tip."""
+
+    levels: tuple[float, ...]
+
+    def __call__(self, robot: Any) -> Any:
+        """Return the robot with a section for each level after the first, before all others."""
+        ends = (*self.levels[1:-1], 1.0)
+        sections = [Stretch(begin, end) for begin, end in zip(self.levels, ends, strict=False)]
+        return robot.replace(sections=(*sections, *robot.sections))
+
+
+def _with_stiffness(robot: Any, values: list[Any]) -> Any:
+    factors = {f"sections.{k}.stiffness": jnp.stack([value]) for k, value in enumerate(values)}
+    return robot.replace(**factors)
 
 
 def _with_axial_stiffness(robot: Any, values: list[Any]) -> Any:
