@@ -15,7 +15,6 @@ import numpy as np
 from knode_cosserat.estimation.parameters import Effect, Number, Replace
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.routing import Straight
-from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rods.tendons import Reels
 
@@ -69,16 +68,18 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         ),
         Effect(
             "springs", "compliance of the springs in series with tendons, by where these end",
-            tuple(_spring(end, float(np.mean(compliance[ends == end])), nominal) for end in levels),
+            tuple(
+                _spring(f"compliance to {end:g} L", float(np.mean(compliance[ends == end])), nominal)
+                for end in levels
+            ),
             _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
         ),
+        Effect(
+            "tendon elasticity", "compliance of all tendons",
+            (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),),
+            Replace(("tendon_compliance",)),
+        ),
     ]  # fmt: skip
-    if len(levels) > 1:
-        effects.append(Effect(
-            "stiffness by section", "stiffness of the sections between the tendons' ends over the first one's",
-            tuple(Number(f"stiffness to {end:g} L", "", 1.0, 0.3, 0.01, 100.0, True) for end in levels[1:]),
-            _with_stiffness, _BySection(tuple(levels.tolist())),
-        ))  # fmt: skip
     if radii is not None:
         single = tuple(
             Number(f"reels.radius[{k}]", "m", float(at), 0.05, 1e-6, 1.0, True) for k, at in enumerate(radii)
@@ -140,24 +141,6 @@ class _ByLevel:
         return robot.replace(**{self.parameter: jnp.stack([values[k] for k in self.level_of])})
 
 
-@dataclasses.dataclass(frozen=True)
-class _BySection:
-    """Divides the rod where tendons end; the last section extends to the tip."""
-
-    levels: tuple[float, ...]
-
-    def __call__(self, robot: Any) -> Any:
-        """Return the robot with a section for each level after the first, before all others."""
-        ends = (*self.levels[1:-1], 1.0)
-        sections = [Stretch(begin, end) for begin, end in zip(self.levels, ends, strict=False)]
-        return robot.replace(sections=(*sections, *robot.sections))
-
-
-def _with_stiffness(robot: Any, values: list[Any]) -> Any:
-    factors = {f"sections.{k}.stiffness": jnp.stack([value]) for k, value in enumerate(values)}
-    return robot.replace(**factors)
-
-
 def _with_axial_stiffness(robot: Any, values: list[Any]) -> Any:
     return robot.replace(shear_stiffness=robot.Kse * values[0])
 
@@ -176,9 +159,8 @@ def _with_part(name: str, value: Any) -> Any:
     return added
 
 
-def _spring(end: float, stated: float, robot: RoutedTendonRobot) -> Number:
+def _spring(label: str, stated: float, robot: RoutedTendonRobot) -> Number:
     """Return the compliance of springs; beside a usual one the rod bends by as much again."""
-    label = f"compliance to {end:g} L"
     if stated:
         return Number(label, "m/N", stated, 0.7, 0.0, 1.0, True)
     offset = float(np.mean([np.linalg.norm([float(at) for at in it.at(0.0)]) for it in robot.routings]))
