@@ -1,7 +1,7 @@
 """The files of the real robots: they load, fit together, and predict measurements that were not used."""
 
 import dataclasses
-import importlib.util
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -78,23 +78,17 @@ def test_three_cables_are_predicted():
 LIMIT = 2.3e-3
 
 
-def motor_order():
-    spec = importlib.util.spec_from_file_location("motor_order", SERVOS / "motor_order.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module.motor_order
-
-
 def test_the_order_of_servos_is_found():
     """Servos in another order, one of them wound the other way, from pulls of one tendon at a time."""
     robot, config = kc.load_robot(SERVOS / "nominal.yaml"), RecordingConfig.load(SERVOS / "recording.yaml")
     seen = kc.load_recording(SERVOS / "tendon_pull.csv", config).sampled()
     order, sides = np.array([4, 0, 8, 2, 6, 1, 3, 7, 5]), np.array([1, 1, -1, 1, 1, 1, 1, 1, 1])
     changed = dataclasses.replace(seen, tension=sides * seen.tension[:, order])
-    found = motor_order()(robot, changed)
+    motor_order = runpy.run_path(str(SERVOS / "motor_order.py"))["motor_order"]
+    found = motor_order(robot, changed)
     assert np.array_equal(found.tendons, sides * (order + 1))
     assert abs(found.turn) < np.radians(15.0)
     with pytest.raises(ValueError, match="motor 1 never moves alone"):
-        motor_order()(robot, changed.rows(40, 60))
+        motor_order(robot, changed.rows(40, 60))
     with pytest.raises(ValueError, match="2 motors; the robot has 9"):
-        motor_order()(robot, dataclasses.replace(seen, tension=seen.tension[:, :2]))
+        motor_order(robot, dataclasses.replace(seen, tension=seen.tension[:, :2]))
