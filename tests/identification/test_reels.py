@@ -107,7 +107,7 @@ SERVOS = kc.robots.RoutedTendonRobot(
 
 @pytest.mark.campaign
 def test_a_servo_robot_is_found_from_the_tip():
-    """Elastic tendons, some slack, wrong zeros, a displaced base: lengths determine stiffness × compliance."""
+    """Elastic tendons, slack, wrong zeros, a displaced base: lengths determine stiffness × compliance."""
     compliance = 6e-5
     true = SERVOS.replace(
         reels=Reels(motors=(1, 2, 3, 4, 5, 6), zero=(2e-4, -3e-4, 1e-4, -2e-4, 3e-4, -1e-4)),
