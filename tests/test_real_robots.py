@@ -1,6 +1,7 @@
 """The files of the real robots: they load, fit together, and predict measurements that were not used."""
 
 import dataclasses
+import runpy
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +12,7 @@ from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import RecordingConfig
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
-TRUNK, CABLES = EXAMPLES / "asl_trunk", EXAMPLES / "three_cables"
+TRUNK, CABLES, SERVOS = (EXAMPLES / name for name in ("asl_trunk", "three_cables", "servo_robot"))
 
 
 def trunk(name="identified_11"):
@@ -75,3 +76,19 @@ def test_three_cables_are_predicted():
 
 #: m, the figure of docs/real-robots.md and a little
 LIMIT = 2.3e-3
+
+
+def test_the_order_of_servos_is_found():
+    """Servos in another order, one of them wound the other way, from pulls of one tendon at a time."""
+    robot, config = kc.load_robot(SERVOS / "nominal.yaml"), RecordingConfig.load(SERVOS / "recording.yaml")
+    seen = kc.load_recording(SERVOS / "tendon_pull.csv", config).sampled()
+    order, sides = np.array([4, 0, 8, 2, 6, 1, 3, 7, 5]), np.array([1, 1, -1, 1, 1, 1, 1, 1, 1])
+    changed = dataclasses.replace(seen, tension=sides * seen.tension[:, order])
+    motor_order = runpy.run_path(str(SERVOS / "motor_order.py"))["motor_order"]
+    found = motor_order(robot, changed)
+    assert np.array_equal(found.tendons, sides * (order + 1))
+    assert abs(found.turn) < np.radians(15.0)
+    with pytest.raises(ValueError, match="motor 1 never moves alone"):
+        motor_order(robot, changed.rows(40, 60))
+    with pytest.raises(ValueError, match="2 motors; the robot has 9"):
+        motor_order(robot, dataclasses.replace(seen, tension=seen.tension[:, :2]))

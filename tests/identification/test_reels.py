@@ -92,3 +92,34 @@ def test_a_robot_is_found_from_equilibria():
     assert before > 2e-3 and after < 2e-4
     by_label = {each.label: each.value for each in found.estimates}
     assert by_label["length"] == pytest.approx(0.125, rel=0.01)
+
+
+#: two sections of steel, three tendons each, with a servo for each tendon; controls are lengths
+SERVOS = kc.robots.RoutedTendonRobot(
+    length=0.2, radius=5e-4, density=7850.0, youngs_modulus=2e11, nodes=7, drive="reel",
+    reels=Reels(motors=(1, 2, 3, 4, 5, 6)),
+    routing=tuple(
+        Straight(4.5e-3 * np.cos(angle), 4.5e-3 * np.sin(angle), end=end)
+        for end, turn in ((0.5, 0.0), (1.0, np.pi / 6)) for angle in turn + 2 * np.pi / 3 * np.arange(3)
+    ),
+)  # fmt: skip
+
+
+@pytest.mark.campaign
+def test_a_servo_robot_is_found_from_the_tip():
+    """Elastic tendons, slack, wrong zeros, a displaced base: lengths determine stiffness × compliance."""
+    compliance = 6e-5
+    true = SERVOS.replace(
+        reels=Reels(motors=(1, 2, 3, 4, 5, 6), zero=(2e-4, -3e-4, 1e-4, -2e-4, 3e-4, -1e-4)),
+        tendon_compliance=compliance,
+        base_end=kc.robots.ends.Clamped(position=(2e-3, -1e-3, 0.0), orientation=(1.0, 0.0, 0.0, 0.0)),
+    )  # fmt: skip
+    control = 3e-3 * np.random.default_rng(2).uniform(-1.0, 1.0, size=(80, 6))
+    seen = equilibria(true, control, 5e-4)
+    found = kc.identify(SERVOS, [seen.rows(0, 50)], ["base position", "motor zeros", "tendon elasticity"])
+    before, after = (evaluate(robot, seen.rows(50, 80)).tip_rmse for robot in (SERVOS, found.robot))
+    assert before > 5e-3 and after < 1.2e-3  # noise 0.9 mm
+    modulus = found["youngs_modulus"]
+    assert modulus.held and modulus.value == pytest.approx(2e11, rel=0.5)
+    product = found["tendon_compliance"].value * modulus.value / 2e11
+    assert product == pytest.approx(compliance, rel=0.1)

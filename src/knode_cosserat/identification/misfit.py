@@ -183,9 +183,12 @@ class Misfit:
         compared = slice(data.steps - 1, steps, data.steps)
         records = np.concatenate([start.record[None], solved_rows.records[compared, :, :size]])
 
-        def every(rows: np.ndarray) -> np.ndarray:
-            """Fill to all rows: one compiled program serves all horizons."""
-            return np.concatenate([rows, np.repeat(rows[-1:], len(data.data) - len(rows), axis=0)])
+        # outputs of few numbers of rows: few compiled programs serve all horizons
+        count = min(size for size in _sizes(len(data.data)) if size >= len(records))
+        seen_data = data.data[:count]
+
+        def filled(rows: np.ndarray) -> np.ndarray:
+            return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
 
         noise, stages = data.noise, 1 if data.static else data.settings.stages
 
@@ -213,10 +216,12 @@ class Misfit:
             # zeros in all other columns: one compiled program serves any coordinates
             whole = np.zeros((*records.shape, len(x)))
             whole[..., which] = np.concatenate([d_first[None, :, :size], d_records])
-            _, slopes = errors_along(system, data.output, every(records), every(whole), data.data, directions)
+            _, slopes = errors_along(
+                system, data.output, filled(records), filled(whole), seen_data, directions
+            )
             return np.asarray(slopes)[which, : len(records)] / noise
 
-        errors = np.asarray(errors_of(system, data.output, every(records), data.data))
+        errors = np.asarray(errors_of(system, data.output, filled(records), seen_data))
         return Rollout(errors[: len(records)] / noise, tangents)
 
     def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
@@ -260,6 +265,11 @@ class Misfit:
             return np.asarray(d_record) @ weights, begun, tuple(np.asarray(part) @ weights for part in d_past)
 
         return _Start(record, past, np.asarray(at_start.control), known, at_start.state.dt is None, tangents)
+
+
+def _sizes(rows: int) -> list[int]:
+    """Return all rows, a quarter of them, and a sixteenth."""
+    return [rows, -(-rows // 4), -(-rows // 16)]
 
 
 def _cells(system: Any) -> LoadCells | None:

@@ -68,8 +68,16 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         ),
         Effect(
             "springs", "compliance of the springs in series with tendons, by where these end",
-            tuple(_spring(end, float(np.mean(compliance[ends == end])), nominal) for end in levels),
+            tuple(
+                _spring(f"compliance to {end:g} L", float(np.mean(compliance[ends == end])), nominal)
+                for end in levels
+            ),
             _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
+        ),
+        Effect(
+            "tendon elasticity", "compliance of all tendons",
+            (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),),
+            Replace(("tendon_compliance",)),
         ),
     ]  # fmt: skip
     if radii is not None:
@@ -151,9 +159,8 @@ def _with_part(name: str, value: Any) -> Any:
     return added
 
 
-def _spring(end: float, stated: float, robot: RoutedTendonRobot) -> Number:
+def _spring(label: str, stated: float, robot: RoutedTendonRobot) -> Number:
     """Return the compliance of springs; beside a usual one the rod bends by as much again."""
-    label = f"compliance to {end:g} L"
     if stated:
         return Number(label, "m/N", stated, 0.7, 0.0, 1.0, True)
     offset = float(np.mean([np.linalg.norm([float(at) for at in it.at(0.0)]) for it in robot.routings]))

@@ -303,7 +303,9 @@ class _Descent:
         self.begin, self.low, self.high = self.x, search.low[free], search.high[free]
         self.units, self.thinned = search.units(self.sizes, self.subset.which), np.sqrt(search.thinned())
         self.known = [np.isfinite(rollout.values) for rollout in self.rollouts]
+        #: the last rollouts, and those of least cost, with their coordinates
         self.last: tuple[bytes, list[Rollout] | None] = (self.x[free].tobytes(), self.rollouts)
+        self.best, self.least = self.last, np.inf
         self.prior, self.offsets = np.sqrt(search.prior[free]), [it.offset for it in self.rollouts]
 
     def run(self, most: int, fall: float) -> tuple[int, bool]:
@@ -345,6 +347,8 @@ class _Descent:
     def _at(self, step: np.ndarray) -> list[Rollout] | None:
         x = self._whole(step)
         key = x[self.free].tobytes()
+        if self.best[0] == key:
+            self.last = self.best
         if self.last[0] != key:
             self.last = key, self.search.solved(x, self.subset, self.offsets)
         return self.last[1]
@@ -356,7 +360,10 @@ class _Descent:
             return np.full(sum(int(known.sum()) for known in self.known) + len(self.prior), np.inf)
         scaled = self._scaled(rollouts)
         roots = np.sign(scaled) * np.sqrt(huber(scaled)[0]) / self.thinned
-        return np.concatenate([roots, self.prior * self._whole(step)[self.free]])
+        found = np.concatenate([roots, self.prior * self._whole(step)[self.free]])
+        if found @ found < self.least:
+            self.best, self.least = self.last, float(found @ found)
+        return found
 
     def slopes(self, step: np.ndarray) -> np.ndarray:
         """Return the derivatives of the values."""
