@@ -27,8 +27,8 @@ def measured(robot, true_tension, source, *, seed=0, noise=NOISE, reading=None, 
     `reading` makes load cells' readings of tensions; bodies are mounted anyhow if `turned`.
     """
     rng = np.random.default_rng(seed)
-    still = kc.equilibrium(robot, true_tension[0])
-    moved = kc.simulate(robot, true_tension, DT, initial=still)
+    still = kc.equilibrium(robot, true_tension[0], space="lobatto4")
+    moved = kc.simulate(robot, true_tension, DT, initial=still, space="lobatto4")
     nodes = np.round(FRACTIONS * (robot.nodes - 1)).astype(int)
     position = np.asarray(moved.position)[:, nodes]
     quaternion = np.array(np.asarray(moved.quaternion)[:, nodes])

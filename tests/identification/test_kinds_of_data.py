@@ -31,7 +31,8 @@ NOMINAL = ROBOT.replace(youngs_modulus=2.2e9, bending_damping=4e-3)
 def motion():
     sine = kc.controls.sine(0.8, 35, DT, base=4.0, amplitude=2.5)
     pulled = np.concatenate([np.full((5, 4), 4.0), sine])
-    return kc.simulate(TRUE, pulled, DT, initial=kc.equilibrium(TRUE, pulled[0]))
+    start = kc.equilibrium(TRUE, pulled[0], space="lobatto4")
+    return kc.simulate(TRUE, pulled, DT, initial=start, space="lobatto4")
 
 
 def sensed(motion, fractions, outputs):

@@ -305,7 +305,7 @@ class _Descent:
         self.known = [np.isfinite(rollout.values) for rollout in self.rollouts]
         #: the last rollouts, and those of least cost, with their coordinates
         self.last: tuple[bytes, list[Rollout] | None] = (self.x[free].tobytes(), self.rollouts)
-        self.best, self.least = self.last, np.inf
+        self.best, self.lowest = self.last, np.inf
         self.prior, self.offsets = np.sqrt(search.prior[free]), [it.offset for it in self.rollouts]
 
     def run(self, most: int, fall: float) -> tuple[int, bool]:
@@ -361,8 +361,8 @@ class _Descent:
         scaled = self._scaled(rollouts)
         roots = np.sign(scaled) * np.sqrt(huber(scaled)[0]) / self.thinned
         found = np.concatenate([roots, self.prior * self._whole(step)[self.free]])
-        if found @ found < self.least:
-            self.best, self.least = self.last, float(found @ found)
+        if found @ found < self.lowest:
+            self.best, self.lowest = (self.last[0], rollouts), float(found @ found)
         return found
 
     def slopes(self, step: np.ndarray) -> np.ndarray:
