@@ -25,7 +25,7 @@ from knode_cosserat.solvers.places import Places, places_at, positions_at
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: time from row to row of recordings (s)
@@ -56,6 +56,8 @@ class Experiment:
         continuous: true if controls are samples of a continuous signal.
         steps: time steps from row to row.
         readings: true if controls are what load cells read, with their latency.
+        accurate: the same with an accurate scheme and steps; its differences count, and this experiment's
+            are for derivatives only.
     """
 
     dt: float
@@ -71,6 +73,7 @@ class Experiment:
     continuous: bool = False
     steps: int = 1
     readings: bool = False
+    accurate: Experiment | None = None
 
     @functools.cached_property
     def fields(self) -> tuple[str, ...]:
@@ -95,6 +98,11 @@ class Experiment:
     def is_resolved(self) -> bool:
         """True if time steps follow a continuous signal, so that shorter ones are nearer to the robot."""
         return not self.static and is_resolved(self.dt, self.continuous)
+
+    def rough(self) -> Experiment:
+        """Return it with the cheaper scheme along the rod and one step from row to row, for derivatives."""
+        settings = dataclasses.replace(self.settings, space=LOBATTO2)
+        return self.replace(settings=settings, steps=1, accurate=self)
 
     def replace(self, **changes: Any) -> Experiment:
         """Return a copy with changed attributes."""

@@ -128,28 +128,25 @@ def identify(
 
     def searched(robot: Any) -> Search:
         model = library_model(robot, tension, measured[0].fractions, plain)
-        return Search(Misfit(model, experiments_of(measured, model, space)), tell, journal=journal)
+        data = [it.rough() for it in experiments_of(measured, model, space)]
+        return Search(Misfit(model, data), tell, journal=journal)
 
-    search = far = searched(robot)
+    search = searched(robot)
     model = search.misfit.model
-    if any(it.steps > 1 for it in search.misfit.data):
-        # a begin need not be accurate
-        rough = [it.replace(steps=1) for it in experiments_of(measured, model, "lobatto2")]
-        far = Search(Misfit(model, rough), tell, journal=journal)
     try:
-        names, steps = tuple[str, ...](), tuple[str, ...]()
+        names, steps = model.names, tuple[str, ...]()
         if effects is not None:
             names = _known([*effects, *(effect.name for effect in plain)], model)
-            point = far.from_far(model.mask(names))
+            point = search.from_far(model.mask(names))
         else:
-            point = from_far(far, tell)
-        for _ in range(REFINEMENTS + 1):
+            point = from_far(search, tell)
+        for refinements in range(REFINEMENTS + 1):
             if effects is None:
                 names, point, more = selected(search, point, tell)
                 steps += more
-            elif search is not far:
+            elif refinements:
                 point = search.run(point.x, model.mask(names))
-            if not has_coarse_rows(model.reduced(point.x, names), search.misfit.data, space):
+            if not has_coarse_rows(search.misfit.system(point.x), search.misfit.data, space):
                 break
             nodes = 2 * model.nominal.nodes
             steps += (f"{nodes} nodes, for the grid was too coarse",)
@@ -270,8 +267,8 @@ def _accepted(
     names, point, steps = selection.names, selection.point, list(selection.steps)
     while True:
         x, kept = _averaged(search, names, point, posterior)
-        robot = model.reduced(x, kept)
-        reason = failed_trial(robot, data, space)
+        whole = search.misfit.system(x)
+        reason = failed_trial(whole, data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
@@ -298,7 +295,7 @@ def _accepted(
         if np.mean(unseen) >= np.mean(before):
             reason = "the nominal robot is returned: it predicts held-out recordings as well"
             return _nominal(search, (*steps, reason))
-    robot = robot.replace(trained=trained_range(robot, data, space))
+    robot = model.reduced(x, kept).replace(trained=trained_range(whole, data, space))
     result = _result(search, robot, x, estimates_of(point, posterior, x, folds), posterior, steps)
     return dataclasses.replace(
         result,

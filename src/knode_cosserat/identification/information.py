@@ -33,17 +33,21 @@ def huber(values: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray]:
     return np.where(size <= ROBUST, values**2, 2.0 * ROBUST * size - ROBUST**2), weights
 
 
-def normal_equations(rollouts: Sequence[Rollout], units: Sequence[np.ndarray], thinned: float) -> Problem:
+def normal_equations(
+    rollouts: Sequence[Rollout], units: Sequence[np.ndarray], thinned: float, which: Bool[np.ndarray, " n"]
+) -> Problem:
     """Return the normal equations of each rollout; a difference counts 1 / `thinned`.
 
-    `units` are sizes (e,) of the differences of each rollout.
+    `units` are sizes (e,) of the differences of each rollout. Equations of coordinates that are not among
+    `which` are zero.
     """
     parts = []
     for rollout, unit in zip(rollouts, units, strict=True):
         scaled = rollout.values / unit
         known = np.isfinite(scaled)
         cost, weights = huber(scaled[known])
-        slopes = (rollout.derivatives / unit)[:, known]
+        slopes = np.zeros((len(which), int(known.sum())))
+        slopes[which] = (rollout.derivatives_by(which) / unit)[:, known]
         weighted = slopes * weights
         sums = cost.sum(), known.sum(), weighted @ scaled[known], weighted @ slopes.T
         parts.append([part / thinned for part in sums])
@@ -77,7 +81,7 @@ def dispersion(
         weights = np.sqrt(huber(off)[1])
         off, slopes = (
             off * weights,
-            np.where(known, rollout.derivatives[free][:, ::stride] / unit, 0.0) * weights,
+            np.where(known, rollout.derivatives_by(free)[:, ::stride] / unit, 0.0) * weights,
         )
         information += np.einsum("iae,jae->ij", slopes, slopes) * stride
         sizes, components = np.linalg.eigh(off.T @ off)

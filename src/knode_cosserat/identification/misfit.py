@@ -101,6 +101,10 @@ class Misfit:
         directions, _ = _directions(model.robot, np.where(model.begin == 0.0, 0.1, model.begin))
         self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
 
+    def system(self, x: Float[np.ndarray, " n"]) -> Any:
+        """Return the robot at a point, with all effects: one machine code serves all points."""
+        return jax.tree.map(with_moving, _system(self.model.robot, np.asarray(x, dtype=float)), self._moving)
+
     def differences(
         self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None,
         offsets: Sequence[Any] | None = None,
@@ -121,21 +125,28 @@ class Misfit:
     def refined(
         self, rollouts: Sequence[Rollout], x: Float[np.ndarray, " n"], which: Sequence[int] | None = None
     ) -> list[Rollout]:
-        """Return whole rollouts at a point with the differences of infinitely short steps, as an offset.
+        """Return whole rollouts at a point with the differences of the accurate experiments, as an offset.
 
-        It is extrapolated from half the steps (Richardson), for schemes of order two. Derivatives are those
-        of the longer steps. Rollouts with held controls, which belong to one scheme, have no offset.
+        Between continuous controls these are extrapolated from half the steps (Richardson), for schemes of
+        order two. Derivatives are not refined. Held controls belong to the steps of their scheme.
         """
 
-        def finer(data: Experiment) -> Rollout | None:
-            if not data.is_resolved:
-                return None
-            return self._of_one(np.asarray(x, dtype=float), data.replace(steps=2 * data.steps), None)
+        def accurate(pair: tuple[Experiment, Rollout]) -> np.ndarray | None:
+            data, rollout = pair
+            target = data if data.accurate is None else data.accurate
+            found: Any = rollout.values - rollout.offset
+            if data.accurate is not None:
+                solved = self._of_one(np.asarray(x, dtype=float), target, None)
+                found = None if solved is None else solved.values
+            if found is None or not target.is_resolved:
+                return found
+            finer = self._of_one(np.asarray(x, dtype=float), target.replace(steps=2 * target.steps), None)
+            return None if finer is None else (4.0 * finer.values - found) / 3.0
 
-        found = self._parallel(finer, self._chosen(which))
+        found = self._parallel(accurate, list(zip(self._chosen(which), rollouts, strict=True)))
         return [
-            each if other is None else each.moved(4.0 / 3.0 * (other.values - each.values + each.offset))
-            for each, other in zip(rollouts, found, strict=True)
+            each if values is None else each.moved(values - each.values + each.offset)
+            for each, values in zip(rollouts, found, strict=True)
         ]
 
     def whole(self, x: Float[np.ndarray, " n"], which: Sequence[int] | None = None) -> list[Rollout | None]:
@@ -166,7 +177,7 @@ class Misfit:
     def _of_one(self, x: np.ndarray, data: Experiment, rows: int | None) -> Rollout | None:
         seen = len(data.control) if rows is None else min(len(data.control), data.moves + rows)
         steps = seen * data.steps
-        system = jax.tree.map(with_moving, _system(self.model.robot, x), self._moving)
+        system = self.system(x)
         start = self._start(system, x, data)
         if start is None:
             return None

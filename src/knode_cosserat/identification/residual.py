@@ -152,7 +152,9 @@ def learn_residual(
         raise SearchError("the identified robot cannot be simulated")
     misfit.differentiated(rollouts)
     scale = search.scales_of(rollouts)
-    problem = normal_equations(rollouts, search.units(scale), search.thinned())
+    problem = normal_equations(
+        rollouts, search.units(scale), search.thinned(), np.ones(model.size, dtype=bool)
+    )
     identified = [name for name in model.names if not name.startswith(RESIDUAL)]
     point = Point(begin, scale, problem, model.mask(identified), search.prior)
     widths = promising(problem, begin, model)

@@ -153,8 +153,12 @@ class Search:
         bodies = max(1.0, len(getattr(data.output, "fractions", ())) / BODIES)
         return max(1.0, CORRELATED / data.dt) * bodies
 
-    def from_far(self, free: Bool[np.ndarray, " n"], skipped: int = 0) -> Point:
+    def from_far(
+        self, free: Bool[np.ndarray, " n"], skipped: int = 0, effort: tuple[int, float] | None = None
+    ) -> Point:
         """Return the end of a search from the nominal robot, over horizons that grow, without the first ones.
+
+        `effort` is that of the last search, as in `run`.
 
         Raises:
             SearchError: the nominal robot cannot be simulated, not even at rest.
@@ -170,11 +174,11 @@ class Search:
         for horizon in [*dict.fromkeys(rows)][skipped:]:
             if horizon < 0.8 * longest:
                 x = self.run(x, free, Subset(horizon), FIRST if self.exact else ROUGH).x
-        return self.run(x, free, effort=EXACT if self.exact else FINE)
+        return self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
 
     def run(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset = ALL,
-        effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None,
+        effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None, every: bool = False,
     ) -> Point:  # fmt: skip
         """Return the end of a search (Levenberg-Marquardt) from a point.
 
@@ -184,13 +188,14 @@ class Search:
             subset: recordings and rows.
             effort: most evaluations, and the relative fall of the cost at which the search ends.
             scale: fixed scales of the differences; None: they follow the differences.
+            every: compute the normal equations of all coordinates, also of those that are not searched.
 
         Raises:
             SearchError: the robot at that point cannot be simulated.
         """
         if self.journal is None:
-            return self._searched(x, free, subset, effort, scale)
-        options = repr((subset.rows, subset.which and tuple(subset.which), effort, scale is None))
+            return self._searched(x, free, subset, effort, scale, every)
+        options = repr((subset.rows, subset.which and tuple(subset.which), effort, scale is None, every))
         key = hashed(self._identity, options, x, free, np.zeros(0) if scale is None else scale)
         try:
             kept = self.journal.load(key)
@@ -198,7 +203,7 @@ class Search:
             kept = None
         if kept is None:
             try:
-                kept = self._searched(x, free, subset, effort, scale).facts()
+                kept = self._searched(x, free, subset, effort, scale, every).facts()
             except SearchError as error:
                 kept = {"failed": str(error)}
             self.journal.save(key, kept)
@@ -219,7 +224,7 @@ class Search:
 
     def _searched(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset,
-        effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None,
+        effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None, every: bool,
     ) -> Point:  # fmt: skip
         (most, fall), which = effort, subset.which
         rollouts = self.solved(x, subset)
@@ -243,12 +248,12 @@ class Search:
                 break
         sizes = self.scales_of(rollouts, which) if scale is None else scale
         units = self.units(sizes, which)
-        self.misfit.differentiated(rollouts)
+        self.misfit.differentiated(rollouts, None if every else free)
         thinned = self.thinned()
         if not self.exact:
             data = [self.misfit.data[k] for k in (range(len(self.misfit.data)) if which is None else which)]
             thinned = dispersion(rollouts, units, [0.0 if it.static else it.dt for it in data], free)
-        problem = normal_equations(rollouts, units, thinned)
+        problem = normal_equations(rollouts, units, thinned, np.ones(len(x), dtype=bool) if every else free)
         return Point(x, sizes, problem, free, self.prior, converged)
 
     def scales_of(self, rollouts: Sequence[Rollout], which: Sequence[int] | None = None) -> np.ndarray:

@@ -14,6 +14,8 @@ from knode_cosserat.identification.search import Point, Search, SearchError
 MOST = 4
 #: evaluations of these searches, and the part by which the cost falls at their end
 TRIED = (15, 2e-3)
+#: the same of the first search, with all effects
+FIRST = (6, 1e-2)
 
 
 class Selection(NamedTuple):
@@ -32,13 +34,15 @@ def from_far(search: Search, tell: Callable[[str], None]) -> Point:
     """
     model = search.misfit.model
     try:
-        return search.from_far(model.mask(model.names))
+        return search.from_far(model.mask(model.names), effort=FIRST)
     except SearchError as error:
         tell(f"all effects: {error}")
     few = model.mask(effect.name for effect in model.effects if effect.basic or effect.usual)
     point = search.from_far(few)
     try:
-        return search.run(np.where(few, point.x, 0.1 * model.begin), np.ones(model.size, dtype=bool))
+        return search.run(
+            np.where(few, point.x, 0.1 * model.begin), np.ones(model.size, dtype=bool), every=True
+        )
     except SearchError as error:
         tell(f"all effects: {error}")
     return point
@@ -64,7 +68,7 @@ def selected(search: Search, point: Point, tell: Callable[[str], None]) -> Selec
             np.where(point.free, point.x, begin),
         ):
             try:
-                end = search.run(np.where(free, x, 0.0), free, effort=TRIED)
+                end = search.run(np.where(free, x, 0.0), free, effort=TRIED, every=True)
                 break
             except SearchError as error:
                 tell(f"{len(names)} effects: {error}")
