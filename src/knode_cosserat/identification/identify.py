@@ -19,7 +19,7 @@ from knode_cosserat.identification.effects import library_model, parameter_effec
 from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.posterior import SURE, Posterior
-from knode_cosserat.identification.result import Estimate, Identified, estimates_of
+from knode_cosserat.identification.result import Identified, estimates_of, variance_ratio
 from knode_cosserat.identification.search import Point, Search, SearchError
 from knode_cosserat.identification.selection import Selection, from_far, selected
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
@@ -155,8 +155,7 @@ def identify(
             model = search.misfit.model
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
-    posterior = Posterior.of(model, point, None if effects is None else names)
-    return _accepted(search, Selection(names, point, steps), posterior, space)
+    return _accepted(search, Selection(names, point, steps), effects is not None, space)
 
 
 # plain parameters
@@ -191,8 +190,7 @@ def _with_parameters(search: Search) -> Identified:
         raise IdentificationError("the search did not converge; begin closer to the data")
     _require_range(model, names, point)
     posterior = Posterior.of(model, point, names)
-    estimates = estimates_of(point, posterior, point.x)
-    result = _result(search, model.reduced(point.x, names), point.x, estimates, posterior, steps)
+    result = _result(search, model.reduced(point.x, names), point.x, posterior, steps)
     undetermined = tuple(name for name in model.names if name not in names)
     return dataclasses.replace(result, undetermined=undetermined)
 
@@ -259,13 +257,17 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
     return tuple(name for name in model.names if name in wanted)
 
 
-def _accepted(
-    search: Search, selection: Selection, posterior: Posterior, space: str | SpaceScheme
-) -> Identified:
-    """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails."""
+def _accepted(search: Search, selection: Selection, known: bool, space: str | SpaceScheme) -> Identified:
+    """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails.
+
+    The effects are `known` if they were not selected.
+    """
     model, data = search.misfit.model, search.misfit.data
     names, point, steps = selection.names, selection.point, list(selection.steps)
     while True:
+        ends = [search.without(point, k, FOLD) for k in range(len(data))] if len(data) > 1 else []
+        scatter = variance_ratio(point, [end.x for end in ends if end is not None])
+        posterior = Posterior.of(model, point.scattered(scatter), names if known else None)
         x, kept = _averaged(search, names, point, posterior)
         whole = search.misfit.system(x)
         reason = failed_trial(whole, data, space)
@@ -280,23 +282,19 @@ def _accepted(
         }
         weakest = max(added, key=lambda name: posterior.evidence(fewer[name]))
         steps.append(f"without {weakest}: {reason}")
-        names = fewer[weakest]
+        names, known = fewer[weakest], True
         free = model.mask(names)
         point = search.run(np.where(free, point.x, 0.0), free)
-        posterior = Posterior.of(model, point, names)
     errors: list[float | None] = [None]
-    folds = []
-    if len(data) > 1:
-        ends = [search.without(point, k, FOLD) for k in range(len(data))]
+    if ends:
         errors = [None if it is None else _errors(search, it.x, [k], False)[0] for k, it in enumerate(ends)]
-        folds = [end.x for end in ends if end is not None]
         nominal = _errors(search, np.zeros(model.size), tip=False)
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
         if np.mean(unseen) >= np.mean(before):
             reason = "the nominal robot is returned: it predicts held-out recordings as well"
             return _nominal(search, (*steps, reason))
     robot = model.reduced(x, kept).replace(trained=trained_range(whole, data, space))
-    result = _result(search, robot, x, estimates_of(point, posterior, x, folds), posterior, steps)
+    result = _result(search, robot, x, posterior, steps)
     return dataclasses.replace(
         result,
         held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
@@ -378,16 +376,16 @@ def _errors_by_name(search: Search, x: np.ndarray) -> dict[str, float | None]:
 
 
 def _result(
-    search: Search, robot: System, x: np.ndarray, estimates: Sequence[Estimate], posterior: Posterior,
-    steps: Sequence[str],
-) -> Identified:  # fmt: skip
+    search: Search, robot: System, x: np.ndarray, posterior: Posterior, steps: Sequence[str]
+) -> Identified:
     """Return the result with an identified robot at some coordinates."""
+    estimates = estimates_of(posterior, x)
     probable = {it.effect: it.probability for it in estimates}
     return Identified(
         robot=robot,
         effects=tuple(name for name, share in probable.items() if share >= SURE),
         undecided={name: share for name, share in probable.items() if share < SURE},
-        estimates=tuple(estimates),
+        estimates=estimates,
         correlation=posterior.correlation([it.label for it in estimates]),
         nominal_error=_errors_by_name(search, np.zeros(len(x))),
         error=_errors_by_name(search, x),

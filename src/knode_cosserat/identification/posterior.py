@@ -10,7 +10,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -85,18 +84,17 @@ class Posterior:
             return np.sqrt(np.diag(self.point.covariance()))
         return self.draws.std(axis=0)
 
-    def interval(self, level: float, wider: Any = 1.0) -> Float[np.ndarray, "2 n"]:
-        """Return the ends of an interval of each coordinate, `wider` by factors (n,), within the bounds."""
+    def interval(self, level: float) -> Float[np.ndarray, "2 n"]:
+        """Return the ends of an interval of each coordinate, within the bounds."""
         # imported here: it takes a third of a second
         from scipy.special import stdtrit
 
         if self.draws is None:
             amount = float(np.sum(self.point.problem.amount)) - float(np.sum(self.point.free))
-            reach = wider * float(stdtrit(max(amount, 1.0), 0.5 + level / 2.0)) * self.deviation
+            reach = float(stdtrit(max(amount, 1.0), 0.5 + level / 2.0)) * self.deviation
             ends = np.array([self.point.x - reach, self.point.x + reach])
         else:
-            quantiles = np.quantile(self.draws, [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
-            ends = self.mean + wider * (quantiles - self.mean)
+            ends = np.quantile(self.draws, [0.5 - level / 2.0, 0.5 + level / 2.0], axis=0)
         return self._clipped(ends)
 
     def correlation(self, labels: Sequence[str]) -> Float[np.ndarray, "m m"]:

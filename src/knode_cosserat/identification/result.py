@@ -61,7 +61,6 @@ class Identified:
 
     robot: System
     effects: tuple[str, ...] = ()
-    undecided: Mapping[str, float] = dataclasses.field(default_factory=dict)
     estimates: tuple[Estimate, ...] = ()
     correlation: Float[np.ndarray, "n n"] = dataclasses.field(default_factory=lambda: np.zeros((0, 0)))
     nominal_error: Mapping[str, float | None] = dataclasses.field(default_factory=dict)
@@ -70,6 +69,7 @@ class Identified:
     undetermined: tuple[str, ...] = ()
     unexplained: tuple[str, ...] = ()
     steps: tuple[str, ...] = ()
+    undecided: Mapping[str, float] = dataclasses.field(default_factory=dict)
 
     def __getitem__(self, label: str) -> Estimate:
         """Return the estimate of a number by its label, such as "youngs_modulus" or "gravity[2]".
@@ -167,20 +167,14 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
     return lines
 
 
-def estimates_of(
-    point: Point, posterior: Posterior, x: Float[np.ndarray, " n"],
-    folds: Sequence[Float[np.ndarray, " n"]] = (),
-) -> list[Estimate]:  # fmt: skip
+def estimates_of(posterior: Posterior, x: Float[np.ndarray, " n"]) -> tuple[Estimate, ...]:
     """Return the numbers of effects that are not improbable, with their intervals.
 
     Args:
-        point: end of a search.
-        posterior: probabilities about that point.
+        posterior: probabilities about the end of a search.
         x: coordinates of the identified robot.
-        folds: ends of searches that left one recording out each.
     """
-    model, wider = posterior.model, widening(point, folds)
-    ends, spread = posterior.interval(LEVEL, wider), wider * posterior.deviation
+    model, ends, spread = posterior.model, posterior.interval(LEVEL), posterior.deviation
     estimates = []
     for name in posterior.names(1.0 - SURE):
         for k in range(*model.slice(name).indices(model.size)):
@@ -195,21 +189,20 @@ def estimates_of(
                     posterior.probability[name],
                 )
             )  # fmt: skip
-    return estimates
+    return tuple(estimates)
 
 
-def widening(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> Float[np.ndarray, " n"]:
-    """Return the factors by which estimates without one recording scatter more than expected, at least 1.
+def variance_ratio(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> float:
+    """Return how much more estimates without one recording scatter than expected, at least 1.
 
     Least squares assumes random differences; those of an incomplete model are systematic, and differ between
-    recordings. The factor is the root of the mean ratio of both variances (jackknife, Efron & Stein 1981), up
-    to the prior's deviation.
+    recordings. It is the mean ratio of both variances (jackknife, Efron & Stein 1981) of the numbers that the
+    data determine.
     """
     spread = np.sqrt(np.diag(point.covariance()))
     count = len(folds)
     free = point.free & (spread < HELD)
     if count < 2 or not free.any():
-        return np.ones(len(spread))
+        return 1.0
     scatter = (count - 1) ** 2 / count * np.var(np.array(folds), axis=0, ddof=1)
-    ratio = float(np.sqrt(max(1.0, np.mean(scatter[free] / spread[free] ** 2))))
-    return np.where(free, np.minimum(ratio, 1.0 / spread), 1.0)
+    return float(max(1.0, np.mean(scatter[free] / spread[free] ** 2)))

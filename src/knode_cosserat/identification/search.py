@@ -90,6 +90,10 @@ class Point:
         """Robust cost with the prior."""
         return float(self.problem.cost.sum() + np.sum(self.prior * self.x**2))
 
+    def scattered(self, ratio: float) -> Self:
+        """Return it with differences of a larger variance, which count less."""
+        return dataclasses.replace(self, problem=Problem(*(part / ratio for part in self.problem)))
+
     def covariance(self) -> Float[np.ndarray, "n n"]:
         """Return the covariance of the coordinates, of the prior where nothing is known or searched."""
         free = self.free
@@ -170,11 +174,17 @@ class Search:
         if data[0].static or wound:
             # rows are independent of each other, and wound-up lengths keep the search near the solution
             longest = 0
-        rows = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
-        for horizon in [*dict.fromkeys(rows)][skipped:]:
+        counts = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
+        for horizon in [*dict.fromkeys(counts)][skipped:]:
             if horizon < 0.8 * longest:
-                x = self.run(x, free, Subset(horizon), FIRST if self.exact else ROUGH).x
+                rows = max(self._rows_until(horizon, it) for it in data)
+                x = self.run(x, free, Subset(rows), FIRST if self.exact else ROUGH).x
         return self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
+
+    def _rows_until(self, count: int, data: Experiment) -> int:
+        """Return the number of rows after the first in motion with so many rows that were measured."""
+        measured = 1 + np.flatnonzero(np.isfinite(data.data[data.moves + 1 :]).any(axis=1))
+        return int(measured[:count][-1]) if count and len(measured) else count
 
     def run(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset = ALL,
