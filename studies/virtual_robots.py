@@ -132,12 +132,12 @@ def _gain(before: Evaluation, after: Evaluation) -> float | None:
 
 
 def _covered(truth: Imperfect, found: Identified) -> dict[str, bool]:
-    """Return which intervals hold the true value, by label."""
-    return {
-        each.label: bool(each.interval[0] <= truth.values[each.label] <= each.interval[1])
-        for each in found.estimates
-        if each.label in truth.values
-    }
+    """Return which intervals hold the true value, by label; without an effect this is the nominal one."""
+    covered = {}
+    for each in found.estimates:
+        low, high = sorted(each.interval)
+        covered[each.label] = bool(low <= truth.values.get(each.label, each.nominal) <= high)
+    return covered
 
 
 def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
@@ -145,6 +145,7 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
     rows = []
     for each in facts:
         true, have = set(each["true_effects"]), set(each["identified"]["effects"])
+        undecided = set(each["identified"]["undecided"])
         gains = [outcome["improvement"] for outcome in each["unseen"].values()]
         inside = list(each["covered"].values())
         angles = [outcome["identified"]["rotation_rmse"] for outcome in each["unseen"].values()]
@@ -154,14 +155,24 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
                 *("failed" if gain is None else f"{100 * gain:.1f} %" for gain in gains),
                 *("failed" if angle is None else f"{np.degrees(angle):.2f}" for angle in angles),
                 f"{len(true & have)} of {len(true)}",
-                ", ".join(sorted(true - have)) or "none",
+                ", ".join(sorted(undecided & true)) or "none",
+                ", ".join(sorted(true - have - undecided)) or "none",
                 ", ".join(sorted(have - true)) or "none",
                 f"{sum(inside)} of {len(inside)}",
             ]
         )
     gains = [f"improvement, {name}" for name in UNSEEN]
     angles = [f"orientations, {name} [degrees]" for name in UNSEEN]
-    heads = ["seed", *gains, *angles, "effects found", "missed", "false", "in interval"]
+    heads = [
+        "seed",
+        *gains,
+        *angles,
+        "effects found",
+        "of others undecided",
+        "missed",
+        "false",
+        "in interval",
+    ]
     told = summary(facts)
     lines = [
         "# Virtual robots with random imperfections",
@@ -183,6 +194,7 @@ def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     gains = [outcome["improvement"] for each in facts for outcome in each["unseen"].values()]
     solved = [gain for gain in gains if gain is not None] or [np.nan]
     found = [(set(each["identified"]["effects"]), set(each["true_effects"])) for each in facts]
+    undecided = [set(each["identified"]["undecided"]) for each in facts]
     right = [each for each, (have, true) in zip(facts, found, strict=True) if have == true]
     inside, inside_right = (
         [value for each in some for value in each["covered"].values()] for some in (facts, right)
@@ -193,7 +205,9 @@ def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "failed": sum(gain is None for gain in gains),
         "false": sum(len(have - true) for have, true in found),
         "found": sum(len(have) for have, _ in found),
-        "missed": sum(len(true - have) for have, true in found),
+        "missed": sum(
+            len(true - have - others) for (have, true), others in zip(found, undecided, strict=True)
+        ),
         "covered": sum(inside),
         "intervals": len(inside),
         "covered_right": sum(inside_right),

@@ -82,6 +82,28 @@ def test_an_effect_is_never_without_those_that_it_needs():
     assert {"e0", "e1"} <= {*posterior.names()}
 
 
+def test_the_shape_of_an_effect_that_is_hardly_there_is_no_evidence_for_it():
+    """rows = a curve(s): the evidence against a small a is that without its derivative by the shape s."""
+    numbers = Number("a", "", 0.0, 1.0), Number("s", "", 0.0, 1.0, shape=True)
+    model = Model(nominal_robot(), [Effect("bent", "", numbers, lambda robot, values: robot)])
+    rng, places, small, shape = np.random.default_rng(6), np.linspace(0.0, 3.0, ROWS), 0.1, 2.0
+    rows = rng.normal(size=ROWS)
+    curve, slope = np.sin(places + shape), np.cos(places + shape)
+    slopes, off = np.stack([curve, small * slope], axis=1), small * curve - rows
+    problem = Problem(
+        np.array([off @ off]), np.array([float(ROWS)]), (slopes.T @ off)[None], (slopes.T @ slopes)[None]
+    )
+    x = np.array([small, shape])
+    posterior = Posterior.of(model, Point(x, np.ones((1, 1)), problem, np.ones(2, dtype=bool), np.ones(2)))
+    # exact: costs with a = 0 and with the mode, whatever the shape
+    at_mode = posterior.mode(["bent"])
+    with_it = np.sum((slopes @ (at_mode - x) + off) ** 2) + at_mode @ at_mode
+    matrix = slopes.T @ slopes + np.eye(2)
+    exact = 0.5 * (rows @ rows - with_it) - 0.5 * np.linalg.slogdet(matrix)[1]
+    found = posterior.evidence(["bent"]) - posterior.evidence([])
+    assert found == pytest.approx(exact, abs=1e-9)
+
+
 def test_a_known_set_has_the_intervals_of_least_squares():
     rng, model = np.random.default_rng(3), model_of()
     point = point_of(rng.normal(size=(ROWS, EFFECTS)), rng.normal(size=ROWS), np.zeros(EFFECTS))

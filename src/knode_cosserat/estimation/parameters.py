@@ -38,7 +38,8 @@ class Number(NamedTuple):
 
     Its coordinate is x = (value - nominal) / width, or log(value / nominal) / width if `logarithmic`. A
     search begins at the coordinate `begin`: for example, friction has no derivative at zero. The prior of x
-    is normal with deviation 1; if `flat`, there is none, and the width is a usual step.
+    is normal with deviation 1; if `flat`, there is none, and the width is a usual step. A `shape` has no
+    effect where the other numbers of its effect are nominal: the length of a sleeve that is not stiff.
     """
 
     label: str
@@ -50,6 +51,7 @@ class Number(NamedTuple):
     logarithmic: bool = False
     begin: float = 0.0
     flat: bool = False
+    shape: bool = False
 
     def value(self, x: float) -> float:
         """Return the value at a coordinate."""
@@ -198,6 +200,11 @@ class Model:
     def prior(self) -> Float[np.ndarray, " n"]:
         """Precision of each coordinate's prior: zero for a flat one."""
         return np.array([0.0 if number.flat else 1.0 for number in self.numbers])
+
+    @property
+    def shapes(self) -> Bool[np.ndarray, " n"]:
+        """True for numbers that have no effect where the others of their effect are nominal."""
+        return np.array([number.shape for number in self.numbers], dtype=bool)
 
     @property
     def begin(self) -> Float[np.ndarray, " n"]:

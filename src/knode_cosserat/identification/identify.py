@@ -269,8 +269,7 @@ def _accepted(search: Search, selection: Selection, known: bool, space: str | Sp
         scatter = variance_ratio(point, [end.x for end in ends if end is not None])
         posterior = Posterior.of(model, point.scattered(scatter), names if known else None)
         x, kept = _averaged(search, names, point, posterior)
-        whole = search.misfit.system(x)
-        reason = failed_trial(whole, data, space)
+        reason = failed_trial(search.misfit.system(x), data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
@@ -293,7 +292,8 @@ def _accepted(search: Search, selection: Selection, known: bool, space: str | Sp
         if np.mean(unseen) >= np.mean(before):
             reason = "the nominal robot is returned: it predicts held-out recordings as well"
             return _nominal(search, (*steps, reason))
-    robot = model.reduced(x, kept).replace(trained=trained_range(whole, data, space))
+    robot = model.reduced(x, kept)
+    robot = robot.replace(trained=trained_range(robot, data, space))
     result = _result(search, robot, x, posterior, steps)
     return dataclasses.replace(
         result,

@@ -117,14 +117,16 @@ class Posterior:
         """Return the mode, a square root of the covariance, and the logarithm of the evidence."""
         from scipy.linalg import cho_solve
 
-        on = np.flatnonzero(self.model.mask(names))
+        model, mask = self.model, self.model.mask(names)
+        # the shape of an absent effect stays: without its other numbers it changes nothing
+        on, fixed = np.flatnonzero(mask), np.where(model.shapes & ~mask, self.point.x, 0.0)
         (information, pull), prior = self._equations, self.point.prior[on]
-        matrix = information[np.ix_(on, on)] + np.diag(prior)
-        factor = np.linalg.cholesky(matrix)
-        x, root = np.zeros(self.model.size), np.zeros((self.model.size, len(on)))
-        x[on] = cho_solve((factor, True), pull[on])
+        left = pull - information @ fixed
+        factor = np.linalg.cholesky(information[np.ix_(on, on)] + np.diag(prior))
+        x, root = np.zeros(model.size), np.zeros((model.size, len(on)))
+        x[on] = cho_solve((factor, True), left[on])
         root[on] = np.linalg.inv(factor).T
-        evidence = 0.5 * pull[on] @ x[on] - np.sum(np.log(np.diag(factor)))
+        evidence = 0.5 * left[on] @ x[on] - np.sum(np.log(np.diag(factor))) + 0.5 * fixed @ (pull + left)
         return x, root, float(evidence + 0.5 * np.sum(np.log(prior[prior > 0.0])))
 
     def _clipped(self, x: np.ndarray) -> np.ndarray:

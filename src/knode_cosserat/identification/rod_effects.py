@@ -53,7 +53,7 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     )  # fmt: skip
     sleeve = (
         Number("sleeve.stiffening", "", 0.0, 1.0, 0.0, 100.0, begin=0.3),
-        Number("sleeve.length", "", 0.15, 0.5, 0.01, 0.6, True),
+        Number("sleeve.length", "", 0.15, 0.5, 0.01, 0.6, True, shape=True),
     )
     axes = tuple(Number(label, "", 0.0, 0.1, -0.9, 0.9) for label in ("anisotropy", "anisotropy_turned"))
     return [
@@ -83,7 +83,7 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     slow = (0.0, 1.0) if branch is None else (float(branch.stiffness), float(branch.time))
     creep = (
         Number("relaxation.stiffness", "", slow[0], 0.2, 0.0, 100.0, begin=0.3),
-        Number("relaxation.time", "s", slow[1], 1.0, 0.02, 100.0, True),
+        Number("relaxation.time", "s", slow[1], 1.0, 0.02, 100.0, True, shape=True),
     )
     fluid = Number(
         "linear_drag", "kg/(m s)", 0.0 if linear is None else float(linear[0, 0]), 3.0 * drag, 0.0, 1e4,

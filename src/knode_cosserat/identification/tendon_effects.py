@@ -123,11 +123,11 @@ def _friction_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
     width = max(0.5 * (usual.highest - shaking), 0.05 * usual.highest)
     friction = (
         Number("friction.wobble", "1/m", wobble, 0.2 / L, 0.0, 100.0, begin=0.5),
-        Number("friction.reach", "1/m", reach, 1.0, 1e-4, 100.0, True),
-        Number("friction.at_rest", "", at_rest, 1.0, -1.0, 1.0, begin=0.3),
+        Number("friction.reach", "1/m", reach, 1.0, 1e-4, 100.0, True, shape=True),
+        Number("friction.at_rest", "", at_rest, 1.0, -1.0, 1.0, begin=0.3, shape=True),
     )
     vibration = (
-        Number("vibration.tension", "N", shaking, width, 0.0, 1e6),
+        Number("vibration.tension", "N", shaking, width, 0.0, 1e6, shape=True),
         Number("vibration.rate", "1/(N s)", 0.0, 0.5, 0.0, 1e3, begin=0.5),
         Number("vibration.softening", "m2", 0.0, (0.1 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),
     )
