@@ -91,7 +91,7 @@ def system_members() -> int:
 def budgets() -> list[Budget]:
     """Return all figures."""
     return [
-        Budget("lines of the library", lines_of(LIBRARY), 37_000, 52_810),
+        Budget("lines of the library", lines_of(LIBRARY), 37_000, 52_820),
         Budget("lines of hardware", lines_of(ROOT / "hardware"), 7_500, 9_300),
         Budget("lines of studies", lines_of(ROOT / "studies"), 6_000, 8_700),
         Budget("lines of tests", lines_of(ROOT / "tests"), 25_000, 39_930),

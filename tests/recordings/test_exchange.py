@@ -69,7 +69,7 @@ def test_a_simulation_goes_through_a_file_without_error(robot, tensions, motion,
     np.testing.assert_allclose(rows.quaternion, seen.quaternion, rtol=0, atol=1e-9)
     assert rows.complete.all() and len(rows.time) == len(motion.time)
     # the same robot under the same tensions: nothing is left but the solver's tolerance
-    found = evaluate(robot, rows)
+    found = evaluate(robot, rows, space="lobatto2")  # the scheme of the simulation
     assert found.failed is None
     assert found.tip_rmse < 1e-8 and found.pose_mse < 1e-15
     # and a row off, it is another motion

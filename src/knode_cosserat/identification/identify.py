@@ -21,7 +21,7 @@ from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.result import Identified, estimates_of, variance_ratio
 from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import Selection, from_far, selected
+from knode_cosserat.identification.selection import Selection, from_far, selected, sizes
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.identification.undetermined import gap_of, unexplained
 from knode_cosserat.learning.training.checkpoint import Checkpoints
@@ -45,6 +45,8 @@ SKIPPED = (0, 3, 9)
 #: row 0 disagrees with the initial equilibrium if it is further away than this part of the length, and than
 #: this part of the motion's root mean square
 AWAY, OF_MOTION = 0.01, 0.25
+#: most selections by what recordings disagree about
+SELECTIONS = 3
 #: an averaged robot is not used if the logarithm of its differences' size is larger by this
 WORSE = 0.02
 
@@ -108,20 +110,21 @@ def identify(
     system: Any = robot
     if not isinstance(system, System) or np.ndim(robot.length):
         raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")
-    tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
-    data = listed_rows(data)
-    plain = [] if parameters is None else parameter_effects(robot, parameters)
-    rows = [it for it in data if isinstance(it, Measurements)]
-    plain += place_effects(rows, flat=effects is None and parameters is not None)
-    if effects is None and parameters is not None:
-        model = Model(robot, plain)
-        search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
-        return _with_parameters(search)
-    if not isinstance(robot, TendonRod):
+    named = effects is None and parameters is not None
+    if not named and not isinstance(robot, TendonRod):
         raise IdentificationError(
             f"robot is a {type(robot).__name__}; allowed is a robot with tendons (TendonRobot, "
             'RoutedTendonRobot), or name `parameters`, such as parameters="all"'
         )
+    tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
+    data = listed_rows(data)
+    plain = [] if parameters is None else parameter_effects(robot, parameters)
+    rows = [it for it in data if isinstance(it, Measurements)]
+    plain += place_effects(rows, flat=named)
+    if named:
+        model = Model(robot, plain)
+        search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
+        return _with_parameters(search)
     measured = measured_rows(data)
 
     tension = np.concatenate([rows.tension for rows in measured])
@@ -264,10 +267,20 @@ def _accepted(search: Search, selection: Selection, known: bool, space: str | Sp
     """
     model, data = search.misfit.model, search.misfit.data
     names, point, steps = selection.names, selection.point, list(selection.steps)
+    searched = {names}
     while True:
         ends = [search.without(point, k, FOLD) for k in range(len(data))] if len(data) > 1 else []
         scatter = variance_ratio(point, [end.x for end in ends if end is not None])
         posterior = Posterior.of(model, point.scattered(scatter), names if known else None)
+        if not known and posterior.names() not in searched and len(searched) <= SELECTIONS:
+            # recordings that disagree support fewer effects
+            names = posterior.names()
+            searched.add(names)
+            x = np.where(model.mask(names), np.where(point.free, point.x, model.begin), 0.0)
+            point = search.run(x, model.mask(names), every=True)
+            steps.append(f"with {', '.join(names)}, as recordings differ: {sizes(point)}")
+            search.tell(steps[-1])
+            continue
         x, kept = _averaged(search, names, point, posterior)
         reason = failed_trial(search.misfit.system(x), data, space)
         if reason is None:
