@@ -174,7 +174,7 @@ def identified(robot: kc.System, it: Made, measured: bool) -> Any:
 
 
 def predicted(robot: kc.System, it: Made) -> Any:
-    found = evaluate(robot, it.seen)
+    found = evaluate(robot, it.seen, space="lobatto2")  # the scheme of the simulation
     assert found.failed is None and found.tip_rmse < 1e-6
     return found.tip_rmse
 
