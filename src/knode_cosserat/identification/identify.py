@@ -21,7 +21,7 @@ from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.result import Identified, estimates_of, variance_ratio
 from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import Selection, from_far, selected, sizes
+from knode_cosserat.identification.selection import Selection, from_far, search_of, selected, sizes
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.identification.undetermined import gap_of, unexplained
 from knode_cosserat.learning.training.checkpoint import Checkpoints
@@ -126,7 +126,6 @@ def identify(
         search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
         return _with_parameters(search)
     measured = measured_rows(data)
-
     tension = np.concatenate([rows.tension for rows in measured])
 
     def searched(robot: Any) -> Search:
@@ -142,10 +141,10 @@ def identify(
             names = _known([*effects, *(effect.name for effect in plain)], model)
             point = search.from_far(model.mask(names))
         else:
-            point = from_far(search, tell)
+            point = from_far(search)
         for refinements in range(REFINEMENTS + 1):
             if effects is None:
-                names, point, more = selected(search, point, tell)
+                names, point, more = selected(search, point)
                 steps += more
             elif refinements:
                 point = search.run(point.x, model.mask(names))
@@ -193,7 +192,7 @@ def _with_parameters(search: Search) -> Identified:
         raise IdentificationError("the search did not converge; begin closer to the data")
     _require_range(model, names, point)
     posterior = Posterior.of(model, point, names)
-    result = _result(search, model.reduced(point.x, names), point.x, posterior, steps)
+    result = _result(search, model.reduced(point.x, names), (point.x, names), posterior, steps)
     undetermined = tuple(name for name in model.names if name not in names)
     return dataclasses.replace(result, undetermined=undetermined)
 
@@ -274,13 +273,13 @@ def _accepted(search: Search, selection: Selection, known: bool, space: str | Sp
         posterior = Posterior.of(model, point.scattered(scatter), names if known else None)
         if not known and posterior.names() not in searched and len(searched) <= SELECTIONS:
             # recordings that disagree support fewer effects
-            names = posterior.names()
-            searched.add(names)
-            x = np.where(model.mask(names), np.where(point.free, point.x, model.begin), 0.0)
-            point = search.run(x, model.mask(names), every=True)
-            steps.append(f"with {', '.join(names)}, as recordings differ: {sizes(point)}")
-            search.tell(steps[-1])
-            continue
+            searched.add(posterior.names())
+            end = search_of(search, posterior, np.where(point.free, point.x, model.begin))
+            if end is not None:
+                names, point = posterior.names(), end
+                steps.append(f"with {', '.join(names)}, as recordings differ: {sizes(point)}")
+                search.tell(steps[-1])
+                continue
         x, kept = _averaged(search, names, point, posterior)
         reason = failed_trial(search.misfit.system(x), data, space)
         if reason is None:
@@ -307,7 +306,7 @@ def _accepted(search: Search, selection: Selection, known: bool, space: str | Sp
             return _nominal(search, (*steps, reason))
     robot = model.reduced(x, kept)
     robot = robot.replace(trained=trained_range(robot, data, space))
-    result = _result(search, robot, x, posterior, steps)
+    result = _result(search, robot, (x, kept), posterior, steps)
     return dataclasses.replace(
         result,
         held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
@@ -389,10 +388,11 @@ def _errors_by_name(search: Search, x: np.ndarray) -> dict[str, float | None]:
 
 
 def _result(
-    search: Search, robot: System, x: np.ndarray, posterior: Posterior, steps: Sequence[str]
-) -> Identified:
-    """Return the result with an identified robot at some coordinates."""
-    estimates = estimates_of(posterior, x)
+    search: Search, robot: System, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior,
+    steps: Sequence[str],
+) -> Identified:  # fmt: skip
+    """Return the result with an identified robot, `at` coordinates of some effects."""
+    x, estimates = at[0], estimates_of(posterior, *at)
     probable = {it.effect: it.probability for it in estimates}
     return Identified(
         robot=robot,

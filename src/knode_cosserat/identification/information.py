@@ -79,10 +79,8 @@ def dispersion(
         known = np.isfinite(scaled)
         off = np.where(known, scaled, 0.0)
         weights = np.sqrt(huber(off)[1])
-        off, slopes = (
-            off * weights,
-            np.where(known, rollout.derivatives_by(free)[:, ::stride] / unit, 0.0) * weights,
-        )
+        off *= weights
+        slopes = np.where(known, rollout.derivatives_by(free)[:, ::stride] / unit, 0.0) * weights
         information += np.einsum("iae,jae->ij", slopes, slopes) * stride
         sizes, components = np.linalg.eigh(off.T @ off)
         for size, component in zip(sizes, components.T, strict=True):

@@ -122,41 +122,36 @@ class Misfit:
         pairs = zip(found, offsets or [0.0] * len(found), strict=True)
         return [None if each is None else each.moved(offset) for each, offset in pairs]
 
+    def whole(self, x: Float[np.ndarray, " n"], which: Sequence[int] | None = None) -> list[Rollout | None]:
+        """Return the refined rollouts of whole experiments at a point; None if one failed."""
+        return self.refined(self.differences(x, which=which), x, which)
+
     def refined(
-        self, rollouts: Sequence[Rollout], x: Float[np.ndarray, " n"], which: Sequence[int] | None = None
-    ) -> list[Rollout]:
+        self, rollouts: Sequence[Rollout | None], x: Float[np.ndarray, " n"],
+        which: Sequence[int] | None = None,
+    ) -> list[Any]:  # fmt: skip
         """Return whole rollouts at a point with the differences of the accurate experiments, as an offset.
 
         Between continuous controls these are extrapolated from half the steps (Richardson), for schemes of
         order two. Derivatives are not refined. Held controls belong to the steps of their scheme.
         """
+        at = np.asarray(x, dtype=float)
 
-        def accurate(pair: tuple[Experiment, Rollout]) -> np.ndarray | None:
+        def of_one(pair: tuple[Experiment, Rollout | None]) -> Rollout | None:
             data, rollout = pair
-            target = data if data.accurate is None else data.accurate
-            found: Any = rollout.values - rollout.offset
-            if data.accurate is not None:
-                solved = self._of_one(np.asarray(x, dtype=float), target, None)
-                found = None if solved is None else solved.values
-            if found is None or not target.is_resolved:
-                return found
-            finer = self._of_one(np.asarray(x, dtype=float), target.replace(steps=2 * target.steps), None)
-            return None if finer is None else (4.0 * finer.values - found) / 3.0
+            target = data.accurate or data
+            solved = rollout if rollout is None or target is data else self._of_one(at, target, None)
+            if rollout is None or solved is None:
+                return rollout
+            values = solved.values - (rollout.offset if solved is rollout else 0.0)
+            if target.is_resolved:
+                finer = self._of_one(at, target.replace(steps=2 * target.steps), None)
+                if finer is None:
+                    return rollout
+                values = (4.0 * finer.values - values) / 3.0
+            return rollout.moved(values - rollout.values + rollout.offset)
 
-        found = self._parallel(accurate, list(zip(self._chosen(which), rollouts, strict=True)))
-        return [
-            each if values is None else each.moved(values - each.values + each.offset)
-            for each, values in zip(rollouts, found, strict=True)
-        ]
-
-    def whole(self, x: Float[np.ndarray, " n"], which: Sequence[int] | None = None) -> list[Rollout | None]:
-        """Return the refined rollouts of whole experiments at a point; None if one failed."""
-        found = self.differences(x, which=which)
-        numbers = range(len(self.data)) if which is None else which
-        return [
-            None if each is None else self.refined([each], x, [k])[0]
-            for each, k in zip(found, numbers, strict=True)
-        ]
+        return self._parallel(of_one, list(zip(self._chosen(which), rollouts, strict=True)))
 
     def _chosen(self, which: Sequence[int] | None) -> list[Experiment]:
         return [self.data[k] for k in (range(len(self.data)) if which is None else which)]

@@ -167,16 +167,19 @@ def _table(rows: list[tuple[str, ...]]) -> list[str]:
     return lines
 
 
-def estimates_of(posterior: Posterior, x: Float[np.ndarray, " n"]) -> tuple[Estimate, ...]:
-    """Return the numbers of effects that are not improbable, with their intervals.
+def estimates_of(
+    posterior: Posterior, x: Float[np.ndarray, " n"], names: Sequence[str]
+) -> tuple[Estimate, ...]:
+    """Return the numbers of a robot's effects, with their intervals.
 
     Args:
         posterior: probabilities about the end of a search.
         x: coordinates of the identified robot.
+        names: its effects.
     """
     model, ends, spread = posterior.model, posterior.interval(LEVEL), posterior.deviation
     estimates = []
-    for name in posterior.names(1.0 - SURE):
+    for name in names:
         for k in range(*model.slice(name).indices(model.size)):
             number = model.numbers[k]
             first, last = map(number.value, ends[:, k])

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.search import Point, Search, SearchError
@@ -26,7 +26,7 @@ class Selection(NamedTuple):
     steps: tuple[str, ...] = ()
 
 
-def from_far(search: Search, tell: Callable[[str], None]) -> Point:
+def from_far(search: Search) -> Point:
     """Return the end of a search with all effects or, if that has no begin, with few.
 
     Raises:
@@ -36,7 +36,7 @@ def from_far(search: Search, tell: Callable[[str], None]) -> Point:
     try:
         return search.from_far(model.mask(model.names), effort=FIRST)
     except SearchError as error:
-        tell(f"all effects: {error}")
+        search.tell(f"all effects: {error}")
     few = model.mask(effect.name for effect in model.effects if effect.basic or effect.usual)
     point = search.from_far(few)
     try:
@@ -44,44 +44,49 @@ def from_far(search: Search, tell: Callable[[str], None]) -> Point:
             np.where(few, point.x, 0.1 * model.begin), np.ones(model.size, dtype=bool), every=True
         )
     except SearchError as error:
-        tell(f"all effects: {error}")
+        search.tell(f"all effects: {error}")
     return point
 
 
-def selected(search: Search, point: Point, tell: Callable[[str], None]) -> Selection:
+def selected(search: Search, point: Point) -> Selection:
     """Return the effects that are more probable than not, and the end of their search.
 
     The probabilities belong to equations that are linear about a point (`Posterior`), so the search with the
-    selected effects gives new ones, until no other set is selected. An effect without a derivative where it
-    is absent, such as friction, begins where the first point has it.
+    selected effects gives new ones, until no other set is selected.
+
+    Raises:
+        SearchError: no set of effects can be searched.
     """
-    model, first = search.misfit.model, point.x
-    begin = np.where(point.free, first, model.begin)
-    steps: list[str] = []
-    searched: list[tuple[str, ...]] = []
-    names = Posterior.of(model, point).names()
-    while names not in searched and len(searched) < MOST:
-        free, nearest = model.mask(names), Posterior.of(model, point).mode(names)
-        end = None
-        for x in (
-            np.where(point.free | (nearest != 0.0), nearest, begin),
-            np.where(point.free, point.x, begin),
-        ):
-            try:
-                end = search.run(np.where(free, x, 0.0), free, effort=TRIED, every=True)
-                break
-            except SearchError as error:
-                tell(f"{len(names)} effects: {error}")
+    model, steps, searched = search.misfit.model, list[str](), list[tuple[str, ...]]()
+    begin, posterior = np.where(point.free, point.x, model.begin), Posterior.of(model, point)
+    while posterior.names() not in searched and len(searched) < MOST:
+        end = search_of(search, posterior, begin)
         if end is None:
             break
-        point = end
-        searched.append(names)
-        steps.append(f"with {', '.join(names)}: {sizes(point)}")
-        tell(steps[-1])
-        names = Posterior.of(model, point).names()
+        searched.append(posterior.names())
+        steps.append(f"with {', '.join(searched[-1])}: {sizes(end)}")
+        search.tell(steps[-1])
+        posterior = Posterior.of(model, end)
     if not searched:
         raise SearchError("no set of effects can be searched")
-    return Selection(searched[-1], point, tuple(steps))
+    return Selection(searched[-1], posterior.point, tuple(steps))
+
+
+def search_of(search: Search, posterior: Posterior, begin: Float[np.ndarray, " n"]) -> Point | None:
+    """Return the end of a search with the effects that are more probable than not; None if it has none.
+
+    It begins at the most probable coordinates, or else at those of the last search. Numbers that were absent
+    there and have no derivative, such as friction, `begin` at other coordinates.
+    """
+    names, point = posterior.names(), posterior.point
+    free, nearest = search.misfit.model.mask(names), posterior.mode(names)
+    for x, known in ((nearest, point.free | (nearest != 0.0)), (point.x, point.free)):
+        try:
+            start = np.where(free, np.where(known, x, begin), 0.0)
+            return search.run(start, free, effort=TRIED, every=True)
+        except SearchError as error:
+            search.tell(f"{len(names)} effects: {error}")
+    return None
 
 
 def sizes(point: Point) -> str:
