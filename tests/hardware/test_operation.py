@@ -4,6 +4,7 @@ import json
 import os
 import pty
 import signal
+import sys
 import threading
 import time
 
@@ -50,6 +51,21 @@ def test_a_signal_stops_the_robot_once(number):
         work()
     assert driver.count == 1 and emergency.is_stopped and emergency.reason == number.name
     assert signal.getsignal(number) == before and signal.set_wakeup_fd(-1) == -1
+
+
+def test_a_signal_during_a_destructor_is_not_lost(capfd):
+    class Dropped:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    driver, hook = Stops(), sys.unraisablehook
+    with EmergencyStop(driver) as emergency:
+        thing = Dropped()
+        del thing
+        assert eventually(lambda: driver.count == 1)
+        with pytest.raises(StoppedError, match="stopped by SIGINT"):
+            emergency.check()
+    assert "Traceback" not in capfd.readouterr().err and sys.unraisablehook is hook
 
 
 @pytest.mark.parametrize("key", [b" ", b"q", b"\n"])

@@ -58,7 +58,7 @@ def test_what_is_written_is_complete(baseline):
     }
     assert figures == {"controls.png", *(f"tips-{name}.png" for name in simulation.IMPERFECTIONS), *shapes}
     rows = list(csv.DictReader((baseline / "table1.csv").open()))
-    assert len(rows) == 2 * 8
+    assert len(rows) == 3 * 8
     truth = kc.load_trajectory(baseline / "trajectories/reference-sine.nc")
     robot = kc.load_robot(simulation.ROBOT)
     tensions = kc.controls.sine(1.5, 100, 0.05, sampled="end")

@@ -102,6 +102,7 @@ class EmergencyStop:
         self._wakeup, self._wakeup_end = os.pipe()
         os.set_blocking(self._wakeup_end, False)
         self._previous_fd: int | None = None
+        self._previous_hook, sys.unraisablehook = sys.unraisablehook, self._unraisable
         with contextlib.suppress(ValueError):  # only the main thread has signals
             self._previous_fd = signal.set_wakeup_fd(self._wakeup_end, warn_on_full_buffer=False)
             for name in SIGNALS:
@@ -116,6 +117,7 @@ class EmergencyStop:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._leaving = True
+        sys.unraisablehook = self._previous_hook
         if kind is not None:
             self.stop(f"an error ({kind.__name__})")
         if self._stopped:
@@ -142,6 +144,11 @@ class EmergencyStop:
         if number == getattr(signal, "SIGQUIT", None) or not (self._leaving or self._raised):
             self._raised = True
             raise StoppedError(f"stopped by {signal.Signals(number).name}; the tendons are released")
+
+    def _unraisable(self, unraisable: sys.UnraisableHookArgs) -> None:
+        # during a destructor or a garbage collection Python drops the error; `check` raises it again
+        if not isinstance(unraisable.exc_value, StoppedError):
+            self._previous_hook(unraisable)
 
     def _watch(self) -> None:
         """Wait for keys and signals."""
