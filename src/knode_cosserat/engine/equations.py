@@ -279,6 +279,27 @@ class TangentEquations(Equations):
         self.moved = {name: program.derivative(nodes, tangents) for name, nodes in results.items()}
         outputs = [node for nodes in self.moved.values() for node in nodes]
         self.moved_terms = self._hoisted(outputs, {STEP, RUN})
+        #: operations of the rates that all directions have in common
+        self.common = self._common(self.moved["rates"], [*self.dparameters, self.ds.item()])
+
+    def _common(self, outputs: Sequence[int], directions: Sequence[int]) -> list[int]:
+        """Return the operations at a state that are the same for all directions, and that others need."""
+        program = self.program
+        moving = program.dependent(outputs, directions, linear=True)
+        todo = [each for node in moving for each in program.arguments(node)]
+        found = set[int]()
+        while todo:
+            node = todo.pop()
+            if node in moving or node in found or program.levels[node] != STATE:
+                continue
+            if node in program.shapes:
+                return []  # arrays are evaluated where they are used
+            name = program.operations[node][0]
+            if program.is_boolean(node):
+                todo += program.arguments(node)
+            elif name != "input":
+                found.add(node)
+        return sorted(found)
 
     def _pull(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
         program = self.program

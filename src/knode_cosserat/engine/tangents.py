@@ -120,6 +120,8 @@ class _TangentCode(EliminationCode):
         #: the results of the equations at fixed y, by the names of their derivatives
         t = self.tangents
         self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
+        #: arrays of further values of the rates, and their nodes
+        self.shared = list[tuple[Array, Any]]()
         self._reserve_products()
         self._write()
         self._run = self.module.compile()["run"]
@@ -139,7 +141,7 @@ class _TangentCode(EliminationCode):
             (self.by_history["rates"], _nodes(e.by_history["rates"])),
             (self.by_control["rates"], _nodes(e.by_control["rates"])),
         ]  # fmt: skip
-        self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes)
+        self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes + self.shared)
         self.solved = self._write_solved()
         self._write_factor()
         self.advance = self._write_advance()
@@ -566,6 +568,8 @@ class TangentCore(_TangentCode):
 
     def _reserve_products(self) -> None:
         e, a = self.equations, self._array
+        self.common = a(len(e.common), self.used)
+        self.shared.append((self.common, e.common))
         whole, self._size = self._size, 0
         # of one direction of the system
         self.dparameters = a(len(e.dparameters), memory=1)
@@ -592,7 +596,10 @@ class TangentCore(_TangentCode):
         known = {node: values[node] for node in e.moved_terms} | moves
         for name in ("rates", "far"):
             for j, _, here in self._states_at(name) if e.moved[name] else ():
-                here |= known | ({e.ds.item(): self._wide(self.ds, 0, j)} if name == "rates" else {})
+                here |= known
+                if name == "rates":
+                    here |= {node: self._wide(self.common, i, j) for i, node in enumerate(e.common)}
+                    here[e.ds.item()] = self._wide(self.ds, 0, j)
                 self._write_results([(self.moved[name], e.moved[name])], j, here)
         for name, here in self._end_states():
             for i, value in enumerate(self._evaluated(e.moved[name], 0, False, here | known)):

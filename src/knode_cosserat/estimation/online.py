@@ -179,12 +179,16 @@ def split_record(system: System, record: Any) -> tuple[Any, Any]:
     return record[..., :ny], record[..., ny : ny + nz]
 
 
-@functools.partial(jax.jit, static_argnames="output")
+@functools.partial(jax.jit, static_argnames=("output", "columns"))
 def errors_along(
-    system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T N x k"],
-    references: Float[Any, "T p"], directions: Any = None,
+    system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T ... k"],
+    references: Float[Any, "T p"], directions: Any = None, columns: tuple[int, ...] | None = None,
 ) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
-    """Return the errors of an output in every row, and their tangents; `directions` are k of the system."""
+    """Return the errors of an output in every row, and their tangents; `directions` are k of the system.
+
+    The tangents of records are those of all numbers (T, N, x, k), or of the `columns` (T, columns, k) among
+    the N * x numbers of a record, while the others do not move.
+    """
     leaves, tree = jax.tree.flatten(system)
     moves = jax.tree.leaves(directions)
 
@@ -193,7 +197,17 @@ def errors_along(
         return output.errors(robot, *split_record(system, records), references)
 
     value, moved = jax.linearize(errors, records, *leaves[: len(moves)])
-    return value, jax.vmap(moved, in_axes=(-1, *(0 for _ in moves)))(d_records, *moves)
+    if columns is None:
+        return value, jax.vmap(moved, in_axes=(-1, *(0 for _ in moves)))(d_records, *moves)
+    # a column of zeros is read in place of all other numbers: no array of all is written
+    place = np.full(records[0].size, len(columns))
+    place[list(columns)] = np.arange(len(columns))
+
+    def along(tangent: Any, *direction: Any) -> Any:
+        wider = jnp.concatenate([tangent, jnp.zeros((len(tangent), 1))], axis=1)
+        return moved(wider[:, place].reshape(records.shape), *direction)
+
+    return value, jax.vmap(along, in_axes=(-1, *(0 for _ in moves)))(d_records, *moves)
 
 
 @functools.partial(jax.jit, static_argnames="output")

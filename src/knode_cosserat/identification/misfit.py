@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 
 from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.online import errors_along, errors_of
+from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import stepped
@@ -97,6 +98,7 @@ class Misfit:
     def __init__(self, model: Model, data: Sequence[Experiment]):
         self.model, self.data = model, tuple(data)
         self._first = True
+        self._known_columns: dict[Output, tuple[int, ...]] = {}
         # no value of a number, such as an effect that a robot lacks, needs machine code of its own
         directions, _ = _directions(model.robot, np.where(model.begin == 0.0, 0.1, model.begin))
         self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
@@ -209,26 +211,33 @@ class Misfit:
                 d_controls = slope[:steps, :, None] * np.asarray(by_latency)[which]
             changes = Changes(d_controls, directions, weights)
             solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
-            d_records = np.zeros((0, *records.shape[1:], weights.shape[1]))
-            if steps and data.static:
-                d_rows, *_ = static_tangents(task.settings, solved, (system, controls), changes)
-                d_records = d_rows[:, :, :size]
-            elif steps:
+            at, columns = (system, controls), self._columns(system, data.output, filled(records), seen_data)
+            used = np.isin(np.arange(records[0].size), columns).reshape(records[0].shape)
+            if data.static:
+                d_rows = static_tangents(task.settings, solved, at, changes, used)[0]
+            else:
                 state = TangentState.of(system, data.settings.space, past, *d_past)
-                _, (d_rows, _) = tangent_time_loop(
-                    task.coefficients, solved, (system, controls), changes, state
-                )
-                d_records = d_rows[stages - 1 :: stages][compared][:, :, :size]
+                d_rows = tangent_time_loop(task.coefficients, solved, at, changes, state, used)[1][0]
             # zeros in all other columns: one compiled program serves any coordinates
-            whole = np.zeros((*records.shape, len(x)))
-            whole[..., which] = np.concatenate([d_first[None, :, :size], d_records])
+            whole = np.zeros((len(records), len(columns), len(x)))
+            whole[:1, :, which] = d_first[None, :, :size][:, used]
+            whole[1:, :, which] = d_rows[stages - 1 :: stages][compared]
             _, slopes = errors_along(
-                system, data.output, filled(records), filled(whole), seen_data, directions
+                system, data.output, filled(records), filled(whole), seen_data, directions, columns
             )
             return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, filled(records), seen_data))
         return Rollout(errors[: len(records)] / noise, tangents)
+
+    def _columns(
+        self, system: Any, output: Output, records: np.ndarray, measured: np.ndarray
+    ) -> tuple[int, ...]:
+        """Return the numbers of a record (N * x) on which an output depends, now or before."""
+        known = self._known_columns.get(output, ())
+        found = np.flatnonzero(_sensitive(system, output, records, measured))
+        self._known_columns[output] = tuple(np.union1d(found, known).astype(int).tolist())
+        return self._known_columns[output]
 
     def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
         """Return the start of an experiment; None if there is no equilibrium."""
@@ -300,6 +309,15 @@ def _acting(system: Any, data: Experiment) -> tuple[np.ndarray, np.ndarray | Non
         for shift in (0.5 * dt, -0.5 * dt, 0.0)
     )
     return acting, (late - early) / dt
+
+
+@functools.partial(jax.jit, static_argnames="output")
+def _sensitive(system: Any, output: Output, records: Any, measured: Any) -> Any:
+    """Return true for the numbers of a record (N * x) on which the errors depend in any row."""
+    errors, pull = jax.vjp(lambda rows: errors_of(system, output, rows, measured), records)
+    # numbers without a pattern do not cancel
+    weights = jnp.sin(1.0 + jnp.arange(errors.size) ** 1.5).reshape(errors.shape)
+    return jnp.any(pull(weights)[0] != 0.0, axis=0).ravel()
 
 
 @jax.jit

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from knode_cosserat.engine.equations import is_moving
 from knode_cosserat.engine.loops import at_all_stages, table_of, tangents_for
@@ -24,6 +24,9 @@ from knode_cosserat.solvers.history import StateHistory, StepCoefficients, used_
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import SpaceScheme
+
+#: most numbers of tangents that are kept at once if few are needed: as many as a cache holds
+PART = 500_000
 
 
 class Changes(NamedTuple):
@@ -64,13 +67,14 @@ class TangentState(NamedTuple):
 
 def tangent_time_loop(
     steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes,
-    state: TangentState,
+    state: TangentState, kept: Bool[np.ndarray, "N x"] | None = None,
 ) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
     """Return the state after the last of some solved rows, and the tangents of all rows and unknowns.
 
     They are linear in `changes` and in the tangents of `state`. `solved` are all rows and unknowns, and
     with several stages those of every stage, like the result; `at` are system and controls. Tangents are
-    columns: weights, controls, state and results have one more axis, the last.
+    columns: weights, controls, state and results have one more axis, the last. The tangents of all numbers
+    of a row are returned, (solves, N, x, m), or those of `kept` ones, (solves, q, m).
     """
     (system, controls), settings, (d_controls, directions, weights, d_tip) = at, steps.settings, changes
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
@@ -94,14 +98,26 @@ def tangent_time_loop(
     moved, weights = moved[needed], weights[needed]
     own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
     table = table_of(steps, len(controls), float(state.t0))
-    known = SolvedSteps(parameters_of(system), table, own, *solved, state.records, state.rate)
-    after, found = core.solve(known, (moved, weights), d_own, (state.d_records, state.d_rate), d_tip)
-    return TangentState._make((*after, state.t0)), found
+    parameters, found = parameters_of(system), list[tuple[np.ndarray, np.ndarray]]()
+    part = max(len(own) if kept is None else PART // (kept.size * weights.shape[1]), 1)
+    for first in range(0, max(len(own), 1), part):
+        on = slice(first, first + part)
+        data = (each[on] for each in (table, own, *solved))
+        known = SolvedSteps._make((parameters, *data, state.records, state.rate))
+        d_states = state.d_records, state.d_rate
+        after, (d_rows, d_unknowns) = core.solve(known, (moved, weights), d_own[on], d_states, d_tip)
+        state = TangentState._make((*after, state.t0))
+        found.append((d_rows if kept is None else d_rows[:, :, : kept.shape[1]][:, kept], d_unknowns))
+    if len(found) == 1:
+        return state, found[0]
+    d_rows, d_unknowns = (np.concatenate(each) for each in zip(*found, strict=True))
+    return state, (d_rows, d_unknowns)
 
 
 def static_tangents(
-    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes
-) -> tuple[Any, Any, Any]:
+    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes,
+    kept: Bool[np.ndarray, "N x"] | None = None,
+) -> tuple[Any, Any, Any]:  # fmt: skip
     """Return the tangents of rows and unknowns of solved equilibria, and of the records of the last.
 
     Arguments as in `tangent_time_loop`. Records are those at the places of the scheme.
@@ -112,5 +128,5 @@ def static_tangents(
     still = dataclasses.replace(settings, time=None)
     before, d_before = (np.stack([each] * still.memory) for each in (none, d_none))
     state = TangentState(before, none, d_before, d_none, 0.0)
-    after, found = tangent_time_loop(StepCoefficients.of(still), solved, at, changes, state)
+    after, found = tangent_time_loop(StepCoefficients.of(still), solved, at, changes, state, kept)
     return *found, after.d_records[0]
