@@ -16,7 +16,7 @@ from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import Discontinuities
-from knode_cosserat.solvers import rollout
+from knode_cosserat.solvers import rollout, sensitivity
 from knode_cosserat.solvers.history import StepCoefficients, history_of, resting_history, unloaded_shape
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.run import TimeIntegration
@@ -332,3 +332,18 @@ def test_transformations_agree_with_each_other(tip_height):
 def test_unsolved_rows_are_nan(tip_height):
     function, tensions = tip_height
     assert np.isnan(jax.jit(function)(1.0, 1e7 * tensions[0]))
+
+
+@pytest.mark.parametrize(("name", "scheme"), [(PAPER, "sdirk2"), (ROUTED, "bdf-alpha")])
+def test_a_few_numbers_of_rows_have_the_tangents_that_they_have_among_all(monkeypatch, name, scheme):
+    """Parts of the steps follow each other from the state before, whatever their length."""
+    motion = Motion(name, scheme)
+    last, (d_rows, d_unknowns) = tangent_time_loop(*motion.given)
+    kept = np.random.default_rng(0).uniform(size=d_rows.shape[1:3]) < 0.1
+    monkeypatch.setattr(sensitivity, "PART", 4 * kept.size * COLUMNS)
+    after, (own, unknowns) = tangent_time_loop(*motion.given, kept)
+    for found, wanted in (
+        (own, d_rows[:, kept]), (unknowns, d_unknowns), (after.d_records, last.d_records),
+        (after.d_rate, last.d_rate),
+    ):  # fmt: skip
+        np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * np.max(np.abs(wanted)))

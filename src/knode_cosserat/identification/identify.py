@@ -18,10 +18,11 @@ from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.effects import library_model, parameter_effects, place_effects
 from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
 from knode_cosserat.identification.misfit import Misfit, Rollout
+from knode_cosserat.identification.next_experiment import next_experiment
 from knode_cosserat.identification.posterior import SURE, Posterior
-from knode_cosserat.identification.result import Identified, estimates_of, variance_ratio
+from knode_cosserat.identification.result import Identified, estimates_of
 from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import Selection, from_far, search_of, selected, sizes
+from knode_cosserat.identification.selection import WORSE, Selection, best_predicting, from_far, selected
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.identification.undetermined import gap_of, unexplained
 from knode_cosserat.learning.training.checkpoint import Checkpoints
@@ -38,17 +39,11 @@ log = logging.getLogger(__name__)
 
 #: nodes are doubled so often at most
 REFINEMENTS = 2
-#: most evaluations of a search without one recording
-FOLD = (8, 5e-3)
 #: numbers of first horizons that searches without priors leave out, one after the other
 SKIPPED = (0, 3, 9)
 #: row 0 disagrees with the initial equilibrium if it is further away than this part of the length, and than
 #: this part of the motion's root mean square
 AWAY, OF_MOTION = 0.01, 0.25
-#: most selections by what recordings disagree about
-SELECTIONS = 3
-#: an averaged robot is not used if the logarithm of its differences' size is larger by this
-WORSE = 0.02
 
 Tell = Callable[[str], None]
 
@@ -135,8 +130,14 @@ def identify(
 
     search = searched(robot)
     model = search.misfit.model
+    steps = list[str]()
+
+    def step(line: str) -> None:
+        steps.append(line)
+        tell(line)
+
     try:
-        names, steps = model.names, tuple[str, ...]()
+        names = model.names
         if effects is not None:
             names = _known([*effects, *(effect.name for effect in plain)], model)
             point = search.from_far(model.mask(names))
@@ -144,20 +145,23 @@ def identify(
             point = from_far(search)
         for refinements in range(REFINEMENTS + 1):
             if effects is None:
-                names, point, more = selected(search, point)
-                steps += more
+                names, point = selected(search, point, step)
             elif refinements:
                 point = search.run(point.x, model.mask(names))
             if not has_coarse_rows(search.misfit.system(point.x), search.misfit.data, space):
                 break
             nodes = 2 * model.nominal.nodes
-            steps += (f"{nodes} nodes, for the grid was too coarse",)
-            tell(steps[-1])
+            step(f"{nodes} nodes, for the grid was too coarse")
             search = searched(model.nominal.replace(nodes=nodes))
             model = search.misfit.model
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
-    return _accepted(search, Selection(names, point, steps), effects is not None, space)
+    selection = Selection.of(search, names, point)
+    if effects is None and selection.folds:
+        selection = best_predicting(search, selection, step)
+    return dataclasses.replace(
+        _accepted(search, selection, effects is not None, space, step), steps=tuple(steps)
+    )
 
 
 # plain parameters
@@ -192,9 +196,9 @@ def _with_parameters(search: Search) -> Identified:
         raise IdentificationError("the search did not converge; begin closer to the data")
     _require_range(model, names, point)
     posterior = Posterior.of(model, point, names)
-    result = _result(search, model.reduced(point.x, names), (point.x, names), posterior, steps)
+    result = _result(search, model.reduced(point.x, names), (point.x, names), posterior)
     undetermined = tuple(name for name in model.names if name not in names)
-    return dataclasses.replace(result, undetermined=undetermined)
+    return dataclasses.replace(result, undetermined=undetermined, steps=tuple(steps))
 
 
 def _from_far(search: Search, free: np.ndarray) -> Point:
@@ -259,79 +263,73 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
     return tuple(name for name in model.names if name in wanted)
 
 
-def _accepted(search: Search, selection: Selection, known: bool, space: str | SpaceScheme) -> Identified:
+def _accepted(
+    search: Search, selection: Selection, known: bool, space: str | SpaceScheme, step: Tell
+) -> Identified:
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails.
 
     The effects are `known` if they were not selected.
     """
     model, data = search.misfit.model, search.misfit.data
-    names, point, steps = selection.names, selection.point, list(selection.steps)
-    searched = {names}
     while True:
-        ends = [search.without(point, k, FOLD) for k in range(len(data))] if len(data) > 1 else []
-        scatter = variance_ratio(point, [end.x for end in ends if end is not None])
-        posterior = Posterior.of(model, point.scattered(scatter), names if known else None)
-        if not known and posterior.names() not in searched and len(searched) <= SELECTIONS:
-            # recordings that disagree support fewer effects
-            searched.add(posterior.names())
-            end = search_of(search, posterior, np.where(point.free, point.x, model.begin))
-            if end is not None:
-                names, point = posterior.names(), end
-                steps.append(f"with {', '.join(names)}, as recordings differ: {sizes(point)}")
-                search.tell(steps[-1])
-                continue
-        x, kept = _averaged(search, names, point, posterior)
+        names, point, folds, _ = selection
+        x, kept, posterior = _averaged(search, selection, selection.posterior(model, known))
         reason = failed_trial(search.misfit.system(x), data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
         search.tell(f"not accepted: {reason}")
         if not added:
-            return _nominal(search, (*steps, f"the nominal robot is returned: {reason}"))
+            step(f"the nominal robot is returned: {reason}")
+            return _nominal(search)
         fewer = {
             name: tuple(it for it in names if name not in (it, *model.effect(it).needs)) for name in added
         }
         weakest = max(added, key=lambda name: posterior.evidence(fewer[name]))
-        steps.append(f"without {weakest}: {reason}")
+        step(f"without {weakest}: {reason}")
         names, known = fewer[weakest], True
         free = model.mask(names)
-        point = search.run(np.where(free, point.x, 0.0), free)
+        selection = Selection.of(search, names, search.run(np.where(free, point.x, 0.0), free))
     errors: list[float | None] = [None]
-    if ends:
-        errors = [None if it is None else _errors(search, it.x, [k], False)[0] for k, it in enumerate(ends)]
+    if folds:
+        errors = [None if it is None else _errors(search, it.x, [k], False)[0] for k, it in enumerate(folds)]
         nominal = _errors(search, np.zeros(model.size), tip=False)
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
         if np.mean(unseen) >= np.mean(before):
-            reason = "the nominal robot is returned: it predicts held-out recordings as well"
-            return _nominal(search, (*steps, reason))
+            step("the nominal robot is returned: it predicts held-out recordings as well")
+            return _nominal(search)
     robot = model.reduced(x, kept)
     robot = robot.replace(trained=trained_range(robot, data, space))
-    result = _result(search, robot, (x, kept), posterior, steps)
+    result = _result(search, robot, (x, kept), posterior)
+    undecided = tuple(result.undecided)
     return dataclasses.replace(
         result,
         held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
+        next_experiment=next_experiment(search, posterior, x, undecided) if undecided else None,
     )
 
 
 def _averaged(
-    search: Search, names: Sequence[str], point: Point, posterior: Posterior
-) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return the mean coordinates over all sets of effects, and the effects that are not improbable.
+    search: Search, selection: Selection, posterior: Posterior
+) -> tuple[np.ndarray, tuple[str, ...], Posterior]:
+    """Return the mean coordinates over all sets of effects, the probable effects, and their distribution.
 
-    If the robot with them is further from the data than the selected effects, those are returned.
+    If the robot with them is further from the data than the selected effects, it is those and about them.
     """
+    model, point = search.misfit.model, selection.point
     kept = posterior.names(1.0 - SURE)
-    x = np.where(search.misfit.model.mask(kept), posterior.mean, 0.0)
-    if set(kept) != set(names):
+    x = np.where(model.mask(kept), posterior.mean, 0.0)
+    if set(kept) != set(selection.names):
         rollouts = search.solved(x)
         if rollouts is None or np.mean(np.log(search.scales_of(rollouts) / point.scale)) > WORSE:
-            return np.where(point.free, point.x, 0.0), tuple(names)
-    return x, kept
+            x = np.where(point.free, point.x, 0.0)
+            return x, selection.names, posterior.about(x)
+    return x, kept, posterior
 
 
-def _nominal(search: Search, steps: Sequence[str]) -> Identified:
+def _nominal(search: Search) -> Identified:
     errors = _errors_by_name(search, np.zeros(search.misfit.model.size))
-    return Identified(search.misfit.model.nominal, nominal_error=errors, error=errors, steps=tuple(steps))
+    return Identified(search.misfit.model.nominal, nominal_error=errors, error=errors)
 
 
 # errors of the tip
@@ -388,20 +386,20 @@ def _errors_by_name(search: Search, x: np.ndarray) -> dict[str, float | None]:
 
 
 def _result(
-    search: Search, robot: System, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior,
-    steps: Sequence[str],
-) -> Identified:  # fmt: skip
+    search: Search, robot: System, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior
+) -> Identified:
     """Return the result with an identified robot, `at` coordinates of some effects."""
-    x, estimates = at[0], estimates_of(posterior, *at)
-    probable = {it.effect: it.probability for it in estimates}
+    (x, names), estimates = at, estimates_of(posterior, *at)
+    possible = {
+        name: share for name, share in posterior.probability.items() if name in names or share >= 1.0 - SURE
+    }
     return Identified(
         robot=robot,
-        effects=tuple(name for name, share in probable.items() if share >= SURE),
-        undecided={name: share for name, share in probable.items() if share < SURE},
+        effects=tuple(name for name, share in possible.items() if share >= SURE),
+        undecided={name: share for name, share in possible.items() if share < SURE},
         estimates=estimates,
         correlation=posterior.correlation([it.label for it in estimates]),
         nominal_error=_errors_by_name(search, np.zeros(len(x))),
         error=_errors_by_name(search, x),
         unexplained=unexplained(search, x),
-        steps=tuple(steps),
     )

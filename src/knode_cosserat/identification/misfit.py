@@ -63,6 +63,12 @@ class Rollout:
         copied.values, copied.offset = self.values - self.offset + offset, offset
         return copied
 
+    def only(self, used: Bool[np.ndarray, "rows e"]) -> Rollout:
+        """Return it with some of its differences."""
+        copied = copy.copy(self)
+        copied.values = np.where(used, self.values, np.nan)
+        return copied
+
     @functools.cached_property
     def derivatives(self) -> Float[np.ndarray, "n rows e"]:
         """Derivatives of the differences by all coordinates."""

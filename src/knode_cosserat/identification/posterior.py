@@ -84,6 +84,14 @@ class Posterior:
             return np.sqrt(np.diag(self.point.covariance()))
         return self.draws.std(axis=0)
 
+    def about(self, x: Float[np.ndarray, " n"]) -> Posterior:
+        """Return it with the same spread about other coordinates of the effects that are present."""
+        if self.draws is None:
+            return self
+        present = self.draws != 0.0
+        mean = self.draws.sum(axis=0) / np.maximum(present.sum(axis=0), 1)
+        return dataclasses.replace(self, draws=self._clipped(np.where(present, self.draws + (x - mean), 0.0)))
+
     def interval(self, level: float) -> Float[np.ndarray, "2 n"]:
         """Return the ends of an interval of each coordinate, within the bounds."""
         # imported here: it takes a third of a second

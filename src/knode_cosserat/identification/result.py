@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._reprs import robot_text, wrapped
+from knode_cosserat.identification.next_experiment import NextExperiment
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.search import Point
 from knode_cosserat.rods.system import System
@@ -49,6 +50,7 @@ class Identified:
             searched for.
         undecided: effects that it may have, and their probabilities; the data do not decide. The robot has
             the mean of what they would change.
+        next_experiment: controls that would tell most about these; None if all is decided.
         estimates: their numbers with 95 % intervals.
         correlation: correlation of the numbers' errors, in the order of `estimates` (n, n).
         nominal_error: by recording, root mean square error of the tip of the nominal robot (m).
@@ -70,6 +72,7 @@ class Identified:
     unexplained: tuple[str, ...] = ()
     steps: tuple[str, ...] = ()
     undecided: Mapping[str, float] = dataclasses.field(default_factory=dict)
+    next_experiment: NextExperiment | None = None
 
     def __getitem__(self, label: str) -> Estimate:
         """Return the estimate of a number by its label, such as "youngs_modulus" or "gravity[2]".
@@ -88,6 +91,7 @@ class Identified:
         return {
             "effects": list(self.effects),
             "undecided": dict(self.undecided),
+            "next_experiment": self.next_experiment and str(self.next_experiment),
             "estimates": [it._asdict() | {"interval": list(it.interval)} for it in self.estimates],
             "correlation": self.correlation.tolist(),
             "nominal_error": dict(self.nominal_error),
@@ -136,6 +140,8 @@ class Identified:
         if self.undecided:
             words = ", ".join(f"{name} ({share:.0%})" for name, share in self.undecided.items())
             lines.append(f"not decided by these data, with probabilities: {words}")
+        if self.next_experiment:
+            lines.append(f"an experiment that would tell most: {self.next_experiment}")
         if self.undetermined:
             lines.append(f"not determined by these data, unchanged: {', '.join(self.undetermined)}")
         if self.unexplained:

@@ -45,6 +45,9 @@ FIRST, EXACT = (50, 1e-5), (100, 1e-10)
 #: the end
 PASS, PASSES, SETTLED = 5, 8, 0.05
 METHOD: Literal["trf"] = "trf"
+#: a row is not used if it moves by more lengths than this for each standard deviation of the priors: such a
+#: motion is unstable there, and derivatives say nothing
+LARGEST = 10.0
 
 
 class SearchError(KnodeCosseratError, RuntimeError):
@@ -167,19 +170,29 @@ class Search:
         Raises:
             SearchError: the nominal robot cannot be simulated, not even at rest.
         """
-        x = np.where(free, self.misfit.model.begin, 0.0)
+        x = self.over(np.where(free, self.misfit.model.begin, 0.0), free, HORIZONS, skipped)
+        return self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
+
+    def over(
+        self,
+        x: Float[np.ndarray, " n"],
+        free: Bool[np.ndarray, " n"],
+        parts: Sequence[float],
+        skipped: int = 0,
+    ) -> Float[np.ndarray, " n"]:
+        """Return coordinates after searches over parts of the longest motion, without the first ones."""
         data = self.misfit.data
         longest = max(len(it.control) - it.moves for it in data)
         wound = {"reel", "motor"} & {*self.misfit.model.nominal.control_layout.names}
         if data[0].static or wound:
             # rows are independent of each other, and wound-up lengths keep the search near the solution
             longest = 0
-        counts = [0] * (not self.exact) + [max(2, round(part * longest)) for part in HORIZONS[1:]]
+        counts = [max(2, round(part * longest)) if part else 0 for part in parts if part or not self.exact]
         for horizon in [*dict.fromkeys(counts)][skipped:]:
             if horizon < 0.8 * longest:
                 rows = max(self._rows_until(horizon, it) for it in data)
                 x = self.run(x, free, Subset(rows), FIRST if self.exact else ROUGH).x
-        return self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
+        return x
 
     def _rows_until(self, count: int, data: Experiment) -> int:
         """Return the number of rows after the first in motion with so many rows that were measured."""
@@ -258,12 +271,14 @@ class Search:
                 break
         sizes = self.scales_of(rollouts, which) if scale is None else scale
         units = self.units(sizes, which)
+        which_free = np.ones(len(x), dtype=bool) if every else free
         self.misfit.differentiated(rollouts, None if every else free)
+        rollouts = [it.only(used) for it, used in zip(rollouts, self.used(rollouts, which_free), strict=True)]
         thinned = self.thinned()
         if not self.exact:
             data = [self.misfit.data[k] for k in (range(len(self.misfit.data)) if which is None else which)]
             thinned = dispersion(rollouts, units, [0.0 if it.static else it.dt for it in data], free)
-        problem = normal_equations(rollouts, units, thinned, np.ones(len(x), dtype=bool) if every else free)
+        problem = normal_equations(rollouts, units, thinned, which_free)
         return Point(x, sizes, problem, free, self.prior, converged)
 
     def scales_of(self, rollouts: Sequence[Rollout], which: Sequence[int] | None = None) -> np.ndarray:
@@ -285,6 +300,17 @@ class Search:
             # white noise of one sensor; separate weights would drift where the model is wrong
             scales[:] = np.sqrt(np.mean(scales**2, axis=0))
         return scales
+
+    def used(self, rollouts: Sequence[Rollout], which: Bool[np.ndarray, " n"]) -> list[np.ndarray]:
+        """Return which differences (rows, e) of each rollout are known, in rows with usable derivatives."""
+        found = []
+        for rollout in rollouts:
+            known = np.isfinite(rollout.values)
+            if not self.exact:
+                sizes = np.linalg.norm(rollout.derivatives_by(which), axis=0)
+                known &= (np.max(sizes, axis=1) <= LARGEST * self.length)[:, None]
+            found.append(known)
+        return found
 
     def units(self, scale: np.ndarray, which: Sequence[int] | None = None) -> list[np.ndarray]:
         """Return the unit (e,) of every number of a difference."""
@@ -317,7 +343,8 @@ class _Descent:
         search, free = self.search, self.free
         self.begin, self.low, self.high = self.x, search.low[free], search.high[free]
         self.units, self.thinned = search.units(self.sizes, self.subset.which), np.sqrt(search.thinned())
-        self.known = [np.isfinite(rollout.values) for rollout in self.rollouts]
+        search.misfit.differentiated(self.rollouts, free)
+        self.known = search.used(self.rollouts, free)
         #: the last rollouts, and those of least cost, with their coordinates
         self.last: tuple[bytes, list[Rollout] | None] = (self.x[free].tobytes(), self.rollouts)
         self.best, self.lowest = self.last, np.inf
@@ -383,7 +410,8 @@ class _Descent:
     def slopes(self, step: np.ndarray) -> np.ndarray:
         """Return the derivatives of the values."""
         rollouts = self._at(step)
-        assert rollouts is not None
+        if rollouts is None:  # a begin at a bound, from which it was moved
+            raise SearchError("the robot that the search begins from cannot be simulated")
         self.search.misfit.differentiated(rollouts, self.free)
         scaled = self._scaled(rollouts)
         size = np.abs(scaled)

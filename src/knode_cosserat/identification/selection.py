@@ -1,54 +1,82 @@
-"""Selection of effects: the most probable ones, searched again until their set stays the same."""
+"""Selection of effects: the most probable ones, and of several such sets the one that predicts best."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.posterior import Posterior
-from knode_cosserat.identification.search import Point, Search, SearchError
+from knode_cosserat.identification.result import variance_ratio
+from knode_cosserat.identification.search import HORIZONS, Point, Search, SearchError, Subset
 
 #: most searches with other effects
 MOST = 4
 #: evaluations of these searches, and the part by which the cost falls at their end
 TRIED = (15, 2e-3)
-#: the same of the first search, with all effects
-FIRST = (6, 1e-2)
+#: the same of the first search, with all effects, and of searches without one recording
+FIRST, FOLD = (6, 1e-2), (8, 5e-3)
+#: most selections by what recordings disagree about
+SELECTIONS = 3
+#: a set of effects, or their average, is not used if the logarithm of the differences' size is larger by this
+WORSE = 0.02
 
 
 class Selection(NamedTuple):
-    """Selected effects, the end of their search, and the steps of the selection, in words."""
+    """Selected effects, and the end of their search, with the ends without one recording each."""
 
     names: tuple[str, ...]
     point: Point
-    steps: tuple[str, ...] = ()
+    folds: tuple[Point | None, ...] = ()
+    #: logarithm of the usual size of the differences of each recording, in the search without it
+    unseen: Float[np.ndarray, " R"] = np.zeros(0)
+
+    @classmethod
+    def of(cls, search: Search, names: tuple[str, ...], point: Point) -> Selection:
+        """Return the selection after searches without one recording each."""
+        count = len(search.misfit.data)
+        folds = [search.without(point, k, FOLD) for k in range(count)] if count > 1 else []
+        unseen = np.full(len(folds), np.inf)
+        for k, fold in enumerate(folds):
+            rollouts = None if fold is None else search.solved(fold.x, Subset(None, [k]))
+            if rollouts is not None:
+                unseen[k] = np.mean(np.log(search.scales_of(rollouts, [k])))
+        return cls(names, point, tuple(folds), unseen)
+
+    def posterior(self, model: Model, known: bool = False) -> Posterior:
+        """Return the probabilities of effects, in view of what recordings disagree about."""
+        scatter = variance_ratio(self.point, [fold.x for fold in self.folds if fold is not None])
+        return Posterior.of(model, self.point.scattered(scatter), self.names if known else None)
 
 
 def from_far(search: Search) -> Point:
     """Return the end of a search with all effects or, if that has no begin, with few.
 
+    Over short horizons the shapes of effects stay: fitted to noise, they make later rows unstable.
+
     Raises:
         SearchError: the nominal robot cannot be simulated.
     """
     model = search.misfit.model
+    every = np.ones(model.size, dtype=bool)
     try:
-        return search.from_far(model.mask(model.names), effort=FIRST)
+        x = search.over(model.begin, every & ~model.shapes, HORIZONS[:-2])
+        return search.run(search.over(x, every, HORIZONS[-2:]), every, effort=FIRST, every=True)
     except SearchError as error:
         search.tell(f"all effects: {error}")
     few = model.mask(effect.name for effect in model.effects if effect.basic or effect.usual)
     point = search.from_far(few)
     try:
-        return search.run(
-            np.where(few, point.x, 0.1 * model.begin), np.ones(model.size, dtype=bool), every=True
-        )
+        return search.run(np.where(few, point.x, 0.1 * model.begin), every, every=True)
     except SearchError as error:
         search.tell(f"all effects: {error}")
     return point
 
 
-def selected(search: Search, point: Point) -> Selection:
+def selected(search: Search, point: Point, tell: Callable[[str], None]) -> tuple[tuple[str, ...], Point]:
     """Return the effects that are more probable than not, and the end of their search.
 
     The probabilities belong to equations that are linear about a point (`Posterior`), so the search with the
@@ -57,19 +85,41 @@ def selected(search: Search, point: Point) -> Selection:
     Raises:
         SearchError: no set of effects can be searched.
     """
-    model, steps, searched = search.misfit.model, list[str](), list[tuple[str, ...]]()
+    model, searched = search.misfit.model, list[tuple[str, ...]]()
     begin, posterior = np.where(point.free, point.x, model.begin), Posterior.of(model, point)
     while posterior.names() not in searched and len(searched) < MOST:
         end = search_of(search, posterior, begin)
         if end is None:
             break
         searched.append(posterior.names())
-        steps.append(f"with {', '.join(searched[-1])}: {sizes(end)}")
-        search.tell(steps[-1])
+        tell(f"with {', '.join(searched[-1])}: {sizes(end)}")
         posterior = Posterior.of(model, end)
     if not searched:
         raise SearchError("no set of effects can be searched")
-    return Selection(searched[-1], posterior.point, tuple(steps))
+    return searched[-1], posterior.point
+
+
+def best_predicting(search: Search, selection: Selection, tell: Callable[[str], None]) -> Selection:
+    """Return a selection in view of what recordings disagree about, as long as it predicts as well.
+
+    Each set is selected about the end of the last one, and has to predict as well as that the recordings that
+    were left out of the searches.
+    """
+    for _ in range(SELECTIONS):
+        posterior, last = selection.posterior(search.misfit.model), selection.point
+        if posterior.names() == selection.names:
+            break
+        end = search_of(search, posterior, np.where(last.free, last.x, search.misfit.model.begin))
+        if end is None:
+            break
+        other = Selection.of(search, posterior.names(), end)
+        words = f"with {', '.join(other.names)}, as recordings differ: {sizes(end)}"
+        if np.mean(other.unseen - selection.unseen) > WORSE:
+            tell(f"not {words}; it predicts held-out recordings worse")
+            break
+        tell(words)
+        selection = other
+    return selection
 
 
 def search_of(search: Search, posterior: Posterior, begin: Float[np.ndarray, " n"]) -> Point | None:

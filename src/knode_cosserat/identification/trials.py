@@ -45,7 +45,7 @@ def failed_trial(robot: System, data: Sequence[Experiment], space: str | SpaceSc
     ]  # fmt: skip
     for words, like, tension in [*trials, ("random tensions", data[0], _random(data))]:
         try:
-            _, motion = _moved(robot, tension, like, space)
+            _, motion = moved(robot, tension, like, space)
         except SimulationError as error:
             return f"{words}: {error}"
         if not np.all(np.isfinite(np.asarray(motion.y))):
@@ -60,7 +60,7 @@ def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | Spac
     """
     for it in data:
         try:
-            _, motion = _moved(robot, it.control, it, space)
+            _, motion = moved(robot, it.control, it, space)
         except SimulationError:
             return False
         if np.mean(np.asarray(motion.result) == Result.COARSE) > FEW:
@@ -70,7 +70,7 @@ def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | Spac
 
 def trained_range(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> TrainedRange | None:
     """Return the range of controls, strains and strain rates of the robot in its recordings."""
-    return TrainedRange.of(part for it in data for part in _moved(robot, it.control, it, space))
+    return TrainedRange.of(part for it in data for part in moved(robot, it.control, it, space))
 
 
 def _random(data: Sequence[Experiment]) -> Float[np.ndarray, "T c"]:
@@ -82,7 +82,7 @@ def _random(data: Sequence[Experiment]) -> Float[np.ndarray, "T c"]:
     return np.repeat(drawn, hold, axis=0)[:count]
 
 
-def _moved(
+def moved(
     robot: System, tension: Float[np.ndarray, "T c"], like: Experiment, space: str | SpaceScheme
 ) -> tuple[Trajectory, Trajectory]:
     """Return the equilibrium under a recording's initial tensions, and the rows from there."""
