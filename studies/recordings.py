@@ -61,7 +61,7 @@ OWN_ROBOT, OWN_CONFIG = "robot.yaml", "recording.yaml"
 #: time step of the comparison, and of the paper's models (s); the best model takes steps of a part of it
 DT, FINER = 0.05, 4
 #: schemes in arclength: of all models, and of the paper's
-SPACE, PAPER_SPACE = "lobatto2", "euler"
+SPACE, PAPER_SPACE = "lobatto4", "euler"
 #: default training recordings: the paper's two sines, and one random recording
 TRAIN = ("sine_1p0", "sine_3p0", "rand_0")
 #: recordings of steps are compared from their beginning; all others rest for as long (s) first

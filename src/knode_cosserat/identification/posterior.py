@@ -111,6 +111,8 @@ class Posterior:
         full = self.point.covariance() if self.draws is None else np.cov(self.draws, rowvar=False)
         covariance = full[np.ix_(on, on)]
         spread = np.sqrt(np.diag(covariance))
+        # numbers of improbable effects do not vary
+        spread = np.where(spread > 0.0, spread, np.inf)
         return covariance / np.outer(spread, spread)
 
     def evidence(self, names: Iterable[str]) -> float:

@@ -12,6 +12,7 @@ from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.result import variance_ratio
 from knode_cosserat.identification.search import HORIZONS, Point, Search, SearchError, Subset
+from knode_cosserat.identification.undetermined import unexplained
 
 #: most searches with other effects
 MOST = 4
@@ -53,27 +54,45 @@ class Selection(NamedTuple):
 
 
 def from_far(search: Search) -> Point:
-    """Return the end of a search with all effects or, if that has no begin, with few.
-
-    Over short horizons the shapes of effects stay: fitted to noise, they make later rows unstable.
+    """Return the end of the first search that explains the data, or of the best search.
 
     Raises:
         SearchError: the nominal robot cannot be simulated.
     """
+    points, errors = list[Point](), list[SearchError]()
+    for begun in (_with_all, _with_few_first):
+        try:
+            points.append(begun(search))
+        except SearchError as error:
+            search.tell(f"all effects: {error}")
+            errors.append(error)
+            continue
+        if not unexplained(search, points[-1].x):
+            break
+    if not points:
+        raise errors[-1]
+    return min(points, key=lambda point: float(np.sum(np.log(point.scale))))
+
+
+def _with_all(search: Search) -> Point:
+    """Search with all effects. Over short horizons their shapes stay: fitted to noise, later rows are unstable."""
     model = search.misfit.model
     every = np.ones(model.size, dtype=bool)
-    try:
-        x = search.over(model.begin, every & ~model.shapes, HORIZONS[:-2])
-        return search.run(search.over(x, every, HORIZONS[-2:]), every, effort=FIRST, every=True)
-    except SearchError as error:
-        search.tell(f"all effects: {error}")
+    x = search.over(model.begin, every & ~model.shapes, HORIZONS[:-2])
+    return search.run(search.over(x, every, HORIZONS[-2:]), every, effort=FIRST, every=True)
+
+
+def _with_few_first(search: Search) -> Point:
+    """Search with the usual effects, and then with all if there is such a robot."""
+    model = search.misfit.model
     few = model.mask(effect.name for effect in model.effects if effect.basic or effect.usual)
     point = search.from_far(few)
     try:
-        return search.run(np.where(few, point.x, 0.1 * model.begin), every, every=True)
+        start = np.where(few, point.x, 0.1 * model.begin)
+        return search.run(start, np.ones(model.size, dtype=bool), effort=FIRST, every=True)
     except SearchError as error:
         search.tell(f"all effects: {error}")
-    return point
+        return point
 
 
 def selected(search: Search, point: Point, tell: Callable[[str], None]) -> tuple[tuple[str, ...], Point]:
