@@ -104,6 +104,18 @@ def test_the_shape_of_an_effect_that_is_hardly_there_is_no_evidence_for_it():
     assert found == pytest.approx(exact, abs=1e-9)
 
 
+def test_about_other_coordinates_it_has_the_same_spread():
+    posterior = drawn(np.random.default_rng(3), model_of(), 6.0)[2]
+    x = np.linspace(-1.0, 1.0, EFFECTS)
+    moved = posterior.about(x)
+    for before, after, at in zip(posterior.draws.T, moved.draws.T, x, strict=True):
+        present = before != 0.0
+        assert not after[~present].any()
+        if present.any():
+            assert np.mean(after[present]) == pytest.approx(at) and moved.probability == posterior.probability
+            np.testing.assert_allclose(np.std(after[present]), np.std(before[present]), rtol=1e-9)
+
+
 def test_a_known_set_has_the_intervals_of_least_squares():
     rng, model = np.random.default_rng(3), model_of()
     point = point_of(rng.normal(size=(ROWS, EFFECTS)), rng.normal(size=ROWS), np.zeros(EFFECTS))
