@@ -7,14 +7,7 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.metrics import (
-    dtw_distance,
-    node_error,
-    pose_mse,
-    rotation_rmse,
-    tip_dtw,
-    tip_rmse,
-)
+from knode_cosserat.metrics import dtw_distance, node_error, pose_mse, rotation_rmse, tip_dtw, tip_rmse
 
 
 @dataclass

@@ -21,12 +21,7 @@ SPACES = [thing for name in sorted(kc.__all__) if isinstance(thing := getattr(kc
 #: first words of a docstring that says nothing on its own
 VAGUE = {"What", "Whether", "That", "Those", "How", "Of"}
 #: errors of computations; all others are of arguments
-RUNNING = {
-    kc.SimulationError,
-    kc.estimation.ObserverError,
-    kch.HardwareError,
-    kch.StoppedError,
-}
+RUNNING = {kc.SimulationError, kc.estimation.ObserverError, kch.HardwareError, kch.StoppedError}
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
 

@@ -150,8 +150,7 @@ READERS = {"Measured": Measured.read}
 
 
 @pytest.mark.parametrize(
-    ("batch", "lengths"),
-    [((), 0.5), ((2,), 0.5), ((3,), [0.5, 0.1, 0.025]), ((1,), [0.25])],
+    ("batch", "lengths"), [((), 0.5), ((2,), 0.5), ((3,), [0.5, 0.1, 0.025]), ((1,), [0.25])]
 )
 def test_a_system_of_bytes_is_in_the_file(tmp_path, batch, lengths):
     robot = Measured(lengths) if isinstance(lengths, float) else stacked(*map(Measured, lengths))

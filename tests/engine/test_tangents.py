@@ -341,7 +341,8 @@ def test_a_few_numbers_of_rows_have_the_tangents_that_they_have_among_all(monkey
     last, (d_rows, d_unknowns) = tangent_time_loop(*motion.given)
     kept = np.random.default_rng(0).uniform(size=d_rows.shape[1:3]) < 0.1
     monkeypatch.setattr(sensitivity, "PART", 4 * kept.size * COLUMNS)
-    after, (own, unknowns) = tangent_time_loop(*motion.given, kept)
+    *before, changes, state = motion.given
+    after, (own, unknowns) = tangent_time_loop(*before, changes._replace(kept=kept), state)
     for found, wanted in (
         (own, d_rows[:, kept]), (unknowns, d_unknowns), (after.d_records, last.d_records),
         (after.d_rate, last.d_rate),

@@ -194,12 +194,7 @@ def test_what_cannot_be_drawn_is_said(trajectory, recording):
     batch = dataclasses.replace(
         trajectory, **{name: getattr(trajectory, name)[None] for name in ("y", "z", "control", "result")}
     )
-    for draw in (
-        figures.shape,
-        figures.tensions,
-        figures.overview,
-        lambda it: figures.tips({"": it}),
-    ):
+    for draw in (figures.shape, figures.tensions, figures.overview, lambda it: figures.tips({"": it})):
         with pytest.raises(ValueError, match="a batch of 1 trajectories"):
             draw(batch)
     with pytest.raises(ValueError, match="the prediction has 16 rows and the recording 17"):

@@ -27,12 +27,7 @@ def test_statics_by_order_4(key):
 
 
 #: all families but the second and third mode of vibration, whose errors at 20 nodes are 1.1 and 2.9 %
-DEFAULT = {
-    **beams.STATICS,
-    **beams.BUCKLING,
-    "mode 1": beams.VIBRATION["mode 1"],
-    **motions.MOTIONS,
-}
+DEFAULT = {**beams.STATICS, **beams.BUCKLING, "mode 1": beams.VIBRATION["mode 1"], **motions.MOTIONS}
 
 
 @pytest.mark.slow

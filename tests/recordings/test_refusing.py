@@ -33,9 +33,7 @@ def test_a_bag_of_another_robot_is_refused_by_the_topic_that_it_lacks(tmp_path, 
 def test_a_topic_of_another_type_is_refused(tmp_path, exact):
     path = write(tmp_path / "it.bag", exact)
     other = dataclasses.replace(
-        PAPER,
-        tension=TensionSource("/vicon/continuum_0/pose", (1, 2, 3, 4)),
-        markers=PAPER.markers[1:],
+        PAPER, tension=TensionSource("/vicon/continuum_0/pose", (1, 2, 3, 4)), markers=PAPER.markers[1:]
     )
     message = refused(path, other)
     assert (

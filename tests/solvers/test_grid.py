@@ -256,10 +256,7 @@ CLOSE = (1e-12, 9e-11, 2e-10, 9e-10, 2e-9)
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize(
-    "off",
-    [side * off for off in CLOSE for side in (-1, 1)],
-)
+@pytest.mark.parametrize("off", [side * off for off in CLOSE for side in (-1, 1)])
 def test_a_discontinuity_close_beside_a_node_costs_no_accuracy(off):
     """Taken to be on the node, and looked at from beyond where it is, it was of order 1."""
 

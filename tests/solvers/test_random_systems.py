@@ -196,15 +196,7 @@ def several_rods(seed, hurry=QUICK):
 
 KINDS = {
     each.__name__: each
-    for each in (
-        with_loads,
-        with_ends,
-        in_contact,
-        with_sections,
-        with_tendons,
-        with_reels,
-        several_rods,
-    )
+    for each in (with_loads, with_ends, in_contact, with_sections, with_tendons, with_reels, several_rods)
 }
 
 

@@ -49,8 +49,7 @@ def test_forward_euler_is_neither():
 
 
 @pytest.mark.parametrize(
-    ("name", "order"),
-    [("lobatto2", 2), ("check of lobatto2", 4), ("lobatto4", 4), ("check of lobatto4", 6)],
+    ("name", "order"), [("lobatto2", 2), ("check of lobatto2", 4), ("lobatto4", 4), ("check of lobatto4", 6)]
 )
 def test_formulas_have_their_orders(name, order):
     """R(z) agrees with exp(z) up to z^order, and the formula that checks another has a higher order."""

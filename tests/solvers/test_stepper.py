@@ -131,8 +131,7 @@ def test_wrong_arguments_are_named(robot, change, message):
 
 
 @pytest.mark.parametrize(
-    ("control", "message"),
-    [([1.0], r"shape \(1,\)"), ("pull", "not numbers"), ([np.nan] * 4, "finite")],
+    ("control", "message"), [([1.0], r"shape \(1,\)"), ("pull", "not numbers"), ([np.nan] * 4, "finite")]
 )
 def test_a_wrong_control_is_named(robot, control, message):
     with pytest.raises(ValueError, match=message):

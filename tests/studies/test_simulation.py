@@ -89,17 +89,7 @@ main(app)
 
 @pytest.mark.campaign
 def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
-    arguments = [
-        "simulation",
-        "--out",
-        tmp_path,
-        "--methods",
-        "baseline",
-        "--seeds",
-        1,
-        "--workers",
-        1,
-    ]
+    arguments = ["simulation", "--out", tmp_path, "--methods", "baseline", "--seeds", 1, "--workers", 1]
     origins = [importlib.util.find_spec(name).origin for name in ("knode_cosserat", "studies")]
     sources = os.pathsep.join(str(Path(origin).parents[1]) for origin in origins)
     done = subprocess.run(

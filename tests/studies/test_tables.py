@@ -4,16 +4,7 @@ import statistics
 
 import pytest
 
-from studies.report import (
-    Cell,
-    Published,
-    Spread,
-    as_csv,
-    as_markdown,
-    in_words,
-    ratio_in_words,
-    spreads,
-)
+from studies.report import Cell, Published, Spread, as_csv, as_markdown, in_words, ratio_in_words, spreads
 
 PUBLISHED = {
     ("length", "sine"): Published((40.16, 16.46), (4.31, 1.44), (4.03, 1.17)),

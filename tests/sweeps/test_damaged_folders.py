@@ -12,13 +12,7 @@ import numpy as np
 import pytest
 
 from knode_cosserat.sweeps import Local, SweepError, load_sweep, run_sweep
-from knode_cosserat.sweeps._shards import (
-    KEY,
-    METADATA_CHECKSUM,
-    json_checksum,
-    read_shard,
-    require_pyarrow,
-)
+from knode_cosserat.sweeps._shards import KEY, METADATA_CHECKSUM, json_checksum, read_shard, require_pyarrow
 from tests.sweeps.small_sweep import content, described
 
 ROOT = Path(__file__).parents[2]

@@ -215,15 +215,15 @@ class Misfit:
             d_controls = np.zeros((*controls.shape, weights.shape[1]))
             if slope is not None:
                 d_controls = slope[:steps, :, None] * np.asarray(by_latency)[which]
-            changes = Changes(d_controls, directions, weights)
-            solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             at, columns = (system, controls), self._columns(system, data.output, filled(records), seen_data)
             used = np.isin(np.arange(records[0].size), columns).reshape(records[0].shape)
+            changes = Changes(d_controls, directions, weights, kept=used)
+            solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
             if data.static:
-                d_rows = static_tangents(task.settings, solved, at, changes, used)[0]
+                d_rows = static_tangents(task.settings, solved, at, changes)[0]
             else:
                 state = TangentState.of(system, data.settings.space, past, *d_past)
-                d_rows = tangent_time_loop(task.coefficients, solved, at, changes, state, used)[1][0]
+                d_rows = tangent_time_loop(task.coefficients, solved, at, changes, state)[1][0]
             # zeros in all other columns: one compiled program serves any coordinates
             whole = np.zeros((len(records), len(columns), len(x)))
             whole[:1, :, which] = d_first[None, :, :size][:, used]

@@ -42,6 +42,8 @@ class Changes(NamedTuple):
     weights: Float[Any, "directions m"] | None = None
     #: added to the residual of the tip's conditions
     tip: Any = 0.0
+    #: numbers of a row whose tangents are returned (N, x); None: all
+    kept: Bool[np.ndarray, "N x"] | None = None
 
 
 class TangentState(NamedTuple):
@@ -67,16 +69,16 @@ class TangentState(NamedTuple):
 
 def tangent_time_loop(
     steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes,
-    state: TangentState, kept: Bool[np.ndarray, "N x"] | None = None,
+    state: TangentState,
 ) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
     """Return the state after the last of some solved rows, and the tangents of all rows and unknowns.
 
     They are linear in `changes` and in the tangents of `state`. `solved` are all rows and unknowns, and
     with several stages those of every stage, like the result; `at` are system and controls. Tangents are
-    columns: weights, controls, state and results have one more axis, the last. The tangents of all numbers
-    of a row are returned, (solves, N, x, m), or those of `kept` ones, (solves, q, m).
+    columns: weights, controls, state and results have one more axis, the last. Tangents of rows are those of
+    all numbers, (solves, N, x, m), or of the `kept` ones, (solves, q, m).
     """
-    (system, controls), settings, (d_controls, directions, weights, d_tip) = at, steps.settings, changes
+    (system, controls), settings, (d_controls, directions, weights, d_tip, kept) = at, steps.settings, changes
     leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
     if directions is None:
         stacked = [np.zeros((0, *leaf.shape)) for leaf in leaves]
@@ -115,9 +117,8 @@ def tangent_time_loop(
 
 
 def static_tangents(
-    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes,
-    kept: Bool[np.ndarray, "N x"] | None = None,
-) -> tuple[Any, Any, Any]:  # fmt: skip
+    settings: Settings, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes
+) -> tuple[Any, Any, Any]:
     """Return the tangents of rows and unknowns of solved equilibria, and of the records of the last.
 
     Arguments as in `tangent_time_loop`. Records are those at the places of the scheme.
@@ -128,5 +129,5 @@ def static_tangents(
     still = dataclasses.replace(settings, time=None)
     before, d_before = (np.stack([each] * still.memory) for each in (none, d_none))
     state = TangentState(before, none, d_before, d_none, 0.0)
-    after, found = tangent_time_loop(StepCoefficients.of(still), solved, at, changes, state, kept)
+    after, found = tangent_time_loop(StepCoefficients.of(still), solved, at, changes, state)
     return *found, after.d_records[0]

@@ -14,12 +14,7 @@ from hypothesis import assume, given, settings
 
 from knode_cosserat.io import container
 from knode_cosserat.learning.knode import KNODE, About, ModelFileError, decoded_model, load_model
-from tests.learning.files.made import (
-    MODELS,
-    ROBOT,
-    fails,
-    network,
-)
+from tests.learning.files.made import MODELS, ROBOT, fails, network
 from tests.trajectories import sealed
 
 BYTES = KNODE(ROBOT, network(), About({"loss": np.arange(9.0)})).to_bytes()
