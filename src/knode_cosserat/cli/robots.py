@@ -70,8 +70,7 @@ class _Run(NamedTuple):
         ),
     ]
     steps: Annotated[
-        int | None,
-        option("N", "Number of time steps; required unless a file gives the controls."),
+        int | None, option("N", "Number of time steps; required unless a file gives the controls.")
     ] = None
     dt: Annotated[float | None, option("S", "Time step (s).", show_default="0.05, or the file's")] = None
     time: Annotated[str, option("SCHEME", "Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")] = (

@@ -24,13 +24,7 @@ from knode_cosserat.solvers.history import (
     unloaded_shape,
 )
 from knode_cosserat.solvers.problem import no_history, row_of
-from knode_cosserat.solvers.replay import (
-    at_one_state,
-    carried,
-    history_settings,
-    replay,
-    state_of_rows,
-)
+from knode_cosserat.solvers.replay import at_one_state, carried, history_settings, replay, state_of_rows
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import InitialState, TimeIntegration, warn_of_results

@@ -32,16 +32,7 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
 from knode_cosserat.statics.dynamics import linearised_modes
-from knode_cosserat.statics.stiffness import (
-    NEEDED,
-    Pieces,
-    divided,
-    firm,
-    joined,
-    narrow,
-    symmetric,
-    wide,
-)
+from knode_cosserat.statics.stiffness import NEEDED, Pieces, divided, firm, joined, narrow, symmetric, wide
 from knode_cosserat.trajectory import Trajectory
 
 #: largest residual of an equilibrium, in natural units
