@@ -103,7 +103,9 @@ def doctor() -> Diagnosis:
     }
     versions |= {name: _version(name) for name in (*NEEDED, *OPTIONAL)}
     cache = Path(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
-    checks = [_precision(), _cache(cache), *_simulated()]
+    kind = jax.numpy.zeros(()).dtype
+    precision = Check("precision", kind == np.float64, f"numbers are {kind}; float64 is needed")
+    checks = [precision, _cache(cache), *_simulated()]
     # files of this package, and of JAX in a directory that the user set for it
     programs = sum(1 for end in (SUFFIX, "-cache") for _ in cache.glob(f"*{end}"))
     return Diagnosis(
@@ -120,23 +122,14 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _precision() -> Check:
-    kind = jax.numpy.zeros(()).dtype
-    return Check("precision", kind == np.float64, f"numbers are {kind}; float64 is needed")
-
-
 def _cache(folder: Path) -> Check:
     """Check that compiled programs can be stored in the folder, or in its parent if it does not exist."""
     place = folder
     while not place.exists() and place != place.parent:
         place = place.parent
     kept = bool(folder.name) and os.access(place, os.W_OK)
-    said = (
-        "can be written"
-        if kept
-        else "cannot be written: set KNODE_COSSERAT_CACHE, or every run compiles anew"
-    )
-    return Check("cache", kept, f"{folder} {said}")
+    said = "cannot be written: set KNODE_COSSERAT_CACHE, or every run compiles anew"
+    return Check("cache", kept, f"{folder} {'can be written' if kept else said}")
 
 
 def _simulated() -> list[Check]:

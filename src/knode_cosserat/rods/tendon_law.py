@@ -136,17 +136,11 @@ def _rates(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> 
     return px + dx, py + dy, pz
 
 
-def _units(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
-    """Return tangents (3, c) and 1/|ṗᵢ| (c,)."""
-    rates = jnp.stack(_rates(x, r, r_s))
-    shorter = 1.0 / jnp.sqrt(jnp.sum(rates * rates, axis=0))
-    return rates * shorter, shorter
-
-
 def _levers(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
     """Return gᵢ = (tᵢ, rᵢ × tᵢ), (6, c), and 1/|ṗᵢ|."""
-    (tx, ty, tz), shorter = _units(x, r, r_s)
-    rx, ry = _columns(r)
+    rates = jnp.stack(_rates(x, r, r_s))
+    shorter = 1.0 / jnp.sqrt(jnp.sum(rates * rates, axis=0))
+    (tx, ty, tz), (rx, ry) = rates * shorter, _columns(r)
     return jnp.stack([tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx]), shorter
 
 
