@@ -60,11 +60,8 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as a mapping for JSON."""
-        return {
-            **dataclasses.asdict(self),
-            "checks": [check._asdict() for check in self.checks],
-            "well": self.well,
-        }
+        checks = [check._asdict() for check in self.checks]
+        return dataclasses.asdict(self) | {"checks": checks, "well": self.well}
 
     def __repr__(self) -> str:
         wrong = [check.name for check in self.checks if not check.well]
@@ -147,11 +144,8 @@ def _simulated() -> list[Check]:
     solved = bool(moved.all_valid and np.max(moved.residual) <= 1e-8)
     weight = float(robot.density * np.pi * robot.radius**2 * robot.length * robot.gravity[2])
     off = abs(carried / weight - 1.0)
+    balance = f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}"
     return [
         Check("simulation", solved, f"20 steps in {times[0]:.2f} s, and again in {1e3 * times[1]:.1f} ms"),
-        Check(
-            "balance",
-            off <= WEIGHT_ERROR,
-            f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}",
-        ),
+        Check("balance", off <= WEIGHT_ERROR, balance),
     ]

@@ -285,12 +285,8 @@ def state_errors(
     time = np.asarray(estimate.time)
     mine = np.flatnonzero(time >= (-np.inf if start is None else start) - _SAME)
     rows = _matching(time[mine], np.asarray(truth.time), "row", "s")
-    nodes = _matching(
-        np.linspace(0.0, 1.0, np.shape(estimate.y)[1]),
-        np.linspace(0.0, 1.0, np.shape(truth.y)[1]),
-        "node",
-        "of its length",
-    )
+    places = [np.linspace(0.0, 1.0, np.shape(it.y)[1]) for it in (estimate, truth)]
+    nodes = _matching(places[0], places[1], "node", "of its length")
     errors = {}
     for name, unit in _shared(estimate, truth):
         found = np.asarray(estimate.part(name), dtype=float)[mine]
@@ -306,11 +302,9 @@ def state_errors(
 def _shared(estimate: Trajectory, truth: Trajectory) -> Iterator[tuple[str, str]]:
     for part in ("y_layout", "z_layout"):
         mine, other = getattr(estimate.system, part), getattr(truth.system, part)
+        sizes = {field.name: field.size for field in other.fields}
         for field in mine.fields:
-            if (
-                field.name in other.names
-                and other.slice(field.name).stop - other.slice(field.name).start == field.size
-            ):
+            if sizes.get(field.name) == field.size:
                 yield field.name, field.unit
 
 

@@ -125,13 +125,8 @@ def simulate(
         summaries.error_text(summary[f"largest_{name}_error"], float(system.length))
         for name in ("position", "time")
     ]
-    facts = {
-        "robot": model.robot,
-        "steps": len(sequence),
-        "dt": dt,
-        "computing_time": round(seconds, 4),
-        **summary,
-    }
+    facts: dict[str, Any] = {"robot": model.robot, "steps": len(sequence), "dt": dt}
+    facts |= {"computing_time": round(seconds, 4), **summary}
     results = ", ".join(f"{count} {result}" for result, count in summary["results"].items())
     lines = [
         f"simulated {model.robot}: {len(sequence)} steps of {dt:g} s, computed in {seconds:.2f} s",

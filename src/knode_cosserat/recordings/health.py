@@ -217,12 +217,7 @@ def latency_of(recording: Recording) -> _Latency | None:
     simplex = np.array(first[1:]) + np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]])
     options: Any = {"xatol": 5e-4, "fatol": 1e-6, "maxiter": 80, "initial_simplex": simplex}
     minimize: Any = scipy.optimize.minimize
-    best = minimize(
-        lambda pair: missed(abs(float(pair[0])), abs(float(pair[1]))),
-        np.array(first[1:]),
-        method="Nelder-Mead",
-        options=options,
-    )
+    best = minimize(lambda pair: missed(*np.abs(pair)), first[1:], method="Nelder-Mead", options=options)
     delay, lag = np.abs(best.x)
     return _Latency(shift, round(float(delay), 4), round(float(lag), 4))
 

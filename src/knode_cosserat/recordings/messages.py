@@ -422,13 +422,8 @@ def _merged(topic: str, parts: Sequence[Stream], *, is_held: bool) -> Stream:
             line = np.interp((at - known[0]) * 1e-9, (known - known[0]) * 1e-9, value)
             columns.append(np.where(inside, line, math.nan))
     received = at if is_held or not stamped else longest.received
-    return Stream(
-        topic,
-        at if stamped else np.full(len(at), -1, dtype=np.int64),
-        received,
-        np.stack(columns, axis=1),
-        sum(part.broken for part in parts),
-    )
+    stamps = at if stamped else np.full(len(at), -1, dtype=np.int64)
+    return Stream(topic, stamps, received, np.stack(columns, axis=1), sum(part.broken for part in parts))
 
 
 def _spoken(read: Callable[[Any], str], text: str, message: Any) -> tuple[float, ...] | None:

@@ -246,11 +246,9 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> 
         if sensor.columns is None:
             raise RecordingError(f"{path}: the columns of the sensor {sensor.topic} are missing; name them")
         titles[sensor.topic] = list(sensor.columns)
-    for tendons, named in zip(
-        (config.tension, config.motors, config.command),
-        (mapped.tensions, mapped.motors, mapped.commands),
-        strict=True,
-    ):
+    for tendons, named in (
+        (config.tension, mapped.tensions), (config.motors, mapped.motors), (config.command, mapped.commands),
+    ):  # fmt: skip
         if tendons is not None:
             count = len(tendons.order)
             usual = tension_titles(tendons.topic, tendons.unit, count)

@@ -253,12 +253,10 @@ class _Variation:
         values, vectors = self.spectrum
         least = float(values[0])
         if not reason and self.rounding > SEEN and abs(least) <= self.rounding:
-            count, reason = (
-                -1,
-                (
-                    f"the least eigenvalue, {least:.2g} EI/L, is within the rounding of the largest, "
-                    f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
-                ),
+            count = -1
+            reason = (
+                f"the least eigenvalue, {least:.2g} EI/L, is within the rounding of the largest, "
+                f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
             )
         moves = (self.free @ vectors[:, 0]).reshape(-1, strand_count(system), 6)[self.nodes, :, :3]
         return Stability(count, least, _mode(moves), self.asymmetry, None, reason, neutral)

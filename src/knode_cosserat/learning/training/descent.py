@@ -100,14 +100,9 @@ def loss_for(name: str, knowledge: System, segments: Samples) -> PaperLoss | Sta
     if name == "paper" and set(PAPER_FIELDS) <= set(knowledge.y_layout.names):
         angles = np.asarray(_angles(y[knowledge.y_layout.slice("h")]))
         return PaperLoss(y, z, angles, segments.weight, knowledge.y_layout)
-    increments = segments.y_next - segments.y
-    return StandardisedLoss(
-        y,
-        z,
-        value_scales(increments, field_sizes(knowledge.y_layout)),
-        value_scales(segments.z, field_sizes(knowledge.z_layout)),
-        segments.weight,
-    )
+    y_spread = value_scales(segments.y_next - segments.y, field_sizes(knowledge.y_layout))
+    z_spread = value_scales(segments.z, field_sizes(knowledge.z_layout))
+    return StandardisedLoss(y, z, y_spread, z_spread, segments.weight)
 
 
 def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
@@ -116,13 +111,8 @@ def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
     The order is SciPy's "zyx". If the second angle is ±π/2 they are not unique, and have no derivative.
     """
     R = jax.vmap(rotation_matrix, in_axes=-1, out_axes=-1)(h)
-    return jnp.stack(
-        [
-            jnp.arctan2(-R[0, 1], R[0, 0]),
-            jnp.arcsin(jnp.clip(R[0, 2], -1.0, 1.0)),
-            jnp.arctan2(-R[1, 2], R[2, 2]),
-        ]
-    )
+    about_y = jnp.arcsin(jnp.clip(R[0, 2], -1.0, 1.0))
+    return jnp.stack([jnp.arctan2(-R[0, 1], R[0, 0]), about_y, jnp.arctan2(-R[1, 2], R[2, 2])])
 
 
 _angles = jax.jit(euler_angles)
@@ -297,11 +287,8 @@ def plateau(numbers: dict[str, Any], loss: Any, rate: Any, best: Any, waited: An
     better = loss < best * (1.0 - LEAST_GAIN)
     waited = jnp.where(better, 0, waited + 1)
     enough = waited > numbers["patience"]
-    return (
-        jnp.where(enough, rate * numbers["factor"], rate),
-        jnp.where(better, loss, best),
-        jnp.where(enough, 0, waited),
-    )
+    rate = jnp.where(enough, rate * numbers["factor"], rate)
+    return rate, jnp.where(better, loss, best), jnp.where(enough, 0, waited)
 
 
 def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:

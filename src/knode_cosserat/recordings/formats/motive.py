@@ -40,14 +40,8 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
     delimiter = lines[0][len(_START) : len(_START) + 1] or ","
     header = [[cell.strip() for cell in row] for row in csv.reader(lines[:_HEADER], delimiter=delimiter)]
     meta = dict(zip(header[0][::2], header[0][1::2], strict=False))
-    axes_row = next(
-        (
-            k
-            for k, row in enumerate(header)
-            if row[:1] == ["Frame"] and row[1:2] and row[1].startswith("Time")
-        ),
-        0,
-    )
+    is_axes = [row[:1] == ["Frame"] and "".join(row[1:2]).startswith("Time") for row in header]
+    axes_row = is_axes.index(True) if any(is_axes) else 0
     above = [row for row in header[1:axes_row] if any(row)]
     if len(above) < 3:
         raise RecordingError(
