@@ -94,10 +94,8 @@ def doctor() -> Diagnosis:
 
     Failures are reported in the checks, not raised.
     """
-    versions: dict[str, str | None] = {
-        "knode-cosserat": package_version(),
-        "Python": platform.python_version(),
-    }
+    versions: dict[str, str | None] = {"knode-cosserat": package_version()}
+    versions["Python"] = platform.python_version()
     versions |= {name: _version(name) for name in (*NEEDED, *OPTIONAL)}
     cache = Path(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
     kind = jax.numpy.zeros(()).dtype

@@ -129,7 +129,8 @@ def pose_mse(prediction: OrientedHistory, reference: OrientedHistory) -> float:
                 "or tip_rmse"
             )
     position_error = predicted[0] - expected[0]
-    angle_error = _euler_angles(predicted[1]) - _euler_angles(expected[1])
+    angles = [_rotations(quaternion).as_euler("zyx") for _, quaternion in (predicted, expected)]
+    angle_error = (angles[0] - angles[1]).reshape(*position_error.shape[:2], 3)
     return float(1000 * np.mean(np.concatenate([position_error, angle_error], axis=-1) ** 2))
 
 
@@ -171,10 +172,6 @@ def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
 def rms_distance(a: Array, b: Array) -> Array:
     """Return the root mean square over time (...) of the distances between points (T, ..., d)."""
     return np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1), axis=0))
-
-
-def _euler_angles(quaternion: Array) -> Array:
-    return np.asarray(_rotations(quaternion).as_euler("zyx").reshape(*quaternion.shape[:-1], 3))
 
 
 def _rotations(quaternion: Array) -> Any:

@@ -347,11 +347,10 @@ def _encoded(trajectory: Trajectory) -> bytes:
     batch = ("batch",) if np.ndim(trajectory.y) == 4 else ()
     rows = (*batch, "time")
     arclength = np.asarray(trajectory.arclength)
+    nodes = (*batch, "node")[-arclength.ndim :]
     variables = {
         "time": Variable(trajectory.time, ("time",), _label("s", "time")),
-        "arclength": Variable(
-            arclength, (*batch, "node")[-arclength.ndim :], _label("m", "arclength of the nodes")
-        ),
+        "arclength": Variable(arclength, nodes, _label("m", "arclength of the nodes")),
     }
     for k, (layout, packed) in enumerate(trajectory._layouts()):
         control = k == 2

@@ -384,9 +384,8 @@ def joint_names(
     if by_name in (list(source.order), counted):
         return first, ""
     if list(source.order) == counted:
-        return sorted(
-            first, key=lambda name: by_name[first.index(name)]
-        ), f"its joints {listed} are matched by name"
+        matched = sorted(first, key=lambda name: by_name[first.index(name)])
+        return matched, f"its joints {listed} are matched by name"
     raise RecordingError(
         f"{where}: its joints are {listed}, and the configuration's order is {list(source.order)}; allowed "
         "is one that agrees with the names, or `names` with the joint of each number in the order"

@@ -104,6 +104,8 @@ def state_from_positions(
     Raises:
         ValueError: the positions are no curve, or the system is not accepted.
     """
+    from scipy.interpolate import make_interp_spline
+
     positions = np.asarray(positions, dtype=float)
     y_layout, z_layout = system.y_layout, system.z_layout
     if strand_count(system) > 1 or not {"p", "h"} <= set(y_layout.names) or "u" not in z_layout.names:
@@ -119,7 +121,10 @@ def state_from_positions(
         raise ValueError("initial holds positions that are not finite, or that repeat")
     record = np.array(rest_record(system))
     s = np.linspace(0.0, 1.0, system.nodes)
-    p, tangent = _curve(positions, s)
+    order, along = min(3, len(positions) - 1), np.linspace(0.0, 1.0, len(positions))
+    spline = make_interp_spline(along, positions, k=order)
+    p, tangent = spline(s), spline.derivative()(s)
+    tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
     base, tip = held_ends(system, control)
     ny, material = y_layout.size, None
     u_rows = slice(ny + z_layout.slice("u").start, ny + z_layout.slice("u").stop)
@@ -167,17 +172,6 @@ def rotations(h: Any) -> Any:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(h, -1, axis=-1))
-
-
-def _curve(positions: Any, s: Any) -> tuple[Any, Any]:
-    """Return positions and unit tangents of a spline at parts of the length."""
-    from scipy.interpolate import make_interp_spline
-
-    spline = make_interp_spline(
-        np.linspace(0.0, 1.0, len(positions)), positions, k=min(3, len(positions) - 1)
-    )
-    tangent = spline.derivative()(s)
-    return spline(s), tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
 def _carried(base: Any, tangents: Any) -> Any:

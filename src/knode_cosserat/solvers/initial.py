@@ -172,8 +172,5 @@ def _last_state(
 
 def _alike(one: System, other: System) -> bool:
     """True if two systems have the same places and records."""
-
-    def grid(system: System) -> Any:
-        return system.discontinuities.places, system.nodes, strand_count(system), system.mixed
-
-    return bool(grid(one) == grid(other))
+    grids = [(it.discontinuities.places, it.nodes, strand_count(it), it.mixed) for it in (one, other)]
+    return bool(grids[0] == grids[1])

@@ -172,12 +172,8 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
     space = (equilibrium.settings or Settings()).space
     found, scales = still_state(system, space, control, y), system.scales()
-    off = float(
-        np.max([
-            found.error, np.max(np.abs(found.tip) / scales.tip),
-            np.max(np.abs(_base(system, space, control, y[0]) - y[0]) / scales.y),
-        ])
-    )  # fmt: skip
+    tip, base = found.tip / scales.tip, (_base(system, space, control, y[0]) - y[0]) / scales.y
+    off = float(np.max([found.error, np.max(np.abs(tip)), np.max(np.abs(base))]))
     if not off <= BALANCED:
         raise ValueError(
             f"row {row} is no equilibrium: {off:.2g} of natural size is left when every rate is zero; "
