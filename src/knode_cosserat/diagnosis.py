@@ -60,11 +60,8 @@ class Diagnosis:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the diagnosis as a mapping for JSON."""
-        return {
-            **dataclasses.asdict(self),
-            "checks": [check._asdict() for check in self.checks],
-            "well": self.well,
-        }
+        checks = [check._asdict() for check in self.checks]
+        return dataclasses.asdict(self) | {"checks": checks, "well": self.well}
 
     def __repr__(self) -> str:
         wrong = [check.name for check in self.checks if not check.well]
@@ -97,13 +94,13 @@ def doctor() -> Diagnosis:
 
     Failures are reported in the checks, not raised.
     """
-    versions: dict[str, str | None] = {
-        "knode-cosserat": package_version(),
-        "Python": platform.python_version(),
-    }
+    versions: dict[str, str | None] = {"knode-cosserat": package_version()}
+    versions["Python"] = platform.python_version()
     versions |= {name: _version(name) for name in (*NEEDED, *OPTIONAL)}
     cache = Path(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
-    checks = [_precision(), _cache(cache), *_simulated()]
+    kind = jax.numpy.zeros(()).dtype
+    precision = Check("precision", kind == np.float64, f"numbers are {kind}; float64 is needed")
+    checks = [precision, _cache(cache), *_simulated()]
     # files of this package, and of JAX in a directory that the user set for it
     programs = sum(1 for end in (SUFFIX, "-cache") for _ in cache.glob(f"*{end}"))
     return Diagnosis(
@@ -120,23 +117,14 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _precision() -> Check:
-    kind = jax.numpy.zeros(()).dtype
-    return Check("precision", kind == np.float64, f"numbers are {kind}; float64 is needed")
-
-
 def _cache(folder: Path) -> Check:
     """Check that compiled programs can be stored in the folder, or in its parent if it does not exist."""
     place = folder
     while not place.exists() and place != place.parent:
         place = place.parent
     kept = bool(folder.name) and os.access(place, os.W_OK)
-    said = (
-        "can be written"
-        if kept
-        else "cannot be written: set KNODE_COSSERAT_CACHE, or every run compiles anew"
-    )
-    return Check("cache", kept, f"{folder} {said}")
+    said = "cannot be written: set KNODE_COSSERAT_CACHE, or every run compiles anew"
+    return Check("cache", kept, f"{folder} {'can be written' if kept else said}")
 
 
 def _simulated() -> list[Check]:
@@ -154,11 +142,8 @@ def _simulated() -> list[Check]:
     solved = bool(moved.all_valid and np.max(moved.residual) <= 1e-8)
     weight = float(robot.density * np.pi * robot.radius**2 * robot.length * robot.gravity[2])
     off = abs(carried / weight - 1.0)
+    balance = f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}"
     return [
         Check("simulation", solved, f"20 steps in {times[0]:.2f} s, and again in {1e3 * times[1]:.1f} ms"),
-        Check(
-            "balance",
-            off <= WEIGHT_ERROR,
-            f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}",
-        ),
+        Check("balance", off <= WEIGHT_ERROR, balance),
     ]

@@ -324,11 +324,8 @@ def curves(
         figure = new_figure(width_of(columns), 2.4)
         axes = figure.subplots()
         for i, (label, values) in enumerate(lines.items()):
-            axes.plot(
-                at,
-                np.asarray(values, dtype=float),
-                **{**line(i), "marker": marker or None, "label": label or None},
-            )
+            look = {**line(i), "marker": marker or None, "label": label or None}
+            axes.plot(at, np.asarray(values, dtype=float), **look)
         axes.set(xlabel=xlabel, ylabel=ylabel, **{f"{name}scale": "log" for name in log})
         if "x" in log and len(at) <= 8:
             axes.set_xticks(at, [f"{each:g}" for each in at])

@@ -129,7 +129,8 @@ def pose_mse(prediction: OrientedHistory, reference: OrientedHistory) -> float:
                 "or tip_rmse"
             )
     position_error = predicted[0] - expected[0]
-    angle_error = _euler_angles(predicted[1]) - _euler_angles(expected[1])
+    angles = [_rotations(quaternion).as_euler("zyx") for _, quaternion in (predicted, expected)]
+    angle_error = (angles[0] - angles[1]).reshape(*position_error.shape[:2], 3)
     return float(1000 * np.mean(np.concatenate([position_error, angle_error], axis=-1) ** 2))
 
 
@@ -171,10 +172,6 @@ def node_error(prediction: PoseHistory, reference: PoseHistory) -> Array:
 def rms_distance(a: Array, b: Array) -> Array:
     """Return the root mean square over time (...) of the distances between points (T, ..., d)."""
     return np.sqrt(np.mean(np.sum((a - b) ** 2, axis=-1), axis=0))
-
-
-def _euler_angles(quaternion: Array) -> Array:
-    return np.asarray(_rotations(quaternion).as_euler("zyx").reshape(*quaternion.shape[:-1], 3))
 
 
 def _rotations(quaternion: Array) -> Any:
@@ -285,12 +282,8 @@ def state_errors(
     time = np.asarray(estimate.time)
     mine = np.flatnonzero(time >= (-np.inf if start is None else start) - _SAME)
     rows = _matching(time[mine], np.asarray(truth.time), "row", "s")
-    nodes = _matching(
-        np.linspace(0.0, 1.0, np.shape(estimate.y)[1]),
-        np.linspace(0.0, 1.0, np.shape(truth.y)[1]),
-        "node",
-        "of its length",
-    )
+    places = [np.linspace(0.0, 1.0, np.shape(it.y)[1]) for it in (estimate, truth)]
+    nodes = _matching(places[0], places[1], "node", "of its length")
     errors = {}
     for name, unit in _shared(estimate, truth):
         found = np.asarray(estimate.part(name), dtype=float)[mine]
@@ -306,11 +299,9 @@ def state_errors(
 def _shared(estimate: Trajectory, truth: Trajectory) -> Iterator[tuple[str, str]]:
     for part in ("y_layout", "z_layout"):
         mine, other = getattr(estimate.system, part), getattr(truth.system, part)
+        sizes = {field.name: field.size for field in other.fields}
         for field in mine.fields:
-            if (
-                field.name in other.names
-                and other.slice(field.name).stop - other.slice(field.name).start == field.size
-            ):
+            if sizes.get(field.name) == field.size:
                 yield field.name, field.unit
 
 

@@ -276,11 +276,8 @@ class Trajectory(eqx.Module):
         if self.y.ndim == 4 and not isinstance(index, slice | int | np.integer):
             raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
         fields: tuple[str, ...] = ("y", "z", "control", "result", "residual", "iterations")
-        fields += tuple(
-            name
-            for name in ("position_error", "time_error", "extrapolated", "stages")
-            if getattr(self, name) is not None
-        )
+        optional = ("position_error", "time_error", "extrapolated", "stages")
+        fields += tuple(name for name in optional if getattr(self, name) is not None)
         picked: dict[str, Any] = {name: getattr(self, name)[index] for name in fields}
         time = self.time if self.y.ndim == 4 else self.time[index]
         system = self.system
@@ -350,11 +347,10 @@ def _encoded(trajectory: Trajectory) -> bytes:
     batch = ("batch",) if np.ndim(trajectory.y) == 4 else ()
     rows = (*batch, "time")
     arclength = np.asarray(trajectory.arclength)
+    nodes = (*batch, "node")[-arclength.ndim :]
     variables = {
         "time": Variable(trajectory.time, ("time",), _label("s", "time")),
-        "arclength": Variable(
-            arclength, (*batch, "node")[-arclength.ndim :], _label("m", "arclength of the nodes")
-        ),
+        "arclength": Variable(arclength, nodes, _label("m", "arclength of the nodes")),
     }
     for k, (layout, packed) in enumerate(trajectory._layouts()):
         control = k == 2
@@ -510,17 +506,14 @@ def _trajectory(content: container.Content, system: System) -> Trajectory:
 
 def _require_possible(time: np.ndarray, numbers: Mapping[str, np.ndarray], y: np.ndarray) -> None:
     """Raise `ContainerError` if rows contradict each other, as those of no simulation do."""
-    result = numbers["result"]
+    result, residual = numbers["result"], numbers["residual"]
     solved, unknown = result >= 0, np.setdiff1d(result, [int(code) for code in Result])
     for wrong, reason in (
         (time.shape != result.shape[-1:], "it has another number of times than of rows"),
         (not np.all(np.isfinite(time)) or np.any(np.diff(time) <= 0.0), "its times do not increase"),
         (unknown.size, f"it has the result code {', '.join(map(str, unknown[:1]))}"),
         (not np.all(np.isfinite(y[solved])), "a solved row has a state that is not finite"),
-        (
-            not np.all(np.isfinite(numbers["residual"][solved])),
-            "a solved row has a residual that is not finite",
-        ),
+        (not np.all(np.isfinite(residual[solved])), "a solved row has a residual that is not finite"),
         (np.any(numbers["iterations"] < 0), "a number of iterations is negative"),
     ):
         if wrong:

@@ -36,10 +36,7 @@ def read_arrays(path: str | Path, limit: int) -> dict[str, np.ndarray]:
 def _array(content: bytes) -> np.ndarray:
     file = io.BytesIO(content)
     version = np.lib.format.read_magic(file)
-    readers = {
-        (1, 0): np.lib.format.read_array_header_1_0,
-        (2, 0): np.lib.format.read_array_header_2_0,
-    }
+    readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
         raise ReadError(f"an array has the version {version}; allowed are {', '.join(map(str, readers))}")
     shape, _, kind = readers[version](file)

@@ -32,20 +32,14 @@ def allowed(number: int) -> int:
     Raises:
         LimitSettingError: the variable is not a finite number above 0.
     """
-    return int(min(number * _factor(), _LARGEST))
-
-
-def _factor() -> float:
-    chosen = os.environ.get(VARIABLE, "")
-    if not chosen:
-        return 1.0
+    chosen = os.environ.get(VARIABLE) or "1"
     try:
         factor = float(chosen)
     except ValueError:
         factor = math.nan
     if not 0.0 < factor < math.inf:
         raise LimitSettingError(f"{VARIABLE} must be a finite number above 0 (got {chosen[:60]!r})")
-    return factor
+    return int(min(number * factor, _LARGEST))
 
 
 def excess(number: int, limit: int, unit: str) -> str:

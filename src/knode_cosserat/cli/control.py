@@ -11,14 +11,7 @@ import numpy as np
 import typer
 
 from knode_cosserat._files.csv_rows import size_excess
-from knode_cosserat.cli.arguments import (
-    Json,
-    Nominal,
-    load_system,
-    option,
-    parse_limits,
-    require_writable,
-)
+from knode_cosserat.cli.arguments import Json, Nominal, load_system, option, parse_limits, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.recordings.formats import written_suffixes
@@ -71,8 +64,7 @@ class _Task(NamedTuple):
     ] = None
     seconds: Annotated[float, option("S", "Duration (s).")] = 10.0
     plant: Annotated[
-        str | None,
-        option("ROBOT", "Robot that is controlled, simulated.", show_default="the model itself"),
+        str | None, option("ROBOT", "Robot that is controlled, simulated.", show_default="the model itself")
     ] = None
     noise: Annotated[float, option("FACTOR", "Noise of the tip sensor, in multiples of 0.2 mm.")] = 0.0
 

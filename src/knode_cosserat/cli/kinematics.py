@@ -97,11 +97,7 @@ class _Target(NamedTuple):
     )
 )
 def reach(
-    model: Model,
-    target: _Target,
-    limits: _Limits,
-    space: Space = "lobatto2",
-    as_json: Json = False,
+    model: Model, target: _Target, limits: _Limits, space: Space = "lobatto2", as_json: Json = False
 ) -> None:
     """Compute controls that move the tip to a pose at rest.
 

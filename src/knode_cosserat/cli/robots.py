@@ -12,6 +12,7 @@ import numpy as np
 import typer
 
 from knode_cosserat._numbers import numbers_in
+from knode_cosserat.cli import summaries
 from knode_cosserat.cli.arguments import (
     ROBOT,
     Changes,
@@ -32,17 +33,6 @@ from knode_cosserat.cli.arguments import (
 )
 from knode_cosserat.cli.output import table, value_text, vector_text, write_output
 from knode_cosserat.cli.program import app, examples
-from knode_cosserat.cli.summaries import (
-    control_summary,
-    derived,
-    equilibrium_summary,
-    error_text,
-    more_lines,
-    motion_summary,
-    parameters,
-    residual_summary,
-    stability_summary,
-)
 
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
@@ -70,8 +60,7 @@ class _Run(NamedTuple):
         ),
     ]
     steps: Annotated[
-        int | None,
-        option("N", "Number of time steps; required unless a file gives the controls."),
+        int | None, option("N", "Number of time steps; required unless a file gives the controls.")
     ] = None
     dt: Annotated[float | None, option("S", "Time step (s).", show_default="0.05, or the file's")] = None
     time: Annotated[str, option("SCHEME", "Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")] = (
@@ -131,17 +120,13 @@ def simulate(
     trajectory.save(out)
     if drawing:
         drawing.overview(trajectory).savefig(figure)
-    summary = motion_summary(trajectory)
+    summary = summaries.motion_summary(trajectory)
     errors = [
-        error_text(summary[f"largest_{name}_error"], float(system.length)) for name in ("position", "time")
+        summaries.error_text(summary[f"largest_{name}_error"], float(system.length))
+        for name in ("position", "time")
     ]
-    facts = {
-        "robot": model.robot,
-        "steps": len(sequence),
-        "dt": dt,
-        "computing_time": round(seconds, 4),
-        **summary,
-    }
+    facts: dict[str, Any] = {"robot": model.robot, "steps": len(sequence), "dt": dt}
+    facts |= {"computing_time": round(seconds, 4), **summary}
     results = ", ".join(f"{count} {result}" for result, count in summary["results"].items())
     lines = [
         f"simulated {model.robot}: {len(sequence)} steps of {dt:g} s, computed in {seconds:.2f} s",
@@ -227,12 +212,12 @@ def equilibrium(
         stability, warnings = _stability(rest, space)
     if out:
         rest.save(out)
-    facts = {"robot": model.robot, **equilibrium_summary(rest), **stability}
+    facts = {"robot": model.robot, **summaries.equilibrium_summary(rest), **stability}
     lines = [
         f"tip: {vector_text(facts['tip_position'])} m",
         f"inclination of the tip from the z axis: {np.degrees(facts['tip_inclination']):.2f} degrees",
         f"scaled residual {facts['residual']:.1e}; largest estimated position error: "
-        f"{error_text(facts['position_error'], float(system.length))}",
+        f"{summaries.error_text(facts['position_error'], float(system.length))}",
     ]
     if "base_force" in facts:
         lines.append(f"internal force at the base: {vector_text(facts['base_force'])} N")
@@ -271,7 +256,7 @@ def info(
         write_output(as_json, {"catalog": robots}, table(list(robots.items())))
         return
     system = load_system(robot, changes, nodes)
-    parts = {"parameters": parameters(system), "derived": derived(system)}
+    parts = {"parameters": summaries.parameters(system), "derived": summaries.derived(system)}
     rows = []
     for title, quantities in parts.items():
         rows += [[""] * 4, [title, "", "", ""]]
@@ -279,14 +264,14 @@ def info(
             [f"  {name}", value_text(it["value"]), it["unit"], it["meaning"]]
             for name, it in quantities.items()
         ]
-    drives = control_summary(system)
+    drives = summaries.control_summary(system)
     rows += [[""] * 4, ["controls", "", "", ""]]
     rows += [[f"  {name}", "", it["unit"], it["meaning"]] for name, it in drives.items()]
     if not drives:
         rows.append(["  none", "", "", "the robot has no controls"])
-    more = more_lines(system)
+    more = summaries.more_lines(system)
     heading = f"{robot}: {robots[robot]}" if robot in robots else robot
-    facts, lines = residual_summary(system)
+    facts, lines = summaries.residual_summary(system)
     write_output(
         as_json,
         {"robot": robot, "kind": type(system).__name__, **parts, "controls": drives, "parts": more, **facts},
@@ -314,16 +299,16 @@ def _stability(rest: Any, space: str) -> tuple[dict[str, Any], list[str]]:
     import knode_cosserat as kc
 
     if rest.result[0] == kc.Result.UNSTABLE:
-        return stability_summary("divergence")
+        return summaries.stability_summary("divergence")
     try:
         decided = kc.statics.stability(rest)
-        return stability_summary(decided.kind, decided.reason)
+        return summaries.stability_summary(decided.kind, decided.reason)
     except ValueError:
         # with reels, or without internal force and moment
         if not {"n", "m"} <= set(kc.robots.Ends.of(rest.system).layout.names):
-            return stability_summary(None)
+            return summaries.stability_summary(None)
         unstable = bool(kc.statics.configuration(rest.system, rest.control[0], space=space).unstable)
-        return stability_summary("divergence" if unstable else "stable")
+        return summaries.stability_summary("divergence" if unstable else "stable")
 
 
 def _control_words(control: str, names: list[str]) -> list[str]:

@@ -178,16 +178,9 @@ def register_controller(name: str, help: str) -> Callable[[AnyController], AnyCo
     def register(cls: AnyController) -> AnyController:
         if name in CONTROLLERS and CONTROLLERS[name].__qualname__ != cls.__qualname__:
             raise ValueError(f"the controller {name!r} is registered already; allowed is another name")
-        parameters = inspect.signature(cls).parameters.values()
-        cls.help, cls.options = (
-            help,
-            {
-                parameter.name: parameter.default
-                for parameter in parameters
-                if parameter.kind is inspect.Parameter.KEYWORD_ONLY
-                and type(parameter.default) in (int, float)
-            },
-        )
+        keywords = [it for it in inspect.signature(cls).parameters.values() if it.kind is it.KEYWORD_ONLY]
+        cls.help = help
+        cls.options = {it.name: it.default for it in keywords if type(it.default) in (int, float)}
         CONTROLLERS[name] = cls
         return cls
 

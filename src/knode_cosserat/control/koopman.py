@@ -14,13 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control import qp
-from knode_cosserat.control.commands import (
-    Command,
-    Controller,
-    ControlLimits,
-    lagged,
-    register_controller,
-)
+from knode_cosserat.control.commands import Command, Controller, ControlLimits, lagged, register_controller
 from knode_cosserat.control.planning import Knots, Tracking, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.outputs import Output, TipPosition

@@ -100,11 +100,9 @@ class Environment:
                 )
         if len({jax.tree.structure(model) for model in models}) > 1:
             raise TaskError("the models must be of one class, with the same nodes and options")
-        stacked = (
-            jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), *models)
-            if models
-            else None
-        )
+        stacked = None
+        if models:
+            stacked = jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), *models)
         settings, rest = Settings(), None
         if Ends.of(equipped).rest_is_guess:
             at_start = initial_state(equipped, settings)

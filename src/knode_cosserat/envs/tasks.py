@@ -395,13 +395,6 @@ class Adaptation(Follow):
 # reaching a pose
 
 
-class _PoseGoal(NamedTuple):
-    """A pose to reach: position (m), and unit tangent."""
-
-    position: Float[Any, "3"]
-    tangent: Float[Any, "3"]
-
-
 @dataclasses.dataclass(frozen=True)
 class Reach(Task):
     """Reach a pose with the tip, and hold it. Poses are equilibria, so that each can be reached.
@@ -424,10 +417,8 @@ class Reach(Task):
             TaskError: the fixed position cannot be reached by an equilibrium within limits.
         """
         if self.position is not None:
-            target, length = (
-                np.asarray(self.position, dtype=float),
-                float(np.max(nominal_model(robot).length)),
-            )
+            target = np.asarray(self.position, dtype=float)
+            length = float(np.max(nominal_model(robot).length))
             if target.shape != (3,) or not np.all(np.isfinite(target)):
                 raise TaskError(f"the target is {self.position!r}; allowed are three finite numbers (m)")
             nearest = inverse_kinematics(robot, target, low=limits.low, high=limits.high)
@@ -439,17 +430,17 @@ class Reach(Task):
                 )
         return super().survey(robot, limits, seed)
 
-    def draw(self, key: Any, survey: Survey) -> _PoseGoal:
+    def draw(self, key: Any, survey: Survey) -> Tip:
         """Return a random pose of the survey, or the fixed one."""
         k = jax.random.randint(key, (), 0, survey.position.shape[0])
         position = survey.position[k] if self.position is None else jnp.asarray(self.position, dtype=float)
-        return _PoseGoal(position, survey.tangent[k])
+        return Tip(position, survey.tangent[k])
 
-    def target(self, goal: _PoseGoal, t: Any) -> Float[Any, "6"]:
+    def target(self, goal: Tip, t: Any) -> Float[Any, "6"]:
         """Return the wanted position (m) and tangent of the tip."""
         return jnp.concatenate([goal.position, goal.tangent])
 
-    def error(self, goal: _PoseGoal, t: Any, tip: Tip) -> Any:
+    def error(self, goal: Tip, t: Any, tip: Tip) -> Any:
         """Return the distance of the tip (m), and in addition `arm` times the error of its tangent."""
         distance = _norm(tip.position - goal.position)
         if self.position is not None:

@@ -10,14 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.estimation.online import (
-    Belief,
-    OnlineModel,
-    Predicted,
-    Spread,
-    measured_error,
-    split_record,
-)
+from knode_cosserat.estimation import online
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.estimation.rollback import Rollback
@@ -106,7 +99,7 @@ class KalmanObserver:
             raise ValueError(f"columns is {columns}; allowed is at least 1")
         self.dt, self.output = checked_dt(dt), output
         self.parameters, self._drift = adapted_model(robot, adapt)
-        self.model = OnlineModel(self.parameters.robot, self.dt)
+        self.model = online.OnlineModel(self.parameters.robot, self.dt)
         self.columns = columns + self.parameters.size
         self._control_deviation = _deviations(robot, control_deviation)
         self._start_deviation = float(start_deviation)
@@ -140,7 +133,7 @@ class KalmanObserver:
         used, n = used_places(robot, settings.space), self.parameters.size
         rows = np.zeros((self.columns, 2, used, past.records.shape[-1]))
         coordinates = np.eye(self.columns, n)
-        self.belief = Belief(np.zeros(n), past, Spread(rows, rows[:, 0], coordinates))
+        self.belief = online.Belief(np.zeros(n), past, online.Spread(rows, rows[:, 0], coordinates))
         self._slopes = np.zeros((self.columns, len(self.output.noise)))
         self._innovation, self._surprise = np.full(len(self.output.noise), np.nan), 0.0
         # the predicted outputs of the last second, in units of the noise
@@ -175,7 +168,7 @@ class KalmanObserver:
     @property
     def estimate(self) -> StateEstimate:
         """Current state, and the parameters with their standard deviations."""
-        y, z = split_record(self.robot, self.record)
+        y, z = online.split_record(self.robot, self.record)
         numbers, labels = self.parameters.numbers, self.parameters.labels
         spread = np.sqrt(np.sum(np.asarray(self.belief.spread.parameters) ** 2, axis=0))
         values = [number.value(x) for number, x in zip(numbers, self.belief.x, strict=True)]
@@ -226,14 +219,17 @@ class KalmanObserver:
         count = 2.0 * BIASED / self.dt
         return 1.0 if np.max(np.abs(self._bias)) * np.sqrt(count) > SIGNIFICANT else float(moved)
 
-    def _accept(self, motion: Predicted, x: Float[np.ndarray, " n"], remaining: Any) -> None:
+    def _accept(self, motion: online.Predicted, x: Float[np.ndarray, " n"], remaining: Any) -> None:
         """Set the state to the end of a motion; `remaining` (m, k) combines its columns to new ones."""
         spread = motion.spread.combined(remaining)
-        matrix = self._compression(spread)
+        # the combinations of columns that keep the most of the covariance
+        records = np.asarray(spread.records)[..., : len(self._scale)] / self._scale
+        flat = np.concatenate([records.reshape(len(records), -1), np.asarray(spread.parameters)], axis=1)
+        matrix = np.linalg.eigh(flat @ flat.T)[1][:, ::-1][:, : self.columns]
         value = np.asarray(motion.values[-1])[: len(self.output.noise)] / self.output.noise
         self._values = np.concatenate([self._values, value[None]])[-max(2, round(BIASED / self.dt)) :]
         self.record = np.asarray(motion.record)
-        self.belief = Belief(x, motion.past, spread.combined(matrix))
+        self.belief = online.Belief(x, motion.past, spread.combined(matrix))
         self._slopes = matrix.T @ (remaining.T @ np.asarray(motion.by_column)[:, -1])
 
     def covers(self, truth: Trajectory, level: float = 0.95) -> bool:
@@ -264,17 +260,6 @@ class KalmanObserver:
         past = self.belief.past._replace(t0=np.asarray(self.time + self.dt))
         self.belief = self.belief._replace(past=past)
 
-    def _compression(self, spread: Spread) -> Float[np.ndarray, "m k"]:
-        """Return the combinations of columns that keep the most of the covariance."""
-        ny = len(self._scale)
-        records, parameters = (
-            np.asarray(spread.records)[..., :ny] / self._scale,
-            np.asarray(spread.parameters),
-        )
-        flat = np.concatenate([records.reshape(len(records), -1), parameters], axis=1)
-        _, vectors = np.linalg.eigh(flat @ flat.T)
-        return vectors[:, ::-1][:, : self.columns]
-
     def _correction(self, measured: Float[np.ndarray, " p"]) -> tuple[Any, Any]:
         """Return the correction's coordinates in the columns, and the remaining covariance's square root."""
         measured = np.asarray(measured, dtype=float)
@@ -283,7 +268,9 @@ class KalmanObserver:
                 f"a measurement has shape {measured.shape}; allowed is ({self.output.size},): "
                 f"{', '.join(self.output.labels)}"
             )
-        error = np.asarray(measured_error(self.model, self.belief.x, self.record, measured, self.output))
+        error = np.asarray(
+            online.measured_error(self.model, self.belief.x, self.record, measured, self.output)
+        )
         known = np.isfinite(error)
         self._innovation, count = -error, int(known.sum())
         self._surprise = 0.0

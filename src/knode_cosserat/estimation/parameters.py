@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat.rods.parameters import ParameterError, parameters_of, value_at
+from knode_cosserat.rods.parameters import ParameterError, owner_at, parameters_of, value_at
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 
@@ -362,26 +362,13 @@ def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
         raise ParameterError(f"{name} is {value.tolist()}: give its deviation, in its unit")
     reach, low, high = WIDEST * deviation, -np.inf, np.inf
     if not value.ndim and not learned:
-        place, _, last = name.rpartition(".")
-        known = parameters_of(type(value_at(nominal_model(robot), place) if place else nominal_model(robot)))[
-            last
-        ]
+        owner, last = owner_at(nominal_model(robot), name)
+        known = parameters_of(type(owner))[last]
         low, high = known.low, known.high
     several = value.ndim == 1 or learned
-    numbers = [
-        Number(
-            f"{name}[{k}]" if several else name,
-            "",
-            at,
-            deviation,
-            max(low, at - reach),
-            min(high, at + reach),
-        )
-        for k, at in enumerate(value.ravel().tolist())
-    ]
-    return Effect(
-        name,
-        name,
-        tuple(numbers),
-        Replace((name,), "coefficients" if learned else "vector" if several else "numbers"),
-    )
+    numbers = []
+    for k, at in enumerate(value.ravel().tolist()):
+        ends = max(low, at - reach), min(high, at + reach)
+        numbers.append(Number(f"{name}[{k}]" if several else name, "", at, deviation, *ends))
+    replace = Replace((name,), "coefficients" if learned else "vector" if several else "numbers")
+    return Effect(name, name, tuple(numbers), replace)

@@ -137,11 +137,7 @@ def _moved(trajectory: Trajectory, seconds: NDArray[np.float64]) -> _Moved:
 
 
 def _frames(
-    motions: Mapping[str, Trajectory],
-    seconds: NDArray[np.float64],
-    view: str | None,
-    width: float,
-    dpi: int,
+    motions: Mapping[str, Trajectory], seconds: NDArray[np.float64], view: str | None, width: float, dpi: int
 ) -> Iterator[Image]:
     """Return an iterator of the frames; invalid input raises before the first frame."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg

@@ -8,12 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat.evaluation import drawing
-from knode_cosserat.evaluation.drawing import (
-    equal_scales,
-    new_figure,
-    one_of,
-    tips_of,
-)
+from knode_cosserat.evaluation.drawing import equal_scales, new_figure, one_of, tips_of
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.trajectory import Trajectory
 

@@ -100,11 +100,8 @@ def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
     for k in range(values.shape[1]):
         # decreasing widths, so that equal tensions all remain visible
         width = max(0.7, 2.4 - 0.55 * k)
-        style: dict[str, Any] = {
-            "label": names[k] if names else f"tendon {k + 1}",
-            "color": PALETTE[k % len(PALETTE)],
-            "linewidth": width,
-        }
+        name = names[k] if names else f"tendon {k + 1}"
+        style: dict[str, Any] = {"label": name, "color": PALETTE[k % len(PALETTE)], "linewidth": width}
         if len(time) == 1:
             axes.plot(time, values[:, k], "o", markersize=4.0 * width, **style)
         else:

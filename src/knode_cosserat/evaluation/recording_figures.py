@@ -6,15 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import (
-    AXES,
-    Tips,
-    draw_tips,
-    legend_above,
-    line,
-    new_figure,
-    tips_of,
-)
+from knode_cosserat.evaluation.drawing import AXES, Tips, draw_tips, legend_above, line, new_figure, tips_of
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.metrics import dtw_distance, rms_distance
 

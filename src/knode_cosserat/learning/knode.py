@@ -237,12 +237,8 @@ def _facts(model: KNODE) -> dict[str, Any]:
             raise ContainerError(str(error)) from None
     else:
         knowledge["traits"] = _traits(model.knowledge)
-    return {
-        "knowledge": knowledge,
-        "residual": model.residual,
-        "trained": model.trained,
-        "about": model.about.facts,
-    }
+    own = {"residual": model.residual, "trained": model.trained, "about": model.about.facts}
+    return {"knowledge": knowledge, **own}
 
 
 def _traits(system: System) -> dict[str, Any]:

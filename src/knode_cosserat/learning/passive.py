@@ -164,11 +164,8 @@ class Passive(Residual):
 
     def clamped(self) -> Self:
         """Return the nearest residual with nonnegative damping coefficients."""
-        return eqx.tree_at(
-            lambda it: [getattr(it, name) for name in POSITIVE if getattr(it, name) is not None],
-            self,
-            replace_fn=_not_negative,
-        )
+        used = [name for name in POSITIVE if getattr(self, name) is not None]
+        return eqx.tree_at(lambda it: [getattr(it, name) for name in used], self, replace_fn=_not_negative)
 
     def _seen(self, knowledge: System, y: Float[Any, " y"]) -> Float[Any, " seen"]:
         """Return wrench and velocities in the material frame, and the mean loss of tension."""

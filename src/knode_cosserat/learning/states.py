@@ -22,15 +22,9 @@ from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
 from knode_cosserat.learning.structured.fit import residuals_of
+from knode_cosserat.learning.training import rollouts
 from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
 from knode_cosserat.learning.training.descent import SegmentRun, standardised
-from knode_cosserat.learning.training.rollouts import (
-    RolloutRun,
-    TrajectoryBatches,
-    held_out_batches,
-    tip_error,
-    trajectory_batches,
-)
 from knode_cosserat.learning.training.runs import ProgressMonitor, Run, run_all
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
@@ -102,7 +96,7 @@ def fit_states(
     trajectories, held_out = _listed("trajectories", trajectories), _listed("held_out", held_out)
     dataset = _samples(knowledge, trajectories, config)
     initial = _initial(knowledge, trajectories, config, dataset)
-    data = _Data(knowledge, trajectories, config, dataset, held_out_batches(knowledge, held_out))
+    data = _Data(knowledge, trajectories, config, dataset, rollouts.held_out_batches(knowledge, held_out))
     kept = None
     if checkpoint is not None:
         kept = Checkpoints(checkpoint, Identity.of(knowledge, trajectories, held_out, config))
@@ -125,7 +119,7 @@ def fit_states(
     for seed, residual in learned.items():
         model, about = KNODE(knowledge, residual), {**facts, "seed": seed, **histories[seed]}
         if data.held_out is not None:
-            about["held_out_error"] = tip_error(model, data.held_out)
+            about["held_out_error"] = rollouts.tip_error(model, data.held_out)
         if verify:
             about["rollout_errors"] = list(rollout_errors(knowledge, model, trajectories[0]))
         about["seconds"] = time.perf_counter() - began
@@ -172,7 +166,7 @@ class _Data(NamedTuple):
     trajectories: Sequence[Trajectory]
     config: FitConfig
     dataset: Any
-    held_out: TrajectoryBatches | None
+    held_out: rollouts.TrajectoryBatches | None
 
 
 def _samples(knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig) -> Dataset | None:
@@ -240,9 +234,9 @@ def _rollout_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
     options = data.config.rollouts
     if options is None:
         return []
-    batches = trajectory_batches(data.knowledge, data.trajectories, options)
+    batches = rollouts.trajectory_batches(data.knowledge, data.trajectories, options)
     return [
-        RolloutRun(KNODE(data.knowledge, residual), batches, options, seed, data.held_out)
+        rollouts.RolloutRun(KNODE(data.knowledge, residual), batches, options, seed, data.held_out)
         for seed, residual in learned.items()
     ]
 

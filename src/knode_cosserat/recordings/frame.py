@@ -225,13 +225,9 @@ def rod_lengths(bodies: Sequence[Body], where: Float[np.ndarray, "M 3"]) -> Floa
     """
     leans = leans_of(where)
     along = np.linalg.norm(where, axis=1) / np.sinc(np.minimum(leans, BENT) / np.pi)
-    return np.array(
-        [
-            arc / body.fraction
-            for body, arc, lean in zip(bodies, along, leans, strict=True)
-            if body.fraction > 0.05 and lean <= BENT
-        ]
-    )
+    fractions = np.array([body.fraction for body in bodies])
+    used = (fractions > 0.05) & (leans <= BENT)
+    return np.asarray(along[used] / fractions[used])
 
 
 def leans_of(where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:

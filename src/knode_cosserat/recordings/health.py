@@ -120,7 +120,13 @@ def health_of(recording: Recording) -> Health:
     streams += [_stream(it.topic, it.output.fields[0], it.time, recording) for it in recording.sensors]
     for what, tensions in (("measured tensions", recording.tension), ("commands", recording.command)):
         if tensions is not None:
-            streams.append(_of_tensions(what, tensions, recording))
+            report = _stream(tensions.topic, what, tensions.time, recording)
+            if what == "commands":
+                report = dataclasses.replace(report, rate=None, jitter=None, missing=None, gaps=None)
+            else:
+                noise = _noise(tensions.time, tensions.tension, recording.rest)
+                report = dataclasses.replace(report, noise=noise)
+            streams.append(report)
     where = rest_positions(recording.bodies, recording.rest)
     lengths = () if where is None else tuple(rod_lengths(recording.bodies, where).tolist())
     latency = latency_of(recording)
@@ -149,13 +155,6 @@ def _of_body(body: Body, recording: Recording) -> StreamHealth:
     report = _stream(body.topic, body.name, body.time, recording)
     noise = _noise(body.time, body.position, recording.rest)
     return dataclasses.replace(report, noise=noise, turn_noise=turn_noise)
-
-
-def _of_tensions(what: str, tensions: Tensions, recording: Recording) -> StreamHealth:
-    report = _stream(tensions.topic, what, tensions.time, recording)
-    if what == "commands":
-        return dataclasses.replace(report, rate=None, jitter=None, missing=None, gaps=None)
-    return dataclasses.replace(report, noise=_noise(tensions.time, tensions.tension, recording.rest))
 
 
 def _stream(topic: str, what: str, time: Float[np.ndarray, " n"], recording: Recording) -> StreamHealth:
@@ -218,12 +217,7 @@ def latency_of(recording: Recording) -> _Latency | None:
     simplex = np.array(first[1:]) + np.array([[0.0, 0.0], [0.01, 0.0], [0.0, 0.01]])
     options: Any = {"xatol": 5e-4, "fatol": 1e-6, "maxiter": 80, "initial_simplex": simplex}
     minimize: Any = scipy.optimize.minimize
-    best = minimize(
-        lambda pair: missed(abs(float(pair[0])), abs(float(pair[1]))),
-        np.array(first[1:]),
-        method="Nelder-Mead",
-        options=options,
-    )
+    best = minimize(lambda pair: missed(*np.abs(pair)), first[1:], method="Nelder-Mead", options=options)
     delay, lag = np.abs(best.x)
     return _Latency(shift, round(float(delay), 4), round(float(lag), 4))
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat._files.limits import MORE
+from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings import checks, frame, streams, table
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
@@ -130,7 +131,9 @@ def _from_bag(path: Path, bag: Bag, config: RecordingConfig) -> Recording:
 
 def _from_table(name: str, path: str, content: Table, config: RecordingConfig | None) -> Recording:
     findings = list(content.findings)
-    simulated = table.is_simulated(content.metadata, path)
+    simulated = content.metadata.get("simulated")
+    if simulated not in (None, "true", "false"):
+        raise RecordingError(f"{path}: simulated is {shown(simulated)}; allowed is true or false")
     if config is None and content.bodies:
         config, remarks = config_of_table(content, path)
         findings += [Finding("warning", "", remark) for remark in remarks]
@@ -139,8 +142,8 @@ def _from_table(name: str, path: str, content: Table, config: RecordingConfig | 
         # the file states its unit and its axes
         config = config.replace(position_unit="m", up=config.up or content.up)
     numbers, about_times = table.streams_of(content.numbers, config, path)
-    if config.simulated is None:
-        config = config.replace(simulated=simulated)
+    if config.simulated is None and simulated is not None:
+        config = config.replace(simulated=simulated == "true")
     source = content.metadata.get("source", name)
     return _assembled(path, source, config, numbers, [*findings, *about_times])
 

@@ -384,9 +384,8 @@ def joint_names(
     if by_name in (list(source.order), counted):
         return first, ""
     if list(source.order) == counted:
-        return sorted(
-            first, key=lambda name: by_name[first.index(name)]
-        ), f"its joints {listed} are matched by name"
+        matched = sorted(first, key=lambda name: by_name[first.index(name)])
+        return matched, f"its joints {listed} are matched by name"
     raise RecordingError(
         f"{where}: its joints are {listed}, and the configuration's order is {list(source.order)}; allowed "
         "is one that agrees with the names, or `names` with the joint of each number in the order"
@@ -422,13 +421,8 @@ def _merged(topic: str, parts: Sequence[Stream], *, is_held: bool) -> Stream:
             line = np.interp((at - known[0]) * 1e-9, (known - known[0]) * 1e-9, value)
             columns.append(np.where(inside, line, math.nan))
     received = at if is_held or not stamped else longest.received
-    return Stream(
-        topic,
-        at if stamped else np.full(len(at), -1, dtype=np.int64),
-        received,
-        np.stack(columns, axis=1),
-        sum(part.broken for part in parts),
-    )
+    stamps = at if stamped else np.full(len(at), -1, dtype=np.int64)
+    return Stream(topic, stamps, received, np.stack(columns, axis=1), sum(part.broken for part in parts))
 
 
 def _spoken(read: Callable[[Any], str], text: str, message: Any) -> tuple[float, ...] | None:

@@ -120,9 +120,8 @@ def config_of_bag(bag: Bag, path: str) -> tuple[RecordingConfig, tuple[str, ...]
             singles.setdefault((match[1], match[3]), []).append(match[2])
         elif count:
             order = tuple(range(1, count + 1))
-            joints = joint_names(TensionSource(topic.name, order), [list(getattr(first, "name", ()))], path)[
-                0
-            ]
+            names_there = [list(getattr(first, "name", ()))]
+            joints, _ = joint_names(TensionSource(topic.name, order), names_there, path)
             _add_topic(sources, topic.name, order, tuple(joints) or None)
             if joints:
                 remarks.append(f"tendons 1 to {count} are taken to be the joints {', '.join(joints)}")

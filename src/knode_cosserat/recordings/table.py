@@ -178,14 +178,6 @@ def _metadata_numbers(key: str, metadata: Mapping[str, str], path: str) -> tuple
         raise RecordingError(f"{path}: {key} is {shown(metadata[key])}; allowed is {kind}") from None
 
 
-def is_simulated(metadata: Mapping[str, str], path: str) -> bool | None:
-    """True if a table states that the robot was a simulation; None if not stated. Raises `RecordingError`."""
-    word = metadata.get("simulated")
-    if word not in (None, "true", "false"):
-        raise RecordingError(f"{path}: simulated is {shown(word)}; allowed is true or false")
-    return None if word is None else word == "true"
-
-
 def position_titles(body: str, unit: str) -> list[str]:
     """Return the titles of a body's position."""
     return [f"{body}_{axis} [{unit}]" for axis in "xyz"]
@@ -246,11 +238,9 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> 
         if sensor.columns is None:
             raise RecordingError(f"{path}: the columns of the sensor {sensor.topic} are missing; name them")
         titles[sensor.topic] = list(sensor.columns)
-    for tendons, named in zip(
-        (config.tension, config.motors, config.command),
-        (mapped.tensions, mapped.motors, mapped.commands),
-        strict=True,
-    ):
+    for tendons, named in (
+        (config.tension, mapped.tensions), (config.motors, mapped.motors), (config.command, mapped.commands),
+    ):  # fmt: skip
         if tendons is not None:
             count = len(tendons.order)
             usual = tension_titles(tendons.topic, tendons.unit, count)

@@ -8,6 +8,7 @@ loses frames and is noisy. Load cells are noisy and quantised. Every file states
 from __future__ import annotations
 
 import dataclasses
+import math
 from pathlib import Path
 
 import numpy as np
@@ -132,12 +133,15 @@ def commands(signal: str, seconds: float) -> Tensions:
     begin = BEFORE_STEP if name == "step" else RESTING
     moving = time > begin - 1e-9
     count = int(moving.sum())
-    plain = _plain_number(number)
-    if count and name == "sine" and plain is not None and plain > 0.0:
+    try:
+        plain = float(number)
+    except ValueError:
+        plain = math.nan
+    if count and name == "sine" and 0.0 < plain < math.inf:
         phase = 2 * np.pi * (time[moving] - begin) / plain
         turns = np.stack([np.cos(phase), np.sin(phase), -np.cos(phase), -np.sin(phase)], axis=1)
         grams[moving] += SWING * turns
-    elif count and name == "step" and plain is not None:
+    elif count and name == "step" and math.isfinite(plain):
         newtons = controls.step(
             plain, count, COMMANDED, base=REST * GRAM, at=0.0, tendons=(2, 3), sampled="end"
         )
@@ -153,14 +157,6 @@ def commands(signal: str, seconds: float) -> Tensions:
         grams[len(time) - count : len(time) - count + len(used)] = used / GRAM
         grams[len(time) - count + len(used) :] = grams[len(time) - count + len(used) - 1]
     return Tensions(time, np.round(grams) * GRAM)
-
-
-def _plain_number(text: str) -> float | None:
-    try:
-        number = float(text)
-    except ValueError:
-        return None
-    return number if np.isfinite(number) else None
 
 
 def lagged(sent: Tensions, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:

@@ -9,12 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.recordings.config import (
-    POSITION_UNITS,
-    CommandSource,
-    RecordingConfig,
-    TensionSource,
-)
+from knode_cosserat.recordings.config import POSITION_UNITS, CommandSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import formats, written_suffixes
 from knode_cosserat.recordings.streams import Body, Outgoing, OutgoingStream, Tensions

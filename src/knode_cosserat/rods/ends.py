@@ -114,12 +114,9 @@ class Driven(Clamped):
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """One control for each driven axis."""
-        return tuple(
-            Field(axis, 1, "rad", f"rotation about {axis[1]}")
-            if axis.startswith("r")
-            else Field(axis, 1, "m", f"displacement along {axis}")
-            for axis in self.axes
-        )
+        fields = [Field(axis, 1, "m", f"displacement along {axis}") for axis in AXES[:3]]
+        fields += [Field(axis, 1, "rad", f"rotation about {axis[1]}") for axis in AXES[3:]]
+        return tuple(fields[AXES.index(axis)] for axis in self.axes)
 
     def pose(self, rest: Pose, control: Any) -> Pose:
         """Return the clamped pose, rotated by the vector (rx, ry, rz) and displaced by (x, y, z)."""

@@ -199,7 +199,11 @@ class ParallelRobot(Bundle):
         p, h, n, m, _, _ = self.legs(y)
         R, M = rotation_matrix(h[0]), self.platform_mass
         arms = jax.vmap(lambda joint: dot(R, joint))(self.joints)
-        acceleration, momentum_rate = self._inertial(y, y_t)
+        # in its frame, from the mean of the legs' velocities, which differ a little on a coarse grid
+        q, w = self.platform_velocity(y)
+        q_t, w_t = self.platform_velocity(y_t)
+        acceleration = q_t + cross(w, q)
+        momentum_rate = dot(self.inertia, w_t) + cross(w, dot(self.inertia, w))
         force = M * (self.gravity - dot(R, acceleration)) + self.platform_force - jnp.sum(n, axis=0)
         twisting = jnp.sum(m + jax.vmap(cross)(arms, n), axis=0)
         moment = self.platform_moment - dot(R, momentum_rate) - twisting
@@ -207,16 +211,6 @@ class ParallelRobot(Bundle):
         gaps = centres[1:] - centres[0]
         turns = jax.vmap(lambda other: _turn(h[0], other))(h[1:])
         return jnp.concatenate([force, moment, jnp.concatenate([gaps, turns], axis=1).reshape(-1)])
-
-    def _inertial(self, y: Any, y_t: Any) -> tuple[Any, Any]:
-        """Acceleration of the platform's centre and rate of its angular momentum, both in its frame.
-
-        Computed from the mean of the legs' velocities, which differ a little on a coarse grid.
-        """
-        q, w = self.platform_velocity(y)
-        q_t, w_t = self.platform_velocity(y_t)
-        inertia = self.inertia
-        return q_t + cross(w, q), dot(inertia, w_t) + cross(w, dot(inertia, w))
 
     def platform_velocity(self, y: Any) -> tuple[Any, Any]:
         """Return velocity and angular velocity of the platform's centre, in its frame; or their rates."""

@@ -201,11 +201,9 @@ class SlenderRod(System):
     @property
     def G(self) -> Any:
         """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
-        return (
-            self.youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
-            if self.shear_modulus is None
-            else self.shear_modulus
-        )
+        if self.shear_modulus is not None:
+            return self.shear_modulus
+        return self.youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
 
     @property
     def Kse(self) -> Float[Any, "3 3"]:

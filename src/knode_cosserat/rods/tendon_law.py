@@ -76,7 +76,7 @@ def tendon_wrench(
 
 def unbent_flexibility(law: TendonLaw) -> Float[Any, "6 6"]:
     """Return J⁻¹ of the unbent rod and tendons; the load is not used."""
-    return _flexibility(*_levers(UNBENT, law.r, law.r_s), law)
+    return small_inverse(_stiffness(*_levers(UNBENT, law.r, law.r_s), law))
 
 
 def tendon_strains(
@@ -136,17 +136,11 @@ def _rates(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> 
     return px + dx, py + dy, pz
 
 
-def _units(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
-    """Return tangents (3, c) and 1/|ṗᵢ| (c,)."""
-    rates = jnp.stack(_rates(x, r, r_s))
-    shorter = 1.0 / jnp.sqrt(jnp.sum(rates * rates, axis=0))
-    return rates * shorter, shorter
-
-
 def _levers(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any]:
     """Return gᵢ = (tᵢ, rᵢ × tᵢ), (6, c), and 1/|ṗᵢ|."""
-    (tx, ty, tz), shorter = _units(x, r, r_s)
-    rx, ry = _columns(r)
+    rates = jnp.stack(_rates(x, r, r_s))
+    shorter = 1.0 / jnp.sqrt(jnp.sum(rates * rates, axis=0))
+    (tx, ty, tz), (rx, ry) = rates * shorter, _columns(r)
     return jnp.stack([tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx]), shorter
 
 
@@ -168,11 +162,6 @@ def _stiffness(g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6 6"]:
     upper = jnp.concatenate([law.K_v, nothing], axis=1)
     lower = jnp.concatenate([nothing, law.K_u], axis=1)
     return jnp.concatenate([upper, lower]) + stiffer
-
-
-def _flexibility(g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6 6"]:
-    """Return J⁻¹."""
-    return small_inverse(_stiffness(g, shorter, law))
 
 
 #: optimisation barrier: without it XLA would recompute early results at each later use
@@ -269,7 +258,7 @@ def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
     moving = [p for m, p in zip(moves, law, strict=True) if m]
     along = [t for m, t in zip(moves, tangents, strict=True) if m]
     _, change = jax.jvp(residual, moving, along)
-    return x, -dot_by_rows(_flexibility(g, shorter, law), change)
+    return x, -dot_by_rows(small_inverse(_stiffness(g, shorter, law)), change)
 
 
 _solution.defjvp(_slope, symbolic_zeros=True)

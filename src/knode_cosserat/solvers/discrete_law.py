@@ -21,7 +21,6 @@ from knode_cosserat.rods.law import (
     InternalState,
     LinearLaw,
     MaterialLaw,
-    MaxwellBranch,
     StressedLaw,
     Viscoelastic,
 )
@@ -198,25 +197,24 @@ class MaterialStep:
         strain, elastic = self.law.strains[name], self.elastic[name]
         if strain.moment is None:
             return elastic.strain()
-        return nonlinear_strain(
-            _NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
-        )
+        law = _NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
+        # the search is not differentiated: one more correction has the derivatives of the implicit function
+        found = _searched(jax.lax.stop_gradient(law))
+        return found + law.correction(found)
 
     def _internal(self, strains: Fields) -> Fields:
         """Return all internal variables for these strains."""
         found = dict(self.internal)
         for name, strain in self.law.strains.items():
-            if strain.branch is not None:
-                found[strain.branch.field] = self._dashpot(strain.branch, strains[name])
+            if (branch := strain.branch) is not None:
+                # T x_t = ε - x
+                moved = strains[name] - branch.time * self.history[branch.field]
+                found[branch.field] = moved / (1.0 + self.c0 * branch.time)
         if self.law.internal is not None:
             rates = {name: self._rate(name, value) for name, value in strains.items()}
             for name, evolution in self.law.internal(strains, rates).items():
                 found[name] = evolved(evolution, self.history[name], self.c0)
         return found
-
-    def _dashpot(self, branch: MaxwellBranch, strain: Any) -> Any:
-        """Return the dashpot's strain x, from T x_t = ε - x."""
-        return (strain - branch.time * self.history[branch.field]) / (1.0 + self.c0 * branch.time)
 
 
 class _NonlinearStrain(NamedTuple):
@@ -236,13 +234,6 @@ class _NonlinearStrain(NamedTuple):
     def correction(self, strain: Float[Any, "3"]) -> Float[Any, "3"]:
         """Return Newton's correction."""
         return -dot(inverse(jax.jacfwd(self.residual)(strain)), self.residual(strain))
-
-
-def nonlinear_strain(law: _NonlinearStrain) -> Float[Any, "3"]:
-    """Return the strain of a nonlinear law; NaN if Newton's method fails."""
-    # the search is not differentiated: one more correction has the derivatives of the implicit function
-    strain = _searched(jax.lax.stop_gradient(law))
-    return strain + law.correction(strain)
 
 
 def _searched(law: _NonlinearStrain) -> Float[Any, "3"]:

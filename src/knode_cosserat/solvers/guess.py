@@ -104,6 +104,8 @@ def state_from_positions(
     Raises:
         ValueError: the positions are no curve, or the system is not accepted.
     """
+    from scipy.interpolate import make_interp_spline
+
     positions = np.asarray(positions, dtype=float)
     y_layout, z_layout = system.y_layout, system.z_layout
     if strand_count(system) > 1 or not {"p", "h"} <= set(y_layout.names) or "u" not in z_layout.names:
@@ -119,7 +121,10 @@ def state_from_positions(
         raise ValueError("initial holds positions that are not finite, or that repeat")
     record = np.array(rest_record(system))
     s = np.linspace(0.0, 1.0, system.nodes)
-    p, tangent = _curve(positions, s)
+    order, along = min(3, len(positions) - 1), np.linspace(0.0, 1.0, len(positions))
+    spline = make_interp_spline(along, positions, k=order)
+    p, tangent = spline(s), spline.derivative()(s)
+    tangent = tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
     base, tip = held_ends(system, control)
     ny, material = y_layout.size, None
     u_rows = slice(ny + z_layout.slice("u").start, ny + z_layout.slice("u").stop)
@@ -130,12 +135,14 @@ def state_from_positions(
     h = _carried(record[0, y_layout.slice("h")] if base is None or base.h is None else base.h, tangent)
     spin = (0.0 if tip is None else tip.spin) - (0.0 if base is None else base.spin)
     h = _twisted(h, None if tip is None else tip.h, u_rest[:, 2] * float(system.length), spin)
-    u = _curvatures(h, float(system.length) / (system.nodes - 1))
+    frames = rotations(h)
+    between = (frames[:-1].inv() * frames[1:]).as_rotvec() / (float(system.length) / (system.nodes - 1))
+    u = np.concatenate([between[:1], 0.5 * (between[:-1] + between[1:]), between[-1:]])
     record[:, y_layout.slice("p")], record[:, y_layout.slice("h")] = p, h
     record[:, u_rows] = u
     if "m" in y_layout.names and material is not None:
         Kbt = np.asarray(material.Kbt)
-        record[:, y_layout.slice("m")] = rotations(h).apply(np.einsum("kij,kj->ki", Kbt, u - u_rest))
+        record[:, y_layout.slice("m")] = frames.apply(np.einsum("kij,kj->ki", Kbt, u - u_rest))
     return record
 
 
@@ -165,17 +172,6 @@ def rotations(h: Any) -> Any:
     from scipy.spatial.transform import Rotation
 
     return Rotation.from_quat(np.roll(h, -1, axis=-1))
-
-
-def _curve(positions: Any, s: Any) -> tuple[Any, Any]:
-    """Return positions and unit tangents of a spline at parts of the length."""
-    from scipy.interpolate import make_interp_spline
-
-    spline = make_interp_spline(
-        np.linspace(0.0, 1.0, len(positions)), positions, k=min(3, len(positions) - 1)
-    )
-    tangent = spline.derivative()(s)
-    return spline(s), tangent / np.linalg.norm(tangent, axis=1, keepdims=True)
 
 
 def _carried(base: Any, tangents: Any) -> Any:
@@ -274,7 +270,10 @@ def hanging_curve(system: System, control: Any, reach: float) -> Float[np.ndarra
         found = curve(_root(lambda reach: excess(curve(reach, 0.0)), most), 0.0)
     else:
         found = curve(most, _root(lambda sag: -excess(curve(most, sag)), length))
-    return _evenly(found)
+    # at even distances along the polygon
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(found, axis=0), axis=1))])
+    at = np.linspace(0.0, along[-1], len(found))
+    return np.stack([np.interp(at, along, column) for column in found.T], axis=1)
 
 
 def _sagging(system: System, chord: Any, base: _HeldEnd) -> Any:
@@ -299,17 +298,3 @@ def _root(growing: Any, high: float) -> float:
         middle = 0.5 * (low + high)
         low, high = (low, middle) if (growing(middle) > 0.0) == rises else (middle, high)
     return 0.5 * (low + high)
-
-
-def _evenly(points: Any) -> Any:
-    """Return points at even distances along a polygon."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    at = np.linspace(0.0, along[-1], len(points))
-    return np.stack([np.interp(at, along, column) for column in points.T], axis=1)
-
-
-def _curvatures(h: Any, ds: float) -> Any:
-    """Return curvatures (1/m), in the material frame, from orientations at the nodes."""
-    frames = rotations(h)
-    between = (frames[:-1].inv() * frames[1:]).as_rotvec() / ds
-    return np.concatenate([between[:1], 0.5 * (between[:-1] + between[1:]), between[-1:]])

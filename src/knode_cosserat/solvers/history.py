@@ -126,12 +126,8 @@ def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) ->
 def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
     """Return the history of the next step."""
     numeric: Any = jnp if is_traced((past, records, rate, y)) else np
-    return past._replace(
-        records=numeric.stack([records, *past.records[:-1]]),
-        rate=rate,
-        y=numeric.concatenate([y[None], past.y[:-1]]),
-        weights=weights,
-    )
+    records, y = numeric.stack([records, *past.records[:-1]]), numeric.concatenate([y[None], past.y[:-1]])
+    return past._replace(records=records, rate=rate, y=y, weights=weights)
 
 
 # histories of one state

@@ -24,18 +24,11 @@ from knode_cosserat.solvers.history import (
     unloaded_shape,
 )
 from knode_cosserat.solvers.problem import no_history, row_of
-from knode_cosserat.solvers.replay import (
-    at_one_state,
-    carried,
-    history_settings,
-    replay,
-    state_of_rows,
-)
+from knode_cosserat.solvers.replay import at_one_state, carried, history_settings, replay, state_of_rows
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import InitialState, TimeIntegration, warn_of_results
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_run
 from knode_cosserat.trajectory import Trajectory
 
@@ -169,21 +162,15 @@ def _last_state(
     if state is None or state.history.rate.shape != no_history(system, settings.space).shape:
         known = replay(initial, initial.system, dt)
         return None if known is None else known.state
-    return dataclasses.replace(state, history=_moved_to(system, settings.space, state.history, record))
-
-
-def _moved_to(system: System, space: SpaceScheme, history: StateHistory, record: Any) -> StateHistory:
-    """Return a history moved to a row that may have been changed since, with unchanged rates."""
-    row = row_of(system, history.y[0], history.records[0])
-    shift = carried(system, space, record - row[:, : record.shape[1]])
-    y = grid_of(system).spread((record - row[:, : record.shape[1]])[:, : system.y_layout.size])
-    return history._replace(records=history.records + shift, y=history.y + y)
+    # the row may have been changed since; rates are unchanged
+    history = state.history
+    change = record - row_of(system, history.y[0], history.records[0])[:, : record.shape[1]]
+    shift = carried(system, settings.space, change)
+    y = history.y + grid_of(system).spread(change[:, : system.y_layout.size])
+    return dataclasses.replace(state, history=history._replace(records=history.records + shift, y=y))
 
 
 def _alike(one: System, other: System) -> bool:
     """True if two systems have the same places and records."""
-
-    def grid(system: System) -> Any:
-        return system.discontinuities.places, system.nodes, strand_count(system), system.mixed
-
-    return bool(grid(one) == grid(other))
+    grids = [(it.discontinuities.places, it.nodes, strand_count(it), it.mixed) for it in (one, other)]
+    return bool(grids[0] == grids[1])

@@ -55,17 +55,13 @@ def positions_at(
     low, high = (Drawing.of(robot).positions(y[..., places.node + k, :]) for k in (0, 1))
     part = places.part[:, None]
     line = (1.0 - part) * low + part * high
-    if not _has_tangents(robot):
+    known = {"p", "h"} <= set(robot.y_layout.names) and "v" in robot.z_layout.names
+    if not known or strand_count(robot) > 1:
         return line
     step = robot.length / (robot.nodes - 1)
     left, right = (step * _tangents(robot, y, z, places.node + k) for k in (0, 1))
     chord = high - low
     return line + part * (1.0 - part) * ((1.0 - part) * (left - chord) - part * (right - chord))
-
-
-def _has_tangents(robot: System) -> bool:
-    known = {"p", "h"} <= set(robot.y_layout.names) and "v" in robot.z_layout.names
-    return known and strand_count(robot) == 1
 
 
 def _tangents(robot: System, y: Any, z: Any, nodes: Any) -> Float[Any, "T M 3"]:

@@ -20,14 +20,8 @@ from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
+from knode_cosserat.solvers import history
 from knode_cosserat.solvers.guess import curve_guesses
-from knode_cosserat.solvers.history import (
-    EXTRAPOLATIONS,
-    StepCoefficients,
-    StepRows,
-    TimeStep,
-    repeated_record_history,
-)
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
@@ -83,7 +77,7 @@ class SolvedStep(NamedTuple):
 
     #: start of the next step: a `StateHistory`, or y at all points of an equilibrium
     state: Any
-    row: StepRows
+    row: history.StepRows
     #: likely cause of a failure
     cause: str = ""
 
@@ -92,7 +86,7 @@ class Recovery(abc.ABC):
     """Recovery of one step, as a series of boundary-value problems."""
 
     #: the time step; None for an equilibrium
-    step: TimeStep | None = None
+    step: history.TimeStep | None = None
 
     def __init__(self, system: System, settings: Settings, budget: Budget):
         self.system, self.settings, self.budget = system, settings, budget
@@ -125,11 +119,11 @@ class Recovery(abc.ABC):
         began, newton = time.perf_counter(), self.settings.newton
         newton = dataclasses.replace(newton, max_linearisations=MOST_LINEARISATIONS)
         patient = dataclasses.replace(self.settings, newton=newton)
-        start, weights, step = guess, EXTRAPOLATIONS[0], self.step
+        start, weights, step = guess, history.EXTRAPOLATIONS[0], self.step
         if step is None:
-            steps = StepCoefficients.of(patient)
+            steps = history.StepCoefficients.of(patient)
         else:
-            steps = StepCoefficients(patient, np.asarray(step.coefficients)[None], step.t)
+            steps = history.StepCoefficients(patient, np.asarray(step.coefficients)[None], step.t)
             # the first guess is the newest of the earlier states
             start = step.past._replace(y=np.stack([guess, *step.past.y[:-1]]), weights=weights, t0=0.0)
         _, state, rows = engine.solve_steps(
@@ -139,7 +133,7 @@ class Recovery(abc.ABC):
         if step is not None:
             y = np.stack([state.y[0], *step.past.y[:-1]])
             state = state._replace(y=y, weights=weights, t0=step.past.t0)
-        found = SolvedStep(state, StepRows(*(leaf[0] for leaf in rows)))
+        found = SolvedStep(state, history.StepRows(*(leaf[0] for leaf in rows)))
         self.corrections += int(found.row.corrections)
         self.budget.spend(time.perf_counter() - began)
         return found
@@ -182,7 +176,7 @@ class Recovery(abc.ABC):
         width = system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
         record, unknowns = np.full((system.nodes, width), np.nan), np.full(unknown_count(system), np.nan)
         stages = (np.zeros((0, *np.shape(each))) for each in (record, unknowns))
-        row = StepRows(record, unknowns, np.inf, 0, np.nan, int(result), np.nan, *stages)
+        row = history.StepRows(record, unknowns, np.inf, 0, np.nan, int(result), np.nan, *stages)
         return SolvedStep(self.state, row, likely_cause(result, system, self.settings, control))
 
     def _outcome(self, result: Result, found: SolvedStep) -> SolvedStep:
@@ -253,9 +247,9 @@ class Recovery(abc.ABC):
 class StepRecovery(Recovery):
     """Recovery of a time step. Its last method divides the step into substeps."""
 
-    step: TimeStep
+    step: history.TimeStep
 
-    def __init__(self, system: System, settings: Settings, step: TimeStep, dt: float, budget: Budget):
+    def __init__(self, system: System, settings: Settings, step: history.TimeStep, dt: float, budget: Budget):
         super().__init__(system, settings, budget)
         self.step = jax.tree.map(lambda leaf: np.asarray(leaf, dtype=float), step)
         self.dt = dt
@@ -267,7 +261,7 @@ class StepRecovery(Recovery):
 
     def guesses(self) -> list[Any]:
         """Return the last state, and its linear extrapolation."""
-        return [np.einsum("p,pny->ny", w, self.step.past.y) for w in EXTRAPOLATIONS[:2]]
+        return [np.einsum("p,pny->ny", w, self.step.past.y) for w in history.EXTRAPOLATIONS[:2]]
 
     def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
         """Divide the step into substeps: with a constant control first, then with a ramp."""
@@ -293,7 +287,7 @@ class StepRecovery(Recovery):
         for _ in range(MOST_SUBSTEPS):
             until = min(1.0, reached + part)
             coefficients = padded(scheme.coefficients((until - reached) * dt, *previous), memory)
-            step = TimeStep(past, coefficients, float(self.step.t) - (1.0 - until) * dt)
+            step = history.TimeStep(past, coefficients, float(self.step.t) - (1.0 - until) * dt)
             substep = StepRecovery(self.system, settings, step, dt, self.budget)
             found = substep.direct(before + until * (now - before), ease=part < EASE_BELOW)
             if found is None:
@@ -334,7 +328,7 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
     before, now = (np.broadcast_to(np.reshape(each, (-1, shape[1])), shape) for each in controls)
     last, past, found = before[-1], step.past, []
     for coefficients, t, own in zip(step.coefficients, step.t, now, strict=True):
-        stage = StepRecovery(system, settings, TimeStep(past, coefficients, t), dt, budget)
+        stage = StepRecovery(system, settings, history.TimeStep(past, coefficients, t), dt, budget)
         # the whole step is divided, not a stage
         solved = stage.recover((last, own), has_last=False)
         if solved.row.result < 0:
@@ -350,7 +344,7 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
         )  # fmt: skip
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
-    one = TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
+    one = history.TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
     # without direct methods: a whole step of one stage would be another scheme's
     divided = StepRecovery(system, settings, one, dt, budget)
     solved = divided.recover((before[-1], now[-1]), has_direct=False)
@@ -389,11 +383,11 @@ class StaticRecovery(Recovery):
         system, part = self.system, 0.0
         settings = Settings(BDF1(), self.settings.space, newton=self.settings.newton)
         still = still_state(system, settings.space, controls[1], self._y)
-        past = repeated_record_history(system, settings, still.records, self._y, 0.0)
+        past = history.repeated_record_history(system, settings, still.records, self._y, 0.0)
         natural = natural_time(system) or 0.1
         dt, longest = 0.1 * natural, 1e5 * natural
         for _ in range(80):
-            step = TimeStep(past, BDF1().coefficients(dt), 0.0)
+            step = history.TimeStep(past, BDF1().coefficients(dt), 0.0)
             moving = StepRecovery(system, settings, step, dt, self.budget)
             target = min(1.0, part + DRAWN)
             found = moving.solve(controls[1], moving.guesses()[0], (1.0 - target) * still.tip)

@@ -21,20 +21,8 @@ from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.guess import materials
-from knode_cosserat.solvers.history import (
-    SolverState,
-    StepCoefficients,
-    StepRows,
-    TimeStep,
-    map_robots,
-)
-from knode_cosserat.solvers.recovery import (
-    Budget,
-    SolvedStep,
-    StaticRecovery,
-    StepRecovery,
-    recovered_stages,
-)
+from knode_cosserat.solvers.history import SolverState, StepCoefficients, StepRows, TimeStep, map_robots
+from knode_cosserat.solvers.recovery import Budget, SolvedStep, StaticRecovery, StepRecovery, recovered_stages
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler

@@ -409,8 +409,19 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
                 f"{name} has {controls} controls a row; the knowledge has "
                 f"{knowledge.control_layout.size} ({names})"
             )
-        _check_finite(name, trajectory)
-        _check_time(name, trajectory)
+        for what in ("y", "z", "control"):
+            finite = np.isfinite(np.asarray(getattr(trajectory, what)))
+            if not finite.all():
+                row = int(np.argwhere(~finite)[0][0])
+                raise DataError(
+                    f"{name} has {what} that is not finite in row {row}; learn from the rows before it"
+                )
+        steps = np.diff(np.asarray(trajectory.time))
+        if np.any(steps <= 0) or np.ptp(steps) > 1e-6 * steps.max():
+            raise DataError(
+                f"{name} has time steps from {steps.min():g} to {steps.max():g} s; "
+                "they must be positive and equal"
+            )
     first = trajectories[0]
     for k, trajectory in enumerate(trajectories):
         if not np.isclose(trajectory.dt, first.dt, rtol=1e-6):
@@ -425,37 +436,14 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
             )
 
 
-def _check_finite(name: str, trajectory: Trajectory) -> None:
-    for what in ("y", "z", "control"):
-        values = np.asarray(getattr(trajectory, what))
-        if not np.all(np.isfinite(values)):
-            row = int(np.argwhere(~np.isfinite(values))[0][0])
-            raise DataError(
-                f"{name} has {what} that is not finite in row {row}; learn from the rows before it"
-            )
-
-
-def _check_time(name: str, trajectory: Trajectory) -> None:
-    steps = np.diff(np.asarray(trajectory.time))
-    if np.any(steps <= 0) or np.ptp(steps) > 1e-6 * steps.max():
-        raise DataError(
-            f"{name} has time steps from {steps.min():g} to {steps.max():g} s; "
-            "they must be positive and equal"
-        )
-
-
 def _checked_nodes(knowledge: System, nodes: Sequence[int] | None) -> np.ndarray:
     last = knowledge.nodes - 1
     if nodes is None:
         return np.arange(1, last + 1)
-    chosen = list(nodes)
-    if (
-        not chosen
-        or len(set(chosen)) < len(chosen)
-        or not all(1 <= node <= last and node == int(node) for node in chosen)
-    ):
+    chosen = sorted(nodes)
+    if not chosen or len(set(chosen)) < len(chosen) or not set(chosen) <= set(range(1, last + 1)):
         raise DataError(f"nodes is {nodes!r}; allowed is different whole numbers from 1 to {last}")
-    return np.array(sorted(chosen))
+    return np.array(chosen)
 
 
 # rates along the rod of a trajectory's rows

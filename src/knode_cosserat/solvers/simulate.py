@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import itertools
 import reprlib
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax
@@ -199,15 +200,8 @@ def refined_trajectory(
         wanted = 2 * segments if np.isnan(error) else 1.1 * segments * (error / tolerance) ** (1.0 / order)
         wanted = max(wanted, 1.2 * segments)
         # few different numbers of nodes, so few programs to compile
-        segments = min(MOST_SEGMENTS, next(n for n in _ladder() if n >= min(wanted, MOST_SEGMENTS)))
-
-
-def _ladder() -> Iterator[int]:
-    """Yield increasing numbers of segments, in steps of about a quarter or less."""
-    step = FIRST_SEGMENTS // 4
-    while True:
-        yield from (k * step for k in range(4, 8))
-        step *= 2
+        ladder = (k * (FIRST_SEGMENTS // 4) * 2**n for n in itertools.count() for k in range(4, 8))
+        segments = min(MOST_SEGMENTS, next(n for n in ladder if n >= min(wanted, MOST_SEGMENTS)))
 
 
 # checks of the arguments

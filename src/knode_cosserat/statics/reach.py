@@ -336,14 +336,9 @@ def _checked_wanted(
     single = next(iter(given.values())).ndim == 1
     poses = {name: np.atleast_2d(array) for name, array in given.items()}
     length, weight = float(system.length), (float(weights[0]), float(weights[1]))
-    count = len(next(iter(poses.values())))
-
-    def row(name: str, i: int) -> np.ndarray | None:
-        return poses[name][i] if name in poses else None
-
-    return [
-        _Wanted(row("position", i), row("quaternion", i), length, weight, tolerance) for i in range(count)
-    ], single
+    free: Any = [None] * len(next(iter(poses.values())))
+    pairs = zip(poses.get("position", free), poses.get("quaternion", free), strict=True)
+    return [_Wanted(*pair, length, weight, tolerance) for pair in pairs], single
 
 
 # the search

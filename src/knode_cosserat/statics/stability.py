@@ -32,16 +32,7 @@ from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
 from knode_cosserat.statics.dynamics import linearised_modes
-from knode_cosserat.statics.stiffness import (
-    NEEDED,
-    Pieces,
-    divided,
-    firm,
-    joined,
-    narrow,
-    symmetric,
-    wide,
-)
+from knode_cosserat.statics.stiffness import NEEDED, Pieces, divided, firm, joined, narrow, symmetric, wide
 from knode_cosserat.trajectory import Trajectory
 
 #: largest residual of an equilibrium, in natural units
@@ -181,12 +172,8 @@ def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
     space = (equilibrium.settings or Settings()).space
     found, scales = still_state(system, space, control, y), system.scales()
-    off = float(
-        np.max([
-            found.error, np.max(np.abs(found.tip) / scales.tip),
-            np.max(np.abs(_base(system, space, control, y[0]) - y[0]) / scales.y),
-        ])
-    )  # fmt: skip
+    tip, base = found.tip / scales.tip, (_base(system, space, control, y[0]) - y[0]) / scales.y
+    off = float(np.max([found.error, np.max(np.abs(tip)), np.max(np.abs(base))]))
     if not off <= BALANCED:
         raise ValueError(
             f"row {row} is no equilibrium: {off:.2g} of natural size is left when every rate is zero; "
@@ -262,12 +249,10 @@ class _Variation:
         values, vectors = self.spectrum
         least = float(values[0])
         if not reason and self.rounding > SEEN and abs(least) <= self.rounding:
-            count, reason = (
-                -1,
-                (
-                    f"the least eigenvalue, {least:.2g} EI/L, is within the rounding of the largest, "
-                    f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
-                ),
+            count = -1
+            reason = (
+                f"the least eigenvalue, {least:.2g} EI/L, is within the rounding of the largest, "
+                f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
             )
         moves = (self.free @ vectors[:, 0]).reshape(-1, strand_count(system), 6)[self.nodes, :, :3]
         return Stability(count, least, _mode(moves), self.asymmetry, None, reason, neutral)

@@ -22,13 +22,7 @@ from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.arguments import (
-    checked_limits,
-    checked_system,
-    checked_vectors,
-    static_settings,
-    within_limits,
-)
+from knode_cosserat.statics import arguments
 from knode_cosserat.statics.response import Pose, equilibrium_poses, tip_pose
 
 #: samples per task of a thread; fewer are padded to a power of two
@@ -195,8 +189,8 @@ def workspace(
     Raises:
         ValueError: arguments of a wrong shape.
     """
-    system = checked_system(robot)
-    settings = static_settings(space, newton)
+    system = arguments.checked_system(robot)
+    settings = arguments.static_settings(space, newton)
     if low is None and high is not None:
         # positional limits
         low, controls = controls, None
@@ -204,17 +198,17 @@ def workspace(
     if given not in ([True, False, False, False], [False, True, True, True]):
         raise ValueError("allowed is workspace(robot, controls) or workspace(robot, low, high, count)")
     if controls is None:
-        limits = checked_limits(system, low, high)
+        limits = arguments.checked_limits(system, low, high)
         number: Any = count
         if not isinstance(number, int | np.integer) or not 1 <= number <= 2**30:
             raise ValueError(f"count is {count!r}; allowed is a whole number from 1 to 2^30")
         samples = sample(*limits, int(number), seed)
     else:
         size = system.control_layout.size
-        samples = checked_vectors("controls", controls, size, f"(B, {size})")
+        samples = arguments.checked_vectors("controls", controls, size, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
-        within_limits(system, samples, "controls")
+        arguments.within_limits(system, samples, "controls")
     return _found(system, settings, pose, samples, progress)
 
 

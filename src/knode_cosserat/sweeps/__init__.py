@@ -13,17 +13,7 @@ if TYPE_CHECKING:
     from knode_cosserat.sweeps._plan import Plan as Plan
     from knode_cosserat.sweeps._run import Dask, Local, Slurm, run_sweep
 
-__all__ = [
-    "Dask",
-    "Local",
-    "Range",
-    "Slurm",
-    "Sweep",
-    "SweepData",
-    "SweepError",
-    "load_sweep",
-    "run_sweep",
-]
+__all__ = ["Dask", "Local", "Range", "Slurm", "Sweep", "SweepData", "SweepError", "load_sweep", "run_sweep"]
 
 make_lazy(
     __name__,

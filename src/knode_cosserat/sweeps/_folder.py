@@ -208,11 +208,9 @@ def open_folder(plan: Plan, folder: Path) -> None:
     other = read_manifest(folder)
     if manifest["identity"] != other["identity"]:
         changed = [key for key, value in manifest["sweep"].items() if other["sweep"].get(key) != value]
-        reason = (
-            f"its {changed[0]} is {shown(other['sweep'].get(changed[0]))}"
-            if changed
-            else "a robot or a file of controls was changed"
-        )
+        reason = "a robot or a file of controls was changed"
+        if changed:
+            reason = f"its {changed[0]} is {shown(other['sweep'].get(changed[0]))}"
         raise SweepError(
             f"{folder}: another sweep is here: {reason}; allowed is the same description, or another folder"
         )

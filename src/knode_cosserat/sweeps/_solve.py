@@ -26,13 +26,7 @@ from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.recovery import likely_cause
 from knode_cosserat.solvers.replay import at_one_state, history_settings
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import (
-    InitialState,
-    TimeIntegration,
-    carried_results,
-    run_one,
-    usable_cores,
-)
+from knode_cosserat.solvers.run import InitialState, TimeIntegration, carried_results, run_one, usable_cores
 from knode_cosserat.sweeps._plan import Cases, Plan
 
 #: robots that one call solves

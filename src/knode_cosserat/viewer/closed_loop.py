@@ -366,10 +366,8 @@ class LoopSession(PageSession):
         place = self.followed.facts.columns["feedback"][0]
         spent = 1e3 * np.sum(moment.numbers[place : place + 2])
         head = [number, moment.time, first.result[0], error, self.pace, spent]
-        rows = [
-            last_row(state.system, state, names)
-            for state, names in zip(states, self.followed.names, strict=True)
-        ]
+        pairs = zip(states, self.followed.names, strict=True)
+        rows = [last_row(state.system, state, names) for state, names in pairs]
         parts = [np.array(head), *rows, moment.numbers]
         return np.concatenate([np.asarray(part, dtype=np.float32) for part in parts]).tobytes()
 

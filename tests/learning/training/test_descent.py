@@ -23,6 +23,7 @@ from knode_cosserat.learning.training.descent import (
     loss_for,
     value_scales,
 )
+from knode_cosserat.learning.training.runs import split
 from knode_cosserat.solvers.segments import predict_segment, samples
 from tests.learning.bar import BAR, WRONG, pulled
 
@@ -191,11 +192,11 @@ class Nested(Residual):
 
 def test_weights_are_what_is_not_fixed():
     tree = Nested(Inner(jnp.ones(2), jnp.ones(3)), (jnp.ones(4), jnp.arange(5), {"a": np.ones(6)}))
-    weights, rest = program.split(tree)
+    weights, rest = split(tree)
     assert sorted(leaf.shape[0] for leaf in jax.tree.leaves(weights)) == [3, 4, 6]
     assert sorted(leaf.shape[0] for leaf in jax.tree.leaves(rest)) == [2, 5]
     net = network(BAR, NetworkOptions(hidden=4), jax.random.key(0))
-    weights, _ = program.split(net)
+    weights, _ = split(net)
     names = ("input_weights", "input_biases", "output_weights", "output_biases")
     assert [getattr(weights, name) is getattr(net, name) for name in names] == [True] * 4
     assert len(jax.tree.leaves(weights)) == 4
@@ -237,7 +238,7 @@ def test_an_epoch_is_a_step_of_adam(bars, convex):
             *jax.vmap(lambda one: predict_segment(model, data.space, one), out_axes=-1)(data.segments)
         )
 
-    expected, rest = program.split(net)
+    expected, rest = split(net)
     optimiser = optax.adamw(0.03, weight_decay=0.1, mask=lambda w: jax.tree.map(lambda x: x.ndim > 1, w))
     state, slope = optimiser.init(expected), jax.jit(jax.value_and_grad(slow))
     for epoch in range(7):

@@ -145,11 +145,8 @@ def held_out_error(parts: Sequence[_Moments], columns: Any) -> float:
         size = np.sqrt(np.maximum(np.diag(G), 1e-300))
         scaled = G / size[:, None] / size[None, :] + 1e-11 * np.eye(len(G))
         w = np.linalg.solve(scaled, b / size[:, None]) / size[:, None]
-        error += float(
-            np.sum(
-                part.c - 2.0 * np.sum(w * part.b[columns], axis=0) + np.sum(w * (part.G[square] @ w), axis=0)
-            )
-        )
+        left = part.c - 2.0 * np.sum(w * part.b[columns], axis=0) + np.sum(w * (part.G[square] @ w), axis=0)
+        error += float(np.sum(left))
     return max(error, 0.0)
 
 

@@ -243,10 +243,8 @@ class Structured(Residual):
 
 def law_inputs(knowledge: System, s: Any, control: Any) -> Any:
     """Return a function of z and z_t: the inputs of stress, scaled by the local factors of the section."""
-    rest, factors = (
-        Observed.of(knowledge).unstressed(s, control),
-        Observed.of(knowledge).law_factors(s, control),
-    )
+    observed = Observed.of(knowledge)
+    rest, factors = observed.unstressed(s, control), observed.law_factors(s, control)
     strain, rate = (1.0, 1.0) if factors is None else factors
     return lambda z, z_t: jnp.concatenate([(z - rest) * strain, z_t * rate])
 

@@ -23,17 +23,8 @@ from jaxtyping import Float, Int
 from knode_cosserat.learning.config import FitError, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
+from knode_cosserat.learning.training import runs
 from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
-from knode_cosserat.learning.training.runs import (
-    ADAM,
-    DIVERGED,
-    NOTHING,
-    Best,
-    ProgressMonitor,
-    Run,
-    is_finite,
-    split,
-)
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
@@ -109,14 +100,9 @@ def loss_for(name: str, knowledge: System, segments: Samples) -> PaperLoss | Sta
     if name == "paper" and set(PAPER_FIELDS) <= set(knowledge.y_layout.names):
         angles = np.asarray(_angles(y[knowledge.y_layout.slice("h")]))
         return PaperLoss(y, z, angles, segments.weight, knowledge.y_layout)
-    increments = segments.y_next - segments.y
-    return StandardisedLoss(
-        y,
-        z,
-        value_scales(increments, field_sizes(knowledge.y_layout)),
-        value_scales(segments.z, field_sizes(knowledge.z_layout)),
-        segments.weight,
-    )
+    y_spread = value_scales(segments.y_next - segments.y, field_sizes(knowledge.y_layout))
+    z_spread = value_scales(segments.z, field_sizes(knowledge.z_layout))
+    return StandardisedLoss(y, z, y_spread, z_spread, segments.weight)
 
 
 def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
@@ -125,13 +111,8 @@ def euler_angles(h: Float[Any, "4 S"]) -> Float[Any, "3 S"]:
     The order is SciPy's "zyx". If the second angle is ±π/2 they are not unique, and have no derivative.
     """
     R = jax.vmap(rotation_matrix, in_axes=-1, out_axes=-1)(h)
-    return jnp.stack(
-        [
-            jnp.arctan2(-R[0, 1], R[0, 0]),
-            jnp.arcsin(jnp.clip(R[0, 2], -1.0, 1.0)),
-            jnp.arctan2(-R[1, 2], R[2, 2]),
-        ]
-    )
+    about_y = jnp.arcsin(jnp.clip(R[0, 2], -1.0, 1.0))
+    return jnp.stack([jnp.arctan2(-R[0, 1], R[0, 0]), about_y, jnp.arctan2(-R[1, 2], R[2, 2])])
 
 
 _angles = jax.jit(euler_angles)
@@ -306,11 +287,8 @@ def plateau(numbers: dict[str, Any], loss: Any, rate: Any, best: Any, waited: An
     better = loss < best * (1.0 - LEAST_GAIN)
     waited = jnp.where(better, 0, waited + 1)
     enough = waited > numbers["patience"]
-    return (
-        jnp.where(enough, rate * numbers["factor"], rate),
-        jnp.where(better, loss, best),
-        jnp.where(enough, 0, waited),
-    )
+    rate = jnp.where(enough, rate * numbers["factor"], rate)
+    return rate, jnp.where(better, loss, best), jnp.where(enough, 0, waited)
 
 
 def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:
@@ -320,14 +298,14 @@ def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:
     now, numbers = rate, data.numbers
     if data.schedule == "cosine":
         now = numbers["learning_rate"] * 0.5 * (1.0 + jnp.cos(jnp.pi * epoch / numbers["epochs"]))
-    direction, adam = ADAM.update(slope, adam)
+    direction, adam = runs.ADAM.update(slope, adam)
 
     def updated(weight: Any, change: Any) -> Any:
         decay = numbers["weight_decay"] * weight if weight.ndim >= 2 else 0.0
         return weight - now * (change + decay)
 
     weights = jax.tree.map(updated, weights, direction)
-    weights, _ = split(eqx.combine(weights, data.rest).clamped())
+    weights, _ = runs.split(eqx.combine(weights, data.rest).clamped())
     if data.schedule == "plateau":
         rate, best, waited = plateau(numbers, loss, rate, best, waited)
     return (weights, adam, rate, best, waited), loss, now
@@ -375,7 +353,7 @@ def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: 
     known = _known(residual, knowledge, segments, space) if adds else None
     names = ("learning_rate", "patience", "factor", "weight_decay", "epochs")
     data = _TrainingData(
-        knowledge, split(residual)[1], None if adds else segments, known,
+        knowledge, runs.split(residual)[1], None if adds else segments, known,
         loss_for(training.loss, knowledge, segments), {name: getattr(training, name) for name in names},
         space, training.schedule,
     )  # fmt: skip
@@ -384,16 +362,16 @@ def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: 
 
 def started(residuals: Sequence[Residual], training: Training) -> _State:
     """Return the state before the first epoch, with one residual for each seed."""
-    every = [split(residual)[0] for residual in residuals]
+    every = [runs.split(residual)[0] for residual in residuals]
     weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
     count = len(residuals)
     rate, best, waited = (
         jnp.full(count, training.learning_rate), jnp.full(count, jnp.inf), jnp.zeros(count, dtype=int)
     )  # fmt: skip
-    return _State(jnp.zeros((), dtype=int), weights, jax.vmap(ADAM.init)(weights), rate, best, waited)
+    return _State(jnp.zeros((), dtype=int), weights, jax.vmap(runs.ADAM.init)(weights), rate, best, waited)
 
 
-class SegmentRun(Run):
+class SegmentRun(runs.Run):
     """Epochs on one-segment samples, for one seed or several in one program."""
 
     stage = "segments"
@@ -405,7 +383,7 @@ class SegmentRun(Run):
         """Prepare the training of the residuals, by their seeds."""
         first, *_ = residuals.values()
         state = started([*residuals.values()], training)
-        best = Best(state.weights, training.stop_after)
+        best = runs.Best(state.weights, training.stop_after)
         super().__init__(tuple(residuals), training.epochs, state, best)
         self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
         self._data = prepared(strand_of(knowledge), first, dataset, training)
@@ -416,7 +394,7 @@ class SegmentRun(Run):
         if self._held_out:
             tip_error(KNODE(self._knowledge, self._residual(0)), self._held_out)
 
-    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+    def advance(self, stop: int, watch: runs.ProgressMonitor) -> None:
         """Run epochs up to the next check, at most `PIECE`."""
         first = self.done
         stop = min(stop, first + PIECE, self.steps)
@@ -439,14 +417,14 @@ class SegmentRun(Run):
     def _require_sane(self, losses: np.ndarray, weights: Any) -> None:
         start = np.concatenate([self.losses, losses])[0]
         active = self.best.stopped < 0
-        bad = ~(losses <= DIVERGED * np.maximum(start, NOTHING)) & active
+        bad = ~(losses <= runs.DIVERGED * np.maximum(start, runs.NOTHING)) & active
         if bad.any():
             row, k = np.argwhere(bad)[0]
             raise FitError(
                 f"the loss of seed {self.seeds[k]} became {losses[row, k]:.3g} in epoch {self.done + row} "
                 f"({start[k]:.3g} in the first): a smaller learning rate may help"
             )
-        if not is_finite([np.asarray(leaf)[active] for leaf in jax.tree.leaves(weights)]):
+        if not runs.is_finite([np.asarray(leaf)[active] for leaf in jax.tree.leaves(weights)]):
             raise FitError(
                 f"weights are not finite after epoch {self.done + len(losses)}: "
                 "a smaller learning rate may help"

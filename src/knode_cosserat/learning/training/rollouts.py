@@ -20,16 +20,7 @@ from jaxtyping import Float
 from knode_cosserat.learning.config import FitError, RolloutTraining
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
-from knode_cosserat.learning.training.runs import (
-    ADAM,
-    DIVERGED,
-    NOTHING,
-    Best,
-    ProgressMonitor,
-    Run,
-    is_finite,
-    split,
-)
+from knode_cosserat.learning.training import runs
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.segments import DataError, samples, settings_of
@@ -221,12 +212,12 @@ class _RolloutState(NamedTuple):
 def _proposal(state: _RolloutState, rest: Any, rate: Any, clip: Any) -> Any:
     """Return the weights and the optimiser after a step."""
     slope, _ = optax.clip_by_global_norm(clip).update(state.slope, optax.EmptyState())
-    direction, adam = ADAM.update(slope, state.adam)
+    direction, adam = runs.ADAM.update(slope, state.adam)
     moved = jax.tree.map(lambda weight, change: weight - rate * change, state.weights, direction)
-    return split(eqx.combine(moved, rest).clamped())[0], adam
+    return runs.split(eqx.combine(moved, rest).clamped())[0], adam
 
 
-class RolloutRun(Run):
+class RolloutRun(runs.Run):
     """Fine-tuning of one seed's residual through whole simulations.
 
     A step after which the simulation fails or the loss diverges is rejected: it is halved, and so are all
@@ -240,11 +231,11 @@ class RolloutRun(Run):
         self, model: KNODE, batches: TrajectoryBatches, options: RolloutTraining, seed: int,
         held_out: TrajectoryBatches | None,
     ):  # fmt: skip
-        weights, self._rest = split(model.residual)
+        weights, self._rest = runs.split(model.residual)
         weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
         slope = jax.tree.map(jnp.zeros_like, weights)
-        state = _RolloutState(weights, ADAM.init(weights), slope, weights, np.array(1.0))
-        super().__init__((seed,), options.updates, state, Best(_one(weights), options.stop_after))
+        state = _RolloutState(weights, runs.ADAM.init(weights), slope, weights, np.array(1.0))
+        super().__init__((seed,), options.updates, state, runs.Best(_one(weights), options.stop_after))
         self._knowledge, self._batches = model.knowledge, batches
         self._options, self._held_out = options, held_out
 
@@ -258,10 +249,10 @@ class RolloutRun(Run):
         loss, slope = loss_and_slope(weights, self._rest, self._knowledge, self._batches)
         return float(loss), slope
 
-    def _begin(self, watch: ProgressMonitor) -> None:
+    def _begin(self, watch: runs.ProgressMonitor) -> None:
         """Evaluate the loss before the first update. Raises `FitError` if the simulation fails."""
         loss, slope = self._evaluated(self.state.weights)
-        if not np.isfinite(loss) or not is_finite(slope):
+        if not np.isfinite(loss) or not runs.is_finite(slope):
             raise FitError(
                 f"the model of seed {self.seeds[0]} cannot be simulated over the trajectories and so not "
                 "be fine-tuned: train it longer on segments, or simulate fewer rows (RolloutTraining.horizon)"
@@ -269,7 +260,7 @@ class RolloutRun(Run):
         self.state, self.losses = self.state._replace(slope=slope), np.array([[loss]])
         self._check(watch)
 
-    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+    def advance(self, stop: int, watch: runs.ProgressMonitor) -> None:
         """Run one update."""
         if len(self.losses) == 0:
             self._begin(watch)
@@ -281,7 +272,9 @@ class RolloutRun(Run):
             step = rate * scale
             weights, adam = _proposal(state, self._rest, step, options.clip)
             loss, slope = self._evaluated(weights)
-            if loss <= DIVERGED * max(self.losses[0, 0], NOTHING) and is_finite((weights, slope)):
+            if loss <= runs.DIVERGED * max(self.losses[0, 0], runs.NOTHING) and runs.is_finite(
+                (weights, slope)
+            ):
                 break
             scale /= 2.0
         else:
@@ -299,7 +292,7 @@ class RolloutRun(Run):
     def _model(self) -> KNODE:
         return KNODE(self._knowledge, eqx.combine(self.state.weights, self._rest))
 
-    def _check(self, watch: ProgressMonitor) -> None:
+    def _check(self, watch: runs.ProgressMonitor) -> None:
         if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
             return
         error = tip_error(self._model(), self._held_out)

@@ -123,7 +123,10 @@ def fitted(
         if correction >= 2:
             # after the first iterations the residual is noise
             precision, effective = _likelier(system, new, precision, groups)
-            profile = _profile(splines, new, precision)
+            # a lower precision over time where the jerk is large, as after a step
+            jerk = splines.roots[: splines.points] @ new
+            strength = gaussian_filter1d(np.sum(jerk**2 * precision, axis=1), WIDTH)
+            profile = (1.0 + QUIET) / (strength / strength.mean() + QUIET)
             rest = residual - (J @ (np.asarray(design @ new) - a)[..., None])[..., 0]
             turns, shifts = rest[:, :size], rest[:, size:]
             kept = max(0.2, 1.0 - effective / seen.sum())
@@ -185,16 +188,6 @@ def _decaying(precision: Float[np.ndarray, " groups"], power: float) -> Float[np
             precision[first + k] = max(precision[first + k], least)
         first += size
     return precision
-
-
-def _profile(
-    splines: _Splines, curves: Float[np.ndarray, "n K"], precision: Float[np.ndarray, " K"]
-) -> Float[np.ndarray, " points"]:
-    """Return the prior's relative precision over time: lower where the jerk is large, as after a step."""
-    jerk = splines.roots[: splines.points] @ curves
-    size = np.sum(jerk**2 * precision, axis=1)
-    size = gaussian_filter1d(size, WIDTH)
-    return (1.0 + QUIET) / (size / size.mean() + QUIET)
 
 
 # curves in time

@@ -244,12 +244,9 @@ def read_sqlite(path: Path, wanted: Collection[str], data: bytes | None = None) 
         damage = f"the file was cut or is damaged ({reason})"
     finally:
         connection.close()
-    return file.result(
-        "SQLite file",
-        path,
-        size,
-        damage or ("" if file.bag.topics else "it has no tables of topics and messages"),
-    )
+    if not (damage or file.bag.topics):
+        damage = "it has no tables of topics and messages"
+    return file.result("SQLite file", path, size, damage)
 
 
 def _read_tables(connection: sqlite3.Connection, file: _Scan, size: int) -> str:

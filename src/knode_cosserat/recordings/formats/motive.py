@@ -22,15 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from knode_cosserat.recordings.exports import (
-    Columns,
-    Track,
-    cells_reader,
-    export_table,
-    length_unit,
-    quaternions_of,
-    text_lines,
-)
+from knode_cosserat.recordings import exports
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.table import Table
@@ -44,18 +36,12 @@ _KINDS = ("Rigid Body", "Bone", "Marker", "Rigid Body Marker", "Bone Marker")
 
 def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
     """Return the bodies and markers of an export. Raises `RecordingError`."""
-    lines = text_lines(path)
+    lines = exports.text_lines(path)
     delimiter = lines[0][len(_START) : len(_START) + 1] or ","
     header = [[cell.strip() for cell in row] for row in csv.reader(lines[:_HEADER], delimiter=delimiter)]
     meta = dict(zip(header[0][::2], header[0][1::2], strict=False))
-    axes_row = next(
-        (
-            k
-            for k, row in enumerate(header)
-            if row[:1] == ["Frame"] and row[1:2] and row[1].startswith("Time")
-        ),
-        0,
-    )
+    is_axes = [row[:1] == ["Frame"] and "".join(row[1:2]).startswith("Time") for row in header]
+    axes_row = is_axes.index(True) if any(is_axes) else 0
     above = [row for row in header[1:axes_row] if any(row)]
     if len(above) < 3:
         raise RecordingError(
@@ -66,7 +52,7 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
     kinds, names, measures = ([*row, *[""] * len(axes)] for row in (above[0], above[1], above[-1]))
     identities = [*next((row for row in above[2:-1] if "Parent" not in row), []), *[""] * len(axes)]
     findings: list[Finding] = []
-    scale = length_unit(meta.get("Length Units", ""), path, "m", findings)
+    scale = exports.length_unit(meta.get("Length Units", ""), path, "m", findings)
     if meta.get("Coordinate Space", "Global") != "Global":
         what = (
             f"the coordinate space is {meta['Coordinate Space']}: are bodies in one frame? (export as Global)"
@@ -74,7 +60,7 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         findings.append(Finding("warning", "", what))
     # the data begin after the row of axes, whose cells have no line breaks
     first = next(k for k, line in enumerate(lines) if line.startswith(("Frame", '"Frame"')))
-    cells = cells_reader(lines[first + 1 :], axes, delimiter, path)
+    cells = exports.cells_reader(lines[first + 1 :], axes, delimiter, path)
     places: dict[tuple[str, str, str], dict[str, dict[str, int]]] = {}
     for k in range(2, len(axes)):
         if measures[k] in ("Position", "Rotation"):
@@ -91,19 +77,19 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         elif set("XYZ") <= set(turned):
             quaternion = _of_angles(cells, turned, meta.get("Rotation Type", "XYZ"), path)
         position = scale * cells([where[axis] for axis in "XYZ"])
-        tracks.append(Track(name, position, quaternion, kind.lower() or "marker"))
+        tracks.append(exports.Track(name, position, quaternion, kind.lower() or "marker"))
     if any(set(columns.get("Rotation", {})) == set("XYZ") for columns in places.values()):
         what = (
             f"its Euler angles ({meta.get('Rotation Type', 'XYZ')}) are read as turns about the moving axes"
         )
         findings.append(Finding("note", "", what))
     tracks.sort(key=lambda track: [*map(str.lower, _KINDS), track.kind].index(track.kind))
-    return export_table(
+    return exports.export_table(
         path, cells([1])[:, 0], tracks, up="y", findings=findings, source=meta.get("Take Name", "")
     )
 
 
-def _of_angles(cells: Columns, places: dict[str, int], order: str, path: Path) -> np.ndarray:
+def _of_angles(cells: exports.Columns, places: dict[str, int], order: str, path: Path) -> np.ndarray:
     """Return quaternions of Euler angles (degrees) about the moving axes in an order such as XYZ."""
     from scipy.spatial.transform import Rotation
 
@@ -112,7 +98,9 @@ def _of_angles(cells: Columns, places: dict[str, int], order: str, path: Path) -
             f"{path}: the rotation type is {order!r}; allowed is Quaternion, or an order as XYZ"
         )
     angles = cells([places[axis] for axis in order.upper()])
-    return quaternions_of(angles, lambda known: Rotation.from_euler(order.upper(), known, degrees=True))
+    return exports.quaternions_of(
+        angles, lambda known: Rotation.from_euler(order.upper(), known, degrees=True)
+    )
 
 
 register(

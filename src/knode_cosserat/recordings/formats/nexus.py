@@ -26,15 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.recordings.exports import (
-    LENGTHS,
-    Columns,
-    Track,
-    cells_reader,
-    export_table,
-    quaternions_of,
-    text_lines,
-)
+from knode_cosserat.recordings import exports
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.formats.csv_table import delimiter_of
@@ -52,7 +44,7 @@ class _Section(NamedTuple):
     #: frame numbers and numbers of the samples within a frame
     frame: Float[np.ndarray, " n"]
     sample: Float[np.ndarray, " n"]
-    cells: Columns
+    cells: exports.Columns
     #: name of the group, title and unit of each column
     groups: Sequence[str]
     titles: Sequence[str]
@@ -61,7 +53,7 @@ class _Section(NamedTuple):
 
 def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
     """Return the bodies, markers and channels of an export. Raises `RecordingError`."""
-    sections = list(_sections(text_lines(path), path))
+    sections = list(_sections(exports.text_lines(path), path))
     # several samples of a device are taken during one frame
     slow = [section.rate for section in sections if not section.sample.any()]
     rate = slow[0] if slow else sections[0].rate / (1.0 + float(np.nanmax(sections[0].sample)))
@@ -76,7 +68,7 @@ def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
             names = ", ".join(track.name for track in bodies)
             findings.append(Finding("warning", "", f"{names:.200}: of another rate than the first; left out"))
         channels.append((at, others))
-    return export_table(
+    return exports.export_table(
         path, np.zeros(0) if time is None else time, tracks, up="z", channels=channels, findings=findings
     )
 
@@ -105,14 +97,14 @@ def _sections(lines: list[str], path: Path) -> Iterator[_Section]:
         groups, units = ([*row, *[""] * len(titles)][: len(titles)] for row in (groups, units))
         for k in range(3, len(groups)):
             groups[k] = groups[k] or groups[k - 1]
-        cells = cells_reader(lines[start + 5 : rows], titles, delimiter, path)
+        cells = exports.cells_reader(lines[start + 5 : rows], titles, delimiter, path)
         frame, sample = np.nan_to_num(cells([0, 1])).T
         yield _Section(rate, frame, sample, cells, groups, titles, units)
 
 
 def _tracks(
     section: _Section, findings: list[Finding], path: Path
-) -> tuple[list[Track], dict[str, np.ndarray]]:
+) -> tuple[list[exports.Track], dict[str, np.ndarray]]:
     """Return the bodies and markers of a section, and its other columns by title."""
     from scipy.spatial.transform import Rotation
 
@@ -128,9 +120,9 @@ def _tracks(
         unit = {title: section.units[k].lower() for title, k in places.items()}
         name = section.groups[begin].removeprefix("Global Angle ")
         for where, rotated in (("XYZ", ()), (("TX", "TY", "TZ"), ("RX", "RY", "RZ"))):
-            if not all(unit.get(axis) in LENGTHS for axis in where):
+            if not all(unit.get(axis) in exports.LENGTHS for axis in where):
                 continue
-            position = section.cells([places[axis] for axis in where]) * LENGTHS[unit[where[0]]]
+            position = section.cells([places[axis] for axis in where]) * exports.LENGTHS[unit[where[0]]]
             quaternion = None
             if rotated and "RW" in places:
                 quaternion = section.cells([places[axis] for axis in ("RW", *rotated)])
@@ -141,10 +133,10 @@ def _tracks(
                         f"{path}: the unit of RX of {name} is {unit['RX']!r}; allowed is deg or rad"
                     )
                 vectors = size * section.cells([places[axis] for axis in rotated])
-                quaternion = quaternions_of(vectors, Rotation.from_rotvec)
+                quaternion = exports.quaternions_of(vectors, Rotation.from_rotvec)
                 what = "rotations RX, RY, RZ are read as rotation vectors (helical angles)"
                 findings.append(Finding("note", name, what))
-            tracks.append(Track(name, position, quaternion, "segment" if rotated else "marker"))
+            tracks.append(exports.Track(name, position, quaternion, "segment" if rotated else "marker"))
             break
         else:
             for title, k in places.items():

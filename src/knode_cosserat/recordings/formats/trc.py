@@ -17,13 +17,7 @@ import re
 from collections.abc import Collection
 from pathlib import Path
 
-from knode_cosserat.recordings.exports import (
-    Track,
-    cells_reader,
-    export_table,
-    length_unit,
-    text_lines,
-)
+from knode_cosserat.recordings.exports import Track, cells_reader, export_table, length_unit, text_lines
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.table import Table
