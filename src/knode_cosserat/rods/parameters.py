@@ -272,7 +272,7 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
-class Slot:
+class _Slot:
     """Statement of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
 
     meaning: str
@@ -396,7 +396,7 @@ def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any
     def several(value: Any) -> Any:
         return (value,) if isinstance(value, family) else _as_tuple(value)
 
-    return _field(Slot(meaning, family, many, optional=default is None), default, several if many else None)
+    return _field(_Slot(meaning, family, many, optional=default is None), default, several if many else None)
 
 
 # Converters do not know the name of their field: a value that they cannot convert stays for `check`.
@@ -449,9 +449,9 @@ def parameters_of(cls: type) -> dict[str, Parameter]:
     return stated_of(cls, Parameter)
 
 
-def slots_of(cls: type) -> dict[str, Slot]:
+def slots_of(cls: type) -> dict[str, _Slot]:
     """Return the slots for parts of a class, by name."""
-    return stated_of(cls, Slot)
+    return stated_of(cls, _Slot)
 
 
 def kinds_of(family: Any) -> dict[str, Any]:

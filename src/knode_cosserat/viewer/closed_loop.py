@@ -126,7 +126,7 @@ def _soft_box(controller: Any) -> list[list[float | None]] | None:
 
 
 @dataclasses.dataclass
-class Moment:
+class _Moment:
     """Shapes of one period by name, as `shapes` returns them, with the numbers of the loop."""
 
     time: float
@@ -200,7 +200,7 @@ class FollowedTarget:
     def restart(self) -> None:
         """Start the plant, the controller and the record again; the target stays."""
         self.loop = Loop(self.first.copied(), self.plant, constant(self.position.tolist()), MOST_PERIODS)
-        self.moments: deque[Moment] = deque(maxlen=MOST_PERIODS)
+        self.moments: deque[_Moment] = deque(maxlen=MOST_PERIODS)
 
     def scene(self) -> dict[str, Any]:
         """Return the page's scene of the run since the last start.
@@ -243,7 +243,7 @@ class FollowedTarget:
         point[[x is None for x in target]] = np.nan
         return point
 
-    def period(self) -> Moment:
+    def period(self) -> _Moment:
         """Move by one period towards the newest target, and return the states at its measurement.
 
         Raises:
@@ -262,7 +262,7 @@ class FollowedTarget:
 
         row: Period = loop.period(note)
         numbers = self.facts.row(row, loop.missed, deviations)
-        moment = Moment(row.time, drawn, numbers, row.command.reason)
+        moment = _Moment(row.time, drawn, numbers, row.command.reason)
         self.moments.append(moment)
         return moment
 
@@ -314,7 +314,7 @@ class LoopSession(PageSession):
             if self.begin_anew:
                 self.begin_anew, stuck = False, False
                 await self._in_thread(followed.restart)
-                self.newest = self.frame(Moment(0.0, followed.shapes, self._at_rest(), ""))
+                self.newest = self.frame(_Moment(0.0, followed.shapes, self._at_rest(), ""))
                 self.fresh.set()
                 due = clock.time()
             if self.paused or stuck or clock.time() < due:
@@ -357,7 +357,7 @@ class LoopSession(PageSession):
             numbers[place : place + size] = values
         return numbers
 
-    def frame(self, moment: Moment, sequence: int | None = None) -> bytes:
+    def frame(self, moment: _Moment, sequence: int | None = None) -> bytes:
         """Return a period for the page: head as in `Session.frame`, the states' rows, the loop's numbers."""
         number = self.sequence if sequence is None else sequence
         states = list(moment.shapes.values())
