@@ -6,6 +6,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.experiments import experiments_of
 from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.section import Stretch
 from knode_cosserat.rods.tendons import Reels
@@ -62,7 +63,7 @@ def test_what_effects_do():
 
 
 def equilibria(robot, control, noise=5e-5):
-    still = kc.equilibrium(robot, control)
+    still = kc.equilibrium(robot, control, space="lobatto4")
     position = np.asarray(still.position)[:, :, -1]
     position = position + noise * np.random.default_rng(0).normal(size=position.shape)
     count = len(control)
@@ -71,6 +72,13 @@ def equilibria(robot, control, noise=5e-5):
         quaternion=np.full((count, 1, 4), np.nan), measured=np.ones((count, 1), dtype=bool), simulated=True,
         source="equilibria", static=True,
     )  # fmt: skip
+
+
+def test_equilibria_follow_a_row_that_was_not_seen():
+    seen = equilibria(CABLES, np.full((3, 3), 20.0))
+    [data] = experiments_of([seen], library_model(CABLES, seen.tension, seen.fractions))
+    assert data.static and len(data.control) == 3 and np.isnan(data.data[0]).all()
+    np.testing.assert_array_equal(data.data[1:, :3], seen.position[:, 0])
 
 
 @pytest.mark.campaign

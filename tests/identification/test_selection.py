@@ -1,7 +1,5 @@
 """Selection: rows that say nothing are not used, and the next experiment tells what it promises."""
 
-import dataclasses
-
 import numpy as np
 import pytest
 
@@ -21,8 +19,7 @@ ROWS = measured(NOMINAL, tensions(1.0, 2.0), "one")
 @pytest.fixture(scope="module")
 def search():
     model = library_model(NOMINAL, ROWS.tension, ROWS.fractions)
-    data = [each.rough() for each in experiments_of([ROWS], model)]
-    return Search(Misfit(model, data))
+    return Search(Misfit(model, [each.rough() for each in experiments_of([ROWS], model)]))
 
 
 def test_rows_that_depend_on_everything_are_not_used(search):
@@ -31,9 +28,7 @@ def test_rows_that_depend_on_everything_are_not_used(search):
     values[1, 2], slopes[:, 3, 1] = np.nan, 2.0 * LARGEST * search.length
     every = np.ones(len(slopes), dtype=bool)
     [used] = search.used([Rollout(values, lambda which: slopes[which])], every)
-    expected = np.ones((5, 3), dtype=bool)
-    expected[1, 2] = expected[3] = False
-    np.testing.assert_array_equal(used, expected)
+    assert used.sum() == 11 and not used[1, 2] and not used[3].any()
 
 
 @pytest.mark.slow
@@ -53,9 +48,7 @@ def test_the_next_experiment_tells_what_it_promises(search):
     scale = np.tile(point.scale, (2, 1))
     again = both.run(point.x, model.mask(names), effort=(0, 0.0), scale=scale, every=True)
     share = point.problem.amount[0] / again.problem.amount[0]
-    problem = again.problem._replace(matrix=again.problem.matrix * share)
-    known = problem.matrix.sum(axis=0) + np.diag(point.prior)
+    known = share * again.problem.matrix.sum(axis=0) + np.diag(point.prior)
     after = np.sqrt(np.diag(np.linalg.inv(known)))
     for label, (_, promised) in found.deviations.items():
         assert after[model.labels.index(label)] == pytest.approx(promised, rel=0.2)
-    assert dataclasses.is_dataclass(found)

@@ -243,7 +243,7 @@ def _measured(measured: Measurements, robot: System) -> tuple[Output, np.ndarray
     These are positions, rotations if the robot has orientations, and values of other sensors. A rotation
     counts as a displacement of a part of the length, a usual value of another sensor as the length.
     """
-    rows, length = len(measured.time), float(np.asarray(robot.length))
+    rows, length = len(measured.position), float(np.asarray(robot.length))
     outputs, data = list[Output](), list[np.ndarray]()
     if len(measured.fractions):
         fractions = tuple(np.clip(measured.fractions, 0.0, 1.0).tolist())
