@@ -242,8 +242,10 @@ class Misfit:
         """Return the numbers of a record (N * x) on which an output depends, now or before."""
         known = self._known_columns.get(output, ())
         found = np.flatnonzero(_sensitive(system, output, records, measured))
-        self._known_columns[output] = tuple(np.union1d(found, known).astype(int).tolist())
-        return self._known_columns[output]
+        # another thread may replace what is kept
+        columns = tuple(np.union1d(found, known).astype(int).tolist())
+        self._known_columns[output] = columns
+        return columns
 
     def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
         """Return the start of an experiment; None if there is no equilibrium."""

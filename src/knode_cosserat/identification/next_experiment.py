@@ -67,7 +67,7 @@ def next_experiment(
         The experiment; None if no control can be simulated.
     """
     model, first, point = posterior.model, search.misfit.data[0], posterior.point
-    robot, second = search.misfit.system(x), round(1.0 / first.dt)
+    robot, second = search.misfit.system(x), max(round(1.0 / first.dt), 1)
     experiments = []
     for words, control in _controls(search.misfit.data, round(LONGEST) * second):
         like = first.replace(control=control, moves=0, accurate=None, name=words)

@@ -75,7 +75,7 @@ def from_far(search: Search) -> Point:
 
 
 def _with_all(search: Search) -> Point:
-    """Search with all effects; over short horizons their shapes stay, which noise would make unstable."""
+    """Search with all effects; shapes stay over short horizons, where noise makes motions unstable."""
     model = search.misfit.model
     every = np.ones(model.size, dtype=bool)
     x = search.over(model.begin, every & ~model.shapes, HORIZONS[:-2])
