@@ -7,6 +7,7 @@ field, by Huber's loss, and priors of the numbers. `scipy.optimize.least_squares
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import logging
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, Self
@@ -45,6 +46,8 @@ FIRST, EXACT = (50, 1e-5), (100, 1e-10)
 #: the end
 PASS, PASSES, SETTLED = 5, 8, 0.05
 METHOD: Literal["trf"] = "trf"
+#: a number is not seen if its variance stays above this part of its prior's
+UNSEEN = 0.8
 #: a row is not used if it moves by more lengths than this for each standard deviation of the priors: such a
 #: motion is unstable there, and derivatives say nothing
 LARGEST = 10.0
@@ -171,7 +174,37 @@ class Search:
             SearchError: the nominal robot cannot be simulated, not even at rest.
         """
         x = self.over(np.where(free, self.misfit.model.begin, 0.0), free, HORIZONS, skipped)
-        return self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
+        point = self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
+        return self._beyond_kinks(point) if self.separate_rows else point
+
+    @property
+    def separate_rows(self) -> bool:
+        """True if tendons' lengths, or equilibria, keep every row near its solution."""
+        wound = {"reel", "motor"} & {*self.misfit.model.nominal.control_layout.names}
+        return bool(self.misfit.data[0].static or wound)
+
+    def _beyond_kinks(self, point: Point) -> Point:
+        """Return the best end of searches that begin at other values of numbers that were not seen.
+
+        A tendon that is slack in the model, but not in the robot, hides the numbers that it depends on.
+        """
+        unseen = point.free & (self.prior * np.diag(point.covariance()) > UNSEEN)
+        rollouts, units = self.solved(point.x), self.units(point.scale)
+        for k, step in itertools.product(np.flatnonzero(unseen), (-1.0, 1.0)):
+            x = np.clip(point.x + step * (np.arange(len(point.x)) == k), self.low, self.high)
+            moved = self.solved(x)
+            if rollouts is None or moved is None:
+                continue
+            changes = [(a.values - b.values) / unit for a, b, unit in zip(moved, rollouts, units, strict=True)]
+            if max(float(np.nanmax(np.abs(it))) for it in changes) < 1.0:
+                continue
+            try:
+                found = self.run(x, point.free, every=True)
+            except SearchError:
+                continue
+            if np.sum(np.log(found.scale)) < np.sum(np.log(point.scale)):
+                point = found
+        return point
 
     def over(
         self,
@@ -183,9 +216,7 @@ class Search:
         """Return coordinates after searches over parts of the longest motion, without the first ones."""
         data = self.misfit.data
         longest = max(len(it.control) - it.moves for it in data)
-        wound = {"reel", "motor"} & {*self.misfit.model.nominal.control_layout.names}
-        if data[0].static or wound:
-            # rows are independent of each other, and wound-up lengths keep the search near the solution
+        if self.separate_rows:
             longest = 0
         counts = [max(2, round(part * longest)) if part else 0 for part in parts if part or not self.exact]
         for horizon in [*dict.fromkeys(counts)][skipped:]:
