@@ -21,6 +21,7 @@ from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.next_experiment import next_experiment
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.result import Identified, estimates_of
+from knode_cosserat.identification.samples import sampled
 from knode_cosserat.identification.search import Point, Search, SearchError
 from knode_cosserat.identification.selection import WORSE, Selection, best_predicting, from_far, selected
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
@@ -272,7 +273,7 @@ def _accepted(
     """
     model, data = search.misfit.model, search.misfit.data
     while True:
-        names, point, folds, _ = selection
+        names, point, folds, *_ = selection
         x, kept, posterior = _averaged(search, selection, selection.posterior(model, known))
         reason = failed_trial(search.misfit.system(x), data, space)
         if reason is None:
@@ -306,6 +307,7 @@ def _accepted(
         result,
         held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
         next_experiment=next_experiment(search, posterior, x, undecided) if undecided else None,
+        ensemble=sampled(search, (x, kept), posterior, selection.held_out, robot.trained),
     )
 
 

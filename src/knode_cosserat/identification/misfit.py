@@ -41,6 +41,8 @@ from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tan
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
 
+#: number of points whose accurate differences are kept
+KEPT = 8
 #: seconds that recovery of one simulation may take
 RECOVERY = 0.5
 
@@ -105,6 +107,8 @@ class Misfit:
         self.model, self.data = model, tuple(data)
         self._first = True
         self._known_columns: dict[Output, tuple[int, ...]] = {}
+        #: accurate differences of the last points, by coordinates and number of the experiment
+        self._accurate: dict[tuple[bytes, int], np.ndarray] = {}
         # no value of a number, such as an effect that a robot lacks, needs machine code of its own
         directions, _ = _directions(model.robot, np.where(model.begin == 0.0, 0.1, model.begin))
         self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
@@ -143,23 +147,31 @@ class Misfit:
         Between continuous controls these are extrapolated from half the steps (Richardson), for schemes of
         order two. Derivatives are not refined. Held controls belong to the steps of their scheme.
         """
-        at = np.asarray(x, dtype=float)
+        at, chosen = np.asarray(x, dtype=float), range(len(self.data)) if which is None else which
 
-        def of_one(pair: tuple[Experiment, Rollout | None]) -> Rollout | None:
-            data, rollout = pair
-            target = data.accurate or data
-            solved = rollout if rollout is None or target is data else self._of_one(at, target, None)
-            if rollout is None or solved is None:
-                return rollout
-            values = solved.values - (rollout.offset if solved is rollout else 0.0)
-            if target.is_resolved:
-                finer = self._of_one(at, target.replace(steps=2 * target.steps), None)
-                if finer is None:
+        def of_one(pair: tuple[int, Rollout | None]) -> Rollout | None:
+            k, rollout = pair
+            values = self._accurate.get((at.tobytes(), k))
+            if rollout is None:
+                return None
+            if values is None:
+                data = self.data[k]
+                target = data.accurate or data
+                solved = rollout if target is data else self._of_one(at, target, None)
+                if solved is None:
                     return rollout
-                values = (4.0 * finer.values - values) / 3.0
+                values = solved.values - (rollout.offset if solved is rollout else 0.0)
+                if target.is_resolved:
+                    finer = self._of_one(at, target.replace(steps=2 * target.steps), None)
+                    if finer is None:
+                        return rollout
+                    values = (4.0 * finer.values - values) / 3.0
+                self._accurate[at.tobytes(), k] = values
             return rollout.moved(values - rollout.values + rollout.offset)
 
-        return self._parallel(of_one, list(zip(self._chosen(which), rollouts, strict=True)))
+        refined = self._parallel(of_one, list(zip(chosen, rollouts, strict=True)))
+        self._accurate = dict([*self._accurate.items()][-KEPT * len(self.data) :])
+        return refined
 
     def _chosen(self, which: Sequence[int] | None) -> list[Experiment]:
         return [self.data[k] for k in (range(len(self.data)) if which is None else which)]

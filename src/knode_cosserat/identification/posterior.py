@@ -92,6 +92,10 @@ class Posterior:
         mean = self.draws.sum(axis=0) / np.maximum(present.sum(axis=0), 1)
         return dataclasses.replace(self, draws=self._clipped(np.where(present, self.draws + (x - mean), 0.0)))
 
+    def samples(self) -> Float[np.ndarray, "D n"]:
+        """Return random samples of the coordinates."""
+        return self._drawn({self.names(): 1.0}) if self.draws is None else self.draws
+
     def interval(self, level: float) -> Float[np.ndarray, "2 n"]:
         """Return the ends of an interval of each coordinate, within the bounds."""
         # imported here: it takes a third of a second

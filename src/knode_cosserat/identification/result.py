@@ -13,6 +13,7 @@ from knode_cosserat._reprs import robot_text, wrapped
 from knode_cosserat.identification.next_experiment import NextExperiment
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.search import Point
+from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.rods.system import System
 
 #: probability of an interval
@@ -51,6 +52,8 @@ class Identified:
         undecided: effects that it may have, and their probabilities; the data do not decide. The robot has
             the mean of what they would change.
         next_experiment: controls that would tell most about these; None if all is decided.
+        ensemble: robots that agree with the recordings, random samples whose spread covers held-out recordings;
+            `ensemble.predict(controls, dt).interval(0.95)` is the band of a prediction. None for parameters.
         estimates: their numbers with 95 % intervals.
         correlation: correlation of the numbers' errors, in the order of `estimates` (n, n).
         nominal_error: by recording, root mean square error of the tip of the nominal robot (m).
@@ -73,6 +76,7 @@ class Identified:
     steps: tuple[str, ...] = ()
     undecided: Mapping[str, float] = dataclasses.field(default_factory=dict)
     next_experiment: NextExperiment | None = None
+    ensemble: Ensemble | None = None
 
     def __getitem__(self, label: str) -> Estimate:
         """Return the estimate of a number by its label, such as "youngs_modulus" or "gravity[2]".
@@ -87,7 +91,7 @@ class Identified:
         raise KeyError(f"there is no estimate {label!r}; there are {labels}")
 
     def to_dict(self) -> dict[str, Any]:
-        """Return everything but the robot, as JSON has it."""
+        """Return everything but the robots, as JSON has it."""
         return {
             "effects": list(self.effects),
             "undecided": dict(self.undecided),

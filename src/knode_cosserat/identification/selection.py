@@ -32,7 +32,9 @@ class Selection(NamedTuple):
     names: tuple[str, ...]
     point: Point
     folds: tuple[Point | None, ...] = ()
-    #: logarithm of the usual size of the differences of each recording, in the search without it
+    #: differences (rows, e) of each recording, in the search without it
+    held_out: tuple[Float[np.ndarray, "rows e"], ...] = ()
+    #: logarithm of the usual size of these differences
     unseen: Float[np.ndarray, " R"] = np.zeros(0)
 
     @classmethod
@@ -40,12 +42,13 @@ class Selection(NamedTuple):
         """Return the selection after searches without one recording each."""
         count = len(search.misfit.data)
         folds = [search.without(point, k, FOLD) for k in range(count)] if count > 1 else []
-        unseen = np.full(len(folds), np.inf)
+        unseen, held_out = np.full(len(folds), np.inf), [np.zeros((0, 0))] * len(folds)
         for k, fold in enumerate(folds):
             rollouts = None if fold is None else search.solved(fold.x, Subset(None, [k]))
             if rollouts is not None:
                 unseen[k] = np.mean(np.log(search.scales_of(rollouts, [k])))
-        return cls(names, point, tuple(folds), unseen)
+                held_out[k] = rollouts[0].values
+        return cls(names, point, tuple(folds), tuple(held_out), unseen)
 
     def posterior(self, model: Model, known: bool = False) -> Posterior:
         """Return the probabilities of effects, in view of what recordings disagree about."""

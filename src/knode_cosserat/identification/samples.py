@@ -1,0 +1,51 @@
+"""Random samples of the robots that agree with recordings, whose spread is the band of a prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.identification.posterior import Posterior
+from knode_cosserat.identification.search import Search
+from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.residual import Nothing
+
+#: number of samples
+MEMBERS = 10
+#: part of the held-out differences that has to lie within the spread, and its bound of a normal distribution
+COVERED, NORMAL = 0.95, 1.96
+#: deviations are at most multiplied by this
+MOST_INFLATED = 30.0
+
+
+def sampled(
+    search: Search, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior,
+    held_out: Sequence[Float[np.ndarray, "rows e"]], trained: Any,
+) -> Ensemble | None:  # fmt: skip
+    """Return samples of the robots that agree with the data, and can follow their controls; None if none can.
+
+    They are spread until they cover the differences of held-out recordings, or of all if none was held out.
+    """
+    model, (x, names), samples = search.misfit.model, at, posterior.samples()
+    rollouts = search.solved(x)
+    assert rollouts is not None
+    search.misfit.differentiated(rollouts)
+    covariance, over = np.cov(samples, rowvar=False), [np.ones(1)]
+    for rollout, off in zip(rollouts, held_out or [it.values for it in rollouts], strict=True):
+        slopes = rollout.derivatives
+        spread = np.sqrt(np.einsum("nre,nm,mre->re", slopes, covariance, slopes, optimize=True))
+        known = np.isfinite(off) & (spread > 0.0) if off.size else np.zeros_like(spread, dtype=bool)
+        over.append(np.abs(off[known]) / spread[known])
+    ratio = np.clip(np.quantile(np.concatenate(over), COVERED) / NORMAL, 1.0, MOST_INFLATED)
+    members = []
+    for sample in samples[np.random.default_rng(0).choice(len(samples), MEMBERS, replace=False)]:
+        wide = np.clip(x + ratio * (sample - samples.mean(axis=0)), *model.bounds)
+        wide = np.where(model.mask(names), wide, 0.0)
+        if all(search.misfit.differences(wide)):
+            robot = model.reduced(wide, names).replace(trained=trained)
+            members.append(KNODE(robot, Nothing(), About({"identified": True})))
+    return Ensemble(members) if members else None
