@@ -55,3 +55,4 @@ def test_a_registered_effect_is_identified(tilt):
     assert {"gravity.x", "gravity.y"} <= {estimate.label for estimate in found.estimates}
     (nominal,), (error,) = found.nominal_error.values(), found.error.values()
     assert error < nominal
+    assert len({float(np.asarray(it.knowledge.gravity)[0]) for it in found.ensemble}) > 5

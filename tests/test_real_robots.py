@@ -92,3 +92,11 @@ def test_the_order_of_servos_is_found():
         motor_order(robot, changed.rows(40, 60))
     with pytest.raises(ValueError, match="2 motors; the robot has 9"):
         motor_order(robot, dataclasses.replace(seen, tension=seen.tension[:, :2]))
+
+
+@pytest.mark.campaign
+def test_the_servo_robots_tip_follows_a_circle(tmp_path):
+    """On a robot with friction, slack and other stiffnesses than the model has."""
+    circle = runpy.run_path(str(SERVOS / "circle.py"))["main"]
+    log = circle(str(SERVOS / "identified.yaml"), str(tmp_path / "circle.png"), 20.0)
+    assert log.tip_rmse(10.0) < 0.01 * 0.23

@@ -463,7 +463,9 @@ def parse(
     if os.path.exists(specification) and not (is_signal and rest):
         return _from_file(specification, layout, steps, dt)
     held = _constant_control(specification, layout.size)
-    is_named = not is_tension or _is_named(specification)
+    # `NAME=SIGNAL;…` and `none`; words such as `sine:2,base=5` are for all tendons
+    word, equals, _ = specification.partition("=")
+    is_named = not is_tension or specification.strip() == "none" or (equals and not set(":,") & set(word))
     if held is None and not (is_named or is_signal):
         close = difflib.get_close_matches(name, _TENSIONS, n=1)
         hint = f"; did you mean {close[0]}:{_TENSIONS[close[0]].main.upper()}?" if close else ""
@@ -486,12 +488,6 @@ def parse(
         except ControlsError as error:
             raise ControlsError(f"controls {specification!r}: {error}") from None
     return _checked_tensions(values, f"controls {specification!r}") if is_tension else values
-
-
-def _is_named(specification: str) -> bool:
-    """True for `NAME=SIGNAL;…` and `none`; words such as `sine:2,base=5` are for all tendons."""
-    name, equals, _ = specification.partition("=")
-    return specification.strip() == "none" or bool(equals and not set(":,") & set(name))
 
 
 def _constant_control(specification: str, size: int) -> np.ndarray | None:

@@ -46,30 +46,15 @@ def encode_message(message, framed):
     return (sealed(text) if framed else text).encode("ascii") + b"\n"
 
 
-class FakeBoard:
-    """A board in a thread; its watchdog is slower than a real one, for busy computers.
+class FakeLine:
+    """A pseudo-terminal, and a thread that answers on it."""
 
-    `paper` is the paper's board: no banner, no hello, plain telemetry only.
-    """
-
-    def __init__(self, *, paper=False, banner=True, taring=0.0, limit=2300, watchdog=0.6):
-        self.paper, self.banner, self.limit, self.watchdog = paper, banner and not paper, limit, watchdog
-        self.framed, self.state, self.fault = False, "ready" if not taring else "taring", ""
-        self.wanted, self.measured = [0] * 4, [0] * 4
-        self.received, self.accepted, self.last = [], [], None
-        self.settings = {"kp": 300, "limit": limit, "jog": 80, "estop": 1}
-        self.saved = False
-        #: part of lines of each kind with one damaged byte, and of commands that the board reads damaged
-        self.damage, self.damage_input = 0, 0
-        self.silent = False
-        self._taring, self._number, self._count = taring, 0, collections.Counter()
-        self._master, slave = pty.openpty()
-        tty.setraw(slave)
-        self.port = os.ttyname(slave)
-        self._slave = slave
-        self._splitter = LineSplitter()
+    def __init__(self):
+        self._master, self._slave = pty.openpty()
+        tty.setraw(self._slave)
+        os.set_blocking(self._master, False)
+        self.port = os.ttyname(self._slave)
         self._end = threading.Event()
-        self.fed = time.monotonic()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
@@ -86,6 +71,28 @@ class FakeBoard:
         for end in (self._master, self._slave):
             with contextlib.suppress(OSError):
                 os.close(end)
+
+
+class FakeBoard(FakeLine):
+    """A board in a thread; its watchdog is slower than a real one, for busy computers.
+
+    `paper` is the paper's board: no banner, no hello, plain telemetry only.
+    """
+
+    def __init__(self, *, paper=False, banner=True, taring=0.0, limit=2300, watchdog=0.6):
+        self.paper, self.banner, self.limit, self.watchdog = paper, banner and not paper, limit, watchdog
+        self.framed, self.state, self.fault = False, "ready" if not taring else "taring", ""
+        self.wanted, self.measured = [0] * 4, [0] * 4
+        self.received, self.accepted, self.last = [], [], None
+        self.settings = {"kp": 300, "limit": limit, "jog": 80, "estop": 1}
+        self.saved = False
+        #: part of lines of each kind with one damaged byte, and of commands that the board reads damaged
+        self.damage, self.damage_input = 0, 0
+        self.silent = False
+        self._taring, self._number, self._count = taring, 0, collections.Counter()
+        self._splitter = LineSplitter()
+        self.fed = time.monotonic()
+        super().__init__()
 
     def latch(self, fault):
         """Latch a fault, such as "slack:2"."""
@@ -115,7 +122,6 @@ class FakeBoard:
         self.write(bytes(line))
 
     def _run(self):
-        os.set_blocking(self._master, False)
         start, sent = time.monotonic(), 0.0
         if self.banner:
             # the boot loader

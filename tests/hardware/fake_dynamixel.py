@@ -2,10 +2,9 @@
 
 import contextlib
 import os
-import pty
-import threading
 import time
-import tty
+
+from tests.hardware.fake_board import FakeLine
 
 HEADER = b"\xff\xff\xfd\x00"
 READ, WRITE, REBOOT, STATUS, SYNC_READ, SYNC_WRITE = 0x02, 0x03, 0x08, 0x55, 0x82, 0x83
@@ -80,33 +79,14 @@ class Motor:
         return bytes(self.memory[k] for k in place)
 
 
-class FakeDynamixel:
+class FakeDynamixel(FakeLine):
     """A bus of motors in a thread."""
 
     def __init__(self, ids):
         self.motors = {motor: Motor() for motor in ids}
         self.silent, self.damage, self.count = set(), 0, 0
         self.bad, self.instructions = 0, []
-        self._master, self._slave = pty.openpty()
-        tty.setraw(self._slave)
-        os.set_blocking(self._master, False)
-        self.port = os.ttyname(self._slave)
-        self._end = threading.Event()
-        self._thread = threading.Thread(target=self._run, daemon=True)
-        self._thread.start()
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.unplug()
-
-    def unplug(self):
-        self._end.set()
-        self._thread.join(2.0)
-        for end in (self._master, self._slave):
-            with contextlib.suppress(OSError):
-                os.close(end)
+        super().__init__()
 
     def _run(self):
         data = b""

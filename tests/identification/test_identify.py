@@ -7,7 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification.effects import library_model
-from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.evaluate import coverage, evaluate
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
 from knode_cosserat.rods.parameters import ParameterError
@@ -32,7 +32,11 @@ TRUE = kc.robots.RoutedTendonRobot.like(
 )
 
 
-def recordings(robot=TRUE, seconds=3.0, kinds=(1.0, 2.0, "random"), reading=lambda tension: tension / GAIN):
+def gauged(tension):
+    return tension / GAIN
+
+
+def recordings(robot=TRUE, seconds=3.0, kinds=(1.0, 2.0, "random"), reading=gauged):
     return [
         measured(robot, tensions(kind, seconds, seed=k), f"recording {k}", seed=k, reading=reading)
         for k, kind in enumerate(kinds)
@@ -44,11 +48,10 @@ def test_a_robot_is_found_and_predicts_what_it_has_not_seen():
     """Not straight at rest, bodies mounted anyhow, and three things that the data sheet does not say."""
     told = []
     found = kc.identify(NOMINAL, recordings(), progress=told.append)
-    unseen = measured(
-        TRUE, tensions("random", 4.0, seed=9), "unseen", seed=9, reading=lambda tension: tension / GAIN
-    )
+    unseen = measured(TRUE, tensions("random", 4.0, seed=9), "unseen", seed=9, reading=gauged)
     before, after = (evaluate(robot, unseen) for robot in (NOMINAL, found.robot))
     assert after.tip_rmse < 0.03 * before.tip_rmse and after.tip_rmse < 3e-3
+    assert coverage(found.ensemble, unseen, 0.95) > 0.9
     assert "friction" in found.effects and "stiffness" in found.effects
     # what is not there is not found
     assert not {"vibration", "early anchors", "friction by curvature"} & set(found.effects)

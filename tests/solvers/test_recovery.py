@@ -15,11 +15,6 @@ from tests.trajectories import HOPELESS
 DT = 0.05
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return kc.load_robot("delrin-tendon-robot")
-
-
 def test_a_hopeless_load_raises_one_clear_line(robot):
     tensions = np.tile(HOPELESS, (5, 1))
     with pytest.raises(kc.SimulationError) as caught:

@@ -21,21 +21,6 @@ from tests.trajectories import HOPELESS, synthetic
 DT = 0.05
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return kc.load_robot("delrin-tendon-robot")
-
-
-@pytest.fixture(scope="module")
-def sine():
-    return kc.controls.sine(1.5, 100, DT)
-
-
-@pytest.fixture(scope="module")
-def truth(robot, sine):
-    return kc.simulate(robot, sine, DT)
-
-
 def test_rows_time_and_controls(robot, sine, truth):
     assert truth.y.shape == (101, 10, 19) and truth.z.shape == (101, 10, 6)
     np.testing.assert_allclose(truth.time, np.arange(101) * DT)

@@ -8,21 +8,6 @@ import knode_cosserat as kc
 DT = 0.05
 
 
-@pytest.fixture(scope="module")
-def robot():
-    return kc.load_robot("delrin-tendon-robot")
-
-
-@pytest.fixture(scope="module")
-def sine():
-    return kc.controls.sine(1.5, 100, DT)
-
-
-@pytest.fixture(scope="module")
-def truth(robot, sine):
-    return kc.simulate(robot, sine, DT)
-
-
 def assert_same(rows, wanted):
     """To the solver's tolerance: a call begins without the linearisation of the step before."""
     found = {

@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.identification.steps import simulated_rows
+from knode_cosserat.learning.ensemble import Prediction
 from knode_cosserat.metrics import dtw_distance, pose_mse, rotation_rmse
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.system import System
@@ -94,20 +95,12 @@ def coverage(
         SimulationError: a member has no solution.
         ValueError: there are fewer than two members.
     """
-    predicted = []
+    predicted = list[Any]()
     for robot in members:
         moved = predict(robot, measured, space=space, recovery=RECOVERY)
         places = places_on(robot, measured.fractions)
-        predicted.append(np.asarray(positions_at(robot, np.asarray(moved.y), places)))
-    count = len(predicted)
-    if count < 2:
-        raise ValueError("fewer than two members have no spread")
-    from scipy.stats import t
-
-    factor = t.ppf(0.5 + level / 2.0, count - 1) * np.sqrt(1.0 + 1.0 / count)
-    half = factor * np.std(predicted, axis=0, ddof=1)
-    off = np.abs(measured.position - np.mean(predicted, axis=0))[1:]
-    return float(np.mean((off <= half[1:])[np.isfinite(off)]))
+        predicted.append(types.SimpleNamespace(position=positions_at(robot, np.asarray(moved.y), places)))
+    return Prediction(predicted).coverage(measured, level, first=0)
 
 
 def predict(

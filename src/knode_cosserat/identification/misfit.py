@@ -209,8 +209,9 @@ class Misfit:
         compared = slice(data.steps - 1, steps, data.steps)
         records = np.concatenate([start.record[None], solved_rows.records[compared, :, :size]])
 
-        # outputs of few numbers of rows: few compiled programs serve all horizons
-        count = min(size for size in _sizes(len(data.data)) if size >= len(records))
+        # outputs of all rows, a quarter, or a sixteenth: few compiled programs serve all horizons
+        sizes = (-(-len(data.data) // part) for part in (1, 4, 16))
+        count = min(size for size in sizes if size >= len(records))
         seen_data = data.data[:count]
 
         def filled(rows: np.ndarray) -> np.ndarray:
@@ -300,11 +301,6 @@ class Misfit:
             return np.asarray(d_record) @ weights, begun, tuple(np.asarray(part) @ weights for part in d_past)
 
         return _Start(record, past, np.asarray(at_start.control), known, at_start.state.dt is None, tangents)
-
-
-def _sizes(rows: int) -> list[int]:
-    """Return all rows, a quarter of them, and a sixteenth."""
-    return [rows, -(-rows // 4), -(-rows // 16)]
 
 
 def _cells(system: Any) -> LoadCells | None:

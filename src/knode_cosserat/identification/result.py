@@ -52,7 +52,7 @@ class Identified:
         undecided: effects that it may have, and their probabilities; the data do not decide. The robot has
             the mean of what they would change.
         next_experiment: controls that would tell most about these; None if all is decided.
-        ensemble: robots that agree with the recordings, random samples whose spread covers held-out recordings;
+        ensemble: random samples of the robots that agree with the recordings, spread as held-out ones are;
             `ensemble.predict(controls, dt).interval(0.95)` is the band of a prediction. None for parameters.
         estimates: their numbers with 95 % intervals.
         correlation: correlation of the numbers' errors, in the order of `estimates` (n, n).

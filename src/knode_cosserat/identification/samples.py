@@ -16,8 +16,6 @@ from knode_cosserat.learning.residual import Nothing
 
 #: number of samples
 MEMBERS = 10
-#: part of the held-out differences that has to lie within the spread, and its bound of a normal distribution
-COVERED, NORMAL = 0.95, 1.96
 #: deviations are at most multiplied by this
 MOST_INFLATED = 30.0
 
@@ -28,19 +26,20 @@ def sampled(
 ) -> Ensemble | None:  # fmt: skip
     """Return samples of the robots that agree with the data, and can follow their controls; None if none can.
 
-    They are spread until they cover the differences of held-out recordings, or of all if none was held out.
+    Their spread is, in root mean square, at least that of the differences of held-out recordings, or of all
+    recordings if none was held out.
     """
     model, (x, names), samples = search.misfit.model, at, posterior.samples()
     rollouts = search.solved(x)
     assert rollouts is not None
     search.misfit.differentiated(rollouts)
-    covariance, over = np.cov(samples, rowvar=False), [np.ones(1)]
+    covariance, expected, seen = np.cov(samples, rowvar=False), 0.0, 0.0
     for rollout, off in zip(rollouts, held_out or [it.values for it in rollouts], strict=True):
         slopes = rollout.derivatives
-        spread = np.sqrt(np.einsum("nre,nm,mre->re", slopes, covariance, slopes, optimize=True))
-        known = np.isfinite(off) & (spread > 0.0) if off.size else np.zeros_like(spread, dtype=bool)
-        over.append(np.abs(off[known]) / spread[known])
-    ratio = np.clip(np.quantile(np.concatenate(over), COVERED) / NORMAL, 1.0, MOST_INFLATED)
+        spread = np.einsum("nre,nm,mre->re", slopes, covariance, slopes, optimize=True)
+        known = np.isfinite(off) if off.size else np.zeros_like(spread, dtype=bool)
+        expected, seen = expected + np.sum(spread[known]), seen + np.sum(off[known] ** 2)
+    ratio = np.clip(np.sqrt(seen / max(expected, np.finfo(float).tiny)), 1.0, MOST_INFLATED)
     members = []
     for sample in samples[np.random.default_rng(0).choice(len(samples), MEMBERS, replace=False)]:
         wide = np.clip(x + ratio * (sample - samples.mean(axis=0)), *model.bounds)

@@ -195,8 +195,8 @@ class Search:
             moved = self.solved(x)
             if rollouts is None or moved is None:
                 continue
-            changes = [(a.values - b.values) / unit for a, b, unit in zip(moved, rollouts, units, strict=True)]
-            if max(float(np.nanmax(np.abs(it))) for it in changes) < 1.0:
+            changed = zip(moved, rollouts, units, strict=True)
+            if all(np.nanmax(np.abs(new.values - old.values) / unit) < 1.0 for new, old, unit in changed):
                 continue
             try:
                 found = self.run(x, point.free, every=True)

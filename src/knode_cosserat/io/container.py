@@ -449,7 +449,10 @@ class _Unpacker:
                 return self._arrays[inner][()]
         if mark == "$tuple" and isinstance(inner, list):
             return tuple(self._value(inner, where))
-        if mark == "$dict" and isinstance(inner, list) and all(_is_item(part) for part in inner):
+        items = isinstance(inner, list) and all(
+            isinstance(part, list) and len(part) == 2 and isinstance(part[0], str) for part in inner
+        )
+        if mark == "$dict" and items:
             return {key: self._value(part, f"{where}.{key}") for key, part in inner}
         if mark == "$class" and isinstance(inner, str) and isinstance(value.get("fields"), dict):
             return self._object(inner, value["fields"], where)
@@ -474,10 +477,6 @@ def nesting(text: str) -> int:
     letters = np.frombuffer(text.encode("utf-8", "replace"), np.uint8)
     steps = np.isin(letters, list(b"[{")).astype(int) - np.isin(letters, list(b"]}")).astype(int)
     return int(np.max(np.cumsum(steps), initial=0))
-
-
-def _is_item(part: Any) -> bool:
-    return isinstance(part, list) and len(part) == 2 and isinstance(part[0], str)
 
 
 def _object_of(cls: Any, values: dict[str, Any], where: str) -> Any:

@@ -147,8 +147,10 @@ class Prediction:
         half = t.ppf(0.5 + level / 2.0, max(count - 1, 1)) * np.sqrt(1.0 + 1.0 / count) * self.spread
         return self.position - half, self.position + half
 
-    def coverage(self, reference: Any, level: float = 0.9) -> float:
+    def coverage(self, reference: Any, level: float = 0.9, first: int = 1) -> float:
         """Return the fraction of the reference's positions inside `interval`, over all rows, nodes and axes.
+
+        Nodes before the `first`, as the base, and row 0 are not counted, for they are not predicted.
 
         The spread is calibrated if the result is near `level`. If it is far below, the members share an
         error: the spread covers data and chance, but not effects that no member can express.
@@ -163,8 +165,7 @@ class Prediction:
         if true.shape != low.shape:
             raise ValueError(f"the reference's positions are {true.shape} and the prediction's {low.shape}")
         inside = (low <= true) & (true <= high)
-        # the base and the initial row are not predicted
-        return float(np.mean(inside[1:, 1:]))
+        return float(np.mean(inside[1:, first:][np.isfinite(true[1:, first:])]))
 
 
 def _mean(values: Any) -> Any:

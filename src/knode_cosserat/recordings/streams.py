@@ -201,7 +201,12 @@ def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]
     # a jump and back: a message out of order, or a damaged stamp
     odd[1:] &= ~odd[:-1]
     drift = (stream.stamped - stream.received) * 1e-9
-    stays = [row for row in np.flatnonzero(odd) if _stays(drift, int(row))]
+    stays = []
+    for row in np.flatnonzero(odd):
+        # the offset between stamps and recording times stays changed for several rows
+        before, after = drift[max(0, row - 4) : row + 1], drift[row + 1 : row + 6]
+        if len(after) >= 3 and abs(float(np.median(after) - np.median(before))) > JUMP:
+            stays.append(int(row))
     if not stays:
         return stream.stamped, []
     sizes = ", ".join(f"{stamps[row] - received[row]:+.3f} s" for row in stays[:3])
@@ -210,12 +215,6 @@ def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]
     delay = np.int64(np.median((stream.received - stream.stamped)[: stays[0] + 1]))
     what = f"the clock of its stamps jumped ({sizes}{more}); the times of recording are used"
     return stream.received - delay, [Finding("warning", stream.topic, what, when)]
-
-
-def _stays(drift: Float[np.ndarray, " n"], row: int) -> bool:
-    """True if the offset between stamps and recording times stays changed for several rows after a jump."""
-    before, after = drift[max(0, row - 4) : row + 1], drift[row + 1 : row + 6]
-    return len(after) >= 3 and abs(float(np.median(after) - np.median(before))) > JUMP
 
 
 def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " kept"], list[Finding]]:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import choice, parameter, place
-from knode_cosserat.rods.parts import Part, RodPoint, Wrench, require_stretch
+from knode_cosserat.rods.parts import Part, RodPoint, Stretched, Wrench
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 
@@ -118,20 +118,8 @@ class PointLoad(Load):
         """Return the load on the rod (N, N·m)."""
 
 
-class SpreadLoad(Load):
+class SpreadLoad(Stretched, Load):
     """A load per length, between two places."""
-
-    begin: float = place("where it begins", default=0.0)
-    end: float = place("where it ends", default=1.0)
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        require_stretch(self.begin, self.end, type(self).__name__)
-
-    @property
-    def cuts(self) -> tuple[float, ...]:
-        """Places where it begins and ends."""
-        return tuple(end for end in (self.begin, self.end) if end > 0.0)
 
     def load(self, point: RodPoint) -> Wrench:
         """Return the load on the rod per length, zero outside of its stretch."""

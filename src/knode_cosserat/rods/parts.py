@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields, slots_of
+from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields, place, slots_of
 
 
 class Wrench(NamedTuple):
@@ -192,7 +192,20 @@ def eased(system: Any, part: float) -> Any:
     return system.replace(**changes) if changes else system
 
 
-def require_stretch(begin: Any, end: Any, who: str) -> None:
-    """Raise `ParameterError` unless a section of the rod ends beyond its beginning."""
-    if not end > begin:
-        raise ParameterError(f"{who}: end is {end:g}; allowed is a place beyond begin, {begin:g}")
+class Stretched(Part):
+    """A part along a stretch of the rod, by fractions of its length."""
+
+    begin: float = place("where it begins", default=0.0)
+    end: float = place("where it ends", default=1.0)
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        if not self.end > self.begin:
+            raise ParameterError(
+                f"{type(self).__name__}: end is {self.end:g}; allowed is a place beyond begin, {self.begin:g}"
+            )
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Places where it begins and ends."""
+        return tuple(end for end in (self.begin, self.end) if end > 0.0)

@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Pose
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, choice, parameter, place
-from knode_cosserat.rods.parts import Part, require_stretch
+from knode_cosserat.rods.parameters import ParameterError, choice, parameter
+from knode_cosserat.rods.parts import Stretched
 from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, turned
 
 #: d₃: along the rod
@@ -82,20 +82,8 @@ class Differences(NamedTuple):
     curvature: Any = 0.0
 
 
-class SectionChange(Part):
+class SectionChange(Stretched):
     """A section of the rod with a cross-section that differs from the rod's parameters."""
-
-    begin: float = place("where it begins", default=0.0)
-    end: float = place("where it ends", default=1.0)
-
-    def __check_init__(self) -> None:
-        super().__check_init__()
-        require_stretch(self.begin, self.end, type(self).__name__)
-
-    @property
-    def cuts(self) -> tuple[float, ...]:
-        """Places where it begins and ends."""
-        return tuple(end for end in (self.begin, self.end) if end > 0.0)
 
     @abc.abstractmethod
     def differences(self, part: Any, control: Any) -> Differences:

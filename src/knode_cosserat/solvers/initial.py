@@ -150,7 +150,10 @@ def _last_state(
     made = initial.settings
     if made is not None and made.time is None:
         return None
-    if made is None or made.space != settings.space or not _alike(initial.system, system):
+    places, other = (
+        (it.discontinuities.places, it.nodes, strand_count(it), it.mixed) for it in (initial.system, system)
+    )
+    if made is None or made.space != settings.space or places != other:
         if len(initial.time) < 2:
             return None
         numeric: Any = jnp if is_traced(initial) else np
@@ -168,9 +171,3 @@ def _last_state(
     shift = carried(system, settings.space, change)
     y = history.y + grid_of(system).spread(change[:, : system.y_layout.size])
     return dataclasses.replace(state, history=history._replace(records=history.records + shift, y=y))
-
-
-def _alike(one: System, other: System) -> bool:
-    """True if two systems have the same places and records."""
-    grids = [(it.discontinuities.places, it.nodes, strand_count(it), it.mixed) for it in (one, other)]
-    return bool(grids[0] == grids[1])

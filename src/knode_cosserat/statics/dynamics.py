@@ -1,4 +1,4 @@
-"""Linearised motion about an equilibrium: growth rates and frequencies of its modes.
+"""Linearised motion about an equilibrium: frequencies, damping and shapes of its modes.
 
 In a small motion δy e^{λt} all rates are λ times the changes. A step of implicit Euler of any length,
 y_t = c0 (y - y_before), multiplies such a motion by ζ = c0 / (c0 - λ). The eigenvalues ζ of one linearised
@@ -8,6 +8,7 @@ those of `simulate`; no potential is needed.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -29,8 +30,10 @@ from knode_cosserat.solvers.space import Lobatto4
 GRIDS = ((11, 21), (21, 41))
 #: largest number of history terms of a step on the finer grid; beyond, eigenvalues take minutes
 MOST_TERMS = 4000
-#: number of tangents side by side
-COLUMNS = 512
+#: number of vectors side by side, of the largest factors that are wanted, and of vectors at most
+BLOCK, WANTED, MOST = 16, 40, 640
+#: residual of an eigenvector, as a fraction of its factor
+CONVERGED = 1e-9
 #: c0 of the step in natural units: near the lowest frequencies, which are thereby the most accurate
 RATE = 10.0
 #: factors below this are of history that does not move anything
@@ -55,10 +58,10 @@ class _Modes(NamedTuple):
     #: uncertainty of the growth rates (1/s), by two grids, and the part of it that is rounding
     uncertainty: np.ndarray
     rounding: np.ndarray
-    #: growth rates on the coarser grid (1/s)
+    #: λ on the coarser grid (1/s)
     coarse: np.ndarray
-    #: (nodes, y): complex amplitude of y in the first mode
-    first: np.ndarray
+    #: (m, nodes, y): complex amplitudes of y
+    motions: np.ndarray
 
     @property
     def growing(self) -> np.ndarray:
@@ -68,7 +71,7 @@ class _Modes(NamedTuple):
     @property
     def undecided(self) -> np.ndarray:
         """True for modes that grow on one of the grids, but not for certain."""
-        return ~self.growing & (np.maximum(self.values.real, self.coarse) > self.rounding)
+        return ~self.growing & (np.maximum(self.values.real, self.coarse.real) > self.rounding)
 
 
 def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Modes:
@@ -94,13 +97,11 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
             raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
         at = np.linspace(0.0, 1.0, nodes)
         guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), each) for each in y.T], axis=1)
-        solved, error, step = _step(own, guess, control, c0)
+        solved, error, step, unit = _step(own, guess, control, c0)
         off = np.max(np.abs(in_strands(system, solved - guess)[..., layout.slice("p")]))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
-        moving = np.any(step != 0.0, axis=0)
-        factors = np.linalg.eigvals(step[np.ix_(moving, moving)])
-        factors = factors[np.abs(factors) > STILL]
+        factors, vectors = _largest(step, unit)
         found.append(RATE * (1.0 - 1.0 / factors))
     coarse, fine = found
     nearest = np.abs(fine[:, None] - coarse).argmin(axis=1)
@@ -111,7 +112,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     kept = (np.abs(fine) < np.min(np.abs(fine[differs]), initial=np.inf)) & (fine.imag >= 0.0)
     if not np.any(kept):
         raise ValueError(f"none of its motions is the same with {grids[0]} and {grids[1]} nodes")
-    fine, factors, other = fine[kept], factors[kept], coarse[nearest[kept]]
+    fine, vectors, other = fine[kept], vectors[:, kept], coarse[nearest[kept]]
     rounding = (
         ROUNDING * np.abs(fine)
         + FACTOR_ROUNDING * np.abs(RATE - fine) ** 2 / RATE
@@ -121,9 +122,10 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     # of motions that neither grow nor decay, the slowest first
     growth = np.where(np.abs(fine.real) <= uncertainty, 0.0, fine.real)
     order = np.lexsort((np.abs(fine), -growth))
-    first = _motion(own, step, moving, factors[order[0]])
-    found = [each[order] / time for each in (fine, uncertainty, rounding, other.real)]
-    return _Modes(found[0], found[1], found[2], found[3], first)
+    found = [each[order] / time for each in (fine, uncertainty, rounding, other)]
+    records = vectors.T[order].reshape(len(order), -1, _history_size(own))
+    motions = records[:, grid_of(own, Lobatto4()).nodes, : own.y_layout.size]
+    return _Modes(found[0], found[1], found[2], found[3], motions)
 
 
 def _history_size(system: System) -> int:
@@ -132,32 +134,74 @@ def _history_size(system: System) -> int:
 
 def _step(
     system: System, guess: np.ndarray, control: np.ndarray, c0: float
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return the equilibrium at the nodes, its error, and the matrix of a linearised step on its history."""
+) -> tuple[np.ndarray, float, Callable[[np.ndarray], np.ndarray], np.ndarray]:
+    """Return the equilibrium at the nodes, its error, a linearised step of its history, and its units."""
     space, used, ny = Lobatto4(), used_places(system, Lobatto4()), system.y_layout.size
     still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
     y = still_state(system, space, control, guess).y
     _, y, found = TimeIntegration(still).solve(system, control[None], y)
     records = still_state(system, space, control, y).records[:used]
     steps = StepCoefficients.of(settings, 1.0 / c0, settings.memory)
-    count, past, parts = records.size, np.stack([records] * settings.memory), []
-    for k in range(0, count, COLUMNS):
-        m = min(COLUMNS, count - k)
-        d_past = np.zeros((2, count, m))
-        d_past[0, k : k + m] = np.eye(m)
-        d_past = d_past.reshape(settings.memory, *records.shape, m)
+    past, count = np.stack([records] * settings.memory), system.z_layout.size
+    scale = np.concatenate([system.scales().y, np.ones(records.shape[1] - ny - count), np.ones(count)])
+    unit = np.tile(scale, used)
+
+    def after(vectors: np.ndarray) -> np.ndarray:
+        m = vectors.shape[1]
+        d_past = np.zeros((settings.memory, *records.shape, m))
+        d_past[0] = vectors.reshape(*records.shape, m)
         state = TangentState(past, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
-        changes = Changes(np.zeros((1, system.control_layout.size, m)))
-        solved = found.records, found.unknowns
-        after, _ = tangent_time_loop(steps, solved, (system, control[None]), changes, state)
-        parts.append(after.d_records[0].reshape(count, -1))
-    return found.records[0, :, :ny], float(found.error[0]), np.concatenate(parts, axis=1)
+        changes, solved = (
+            Changes(np.zeros((1, system.control_layout.size, m))),
+            (found.records, found.unknowns),
+        )
+        moved, _ = tangent_time_loop(steps, solved, (system, control[None]), changes, state)
+        return np.asarray(moved.d_records[0].reshape(len(vectors), m))
+
+    return found.records[0, :, :ny], float(found.error[0]), after, unit
 
 
-def _motion(system: System, step: np.ndarray, moving: np.ndarray, factor: complex) -> np.ndarray:
-    """Return the complex amplitude of y at the nodes in the motion with a factor, by inverse iteration."""
-    own = step[np.ix_(moving, moving)] - factor * (1.0 + STILL) * np.eye(int(np.sum(moving)))
-    vector = np.linalg.solve(own, np.linalg.solve(own, np.ones(len(own))))
-    grid = grid_of(system, Lobatto4())
-    record = (step[:, moving] @ (vector / np.max(np.abs(vector)))).reshape(-1, _history_size(system))
-    return np.asarray(record[grid.nodes, : system.y_layout.size])
+def _largest(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest eigenvalues of a linear map of vectors, and their vectors (count, m).
+
+    By a block Krylov method, which finds multiple eigenvalues as well (Saad 2011, section 6.5).
+
+    Args:
+        step: map of vectors side by side (count, BLOCK).
+        unit: unit of each number (count,).
+    """
+    fresh = np.linalg.qr(np.random.default_rng(0).normal(size=(len(unit), BLOCK)))[0]
+    basis = images = np.zeros((len(unit), 0))
+    while True:
+        basis = np.concatenate([basis, fresh], axis=1)
+        images = np.concatenate([images, step(unit[:, None] * fresh) / unit[:, None]], axis=1)
+        values, small = np.linalg.eig(basis.T @ images)
+        largest = np.argsort(-np.abs(values))[:WANTED]
+        values, vectors = values[largest], basis @ small[:, largest]
+        off = np.linalg.norm(images @ small[:, largest] - vectors * values, axis=0)
+        known = (np.abs(values) > STILL) & (off <= CONVERGED * np.abs(values))
+        if known.all() or basis.shape[1] + BLOCK > min(MOST, len(unit)):
+            # none beyond one that did not converge
+            count = int(np.argmin(np.append(known, False)))
+            return values[:count], unit[:, None] * vectors[:, :count]
+        fresh = images[:, -BLOCK:]
+        for _ in range(2):
+            fresh = np.linalg.qr(fresh - basis @ (basis.T @ fresh))[0]
+
+
+def displacements(system: System, motion: np.ndarray) -> np.ndarray:
+    """Return the displacements of the nodes of a robot (nodes, strands, 3) in a mode (points, y).
+
+    Their phase is that of the largest displacement.
+    """
+    p = in_strands(system, motion)[..., strand_of(system).y_layout.slice("p")]
+    moves = np.real(p * np.conj(p.ravel()[np.argmax(np.abs(p))]))
+    grid, nodes = (np.linspace(0.0, 1.0, size) for size in (len(moves), system.nodes))
+    return np.apply_along_axis(lambda own: np.interp(nodes, grid, own), 0, moves)
+
+
+def in_unit(moves: np.ndarray) -> np.ndarray:
+    """Return displacements (nodes, strands, 3) with maximum 1; a single strand has no axis."""
+    # a mode of pure torsion does not move the line
+    moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
+    return moves[:, 0] if moves.shape[1] == 1 else moves

@@ -31,7 +31,7 @@ from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
-from knode_cosserat.statics.dynamics import linearised_modes
+from knode_cosserat.statics.dynamics import displacements, in_unit, linearised_modes
 from knode_cosserat.statics.stiffness import NEEDED, Pieces, divided, firm, joined, narrow, symmetric, wide
 from knode_cosserat.trajectory import Trajectory
 
@@ -131,7 +131,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
         ValueError: the row is no equilibrium; the system is not made of rods with positions and orientations;
             or its y has further energetic variables (such as tendons on reels).
     """
-    system, y, z, control = _checked(equilibrium, row)
+    system, y, z, control = checked_equilibrium(equilibrium, row)
     space = (equilibrium.settings or Settings()).space
     if not isinstance(space, Lobatto4):
         one = Trajectory(
@@ -153,7 +153,12 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     return _decided(system, y, control, by)
 
 
-def _checked(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray, np.ndarray]:
+def checked_equilibrium(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray, np.ndarray]:
+    """Return system, y, z and control of a row that is an equilibrium.
+
+    Raises:
+        ValueError: it is none, or not one of rods with positions and orientations.
+    """
     if not isinstance(equilibrium, Trajectory):
         raise ValueError(
             f"equilibrium is a {type(equilibrium).__name__}; allowed is a Trajectory, of kc.equilibrium"
@@ -255,7 +260,7 @@ class _Variation:
                 f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
             )
         moves = (self.free @ vectors[:, 0]).reshape(-1, strand_count(system), 6)[self.nodes, :, :3]
-        return Stability(count, least, _mode(moves), self.asymmetry, None, reason, neutral)
+        return Stability(count, least, in_unit(moves), self.asymmetry, None, reason, neutral)
 
     def by_motion(self, system: System, y: np.ndarray, control: np.ndarray) -> Stability:
         """Return the stability of a robot whose loads have no potential."""
@@ -271,21 +276,9 @@ class _Variation:
                 f"loads without a potential; a mode's growth rate of {first.real:.2g} 1/s is uncertain by "
                 f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
             )
-        # the phase of the largest displacement
-        p = in_strands(system, modes.first)[..., strand_of(system).y_layout.slice("p")]
-        largest = p.ravel()[np.argmax(np.abs(p))]
-        moves = np.real(p * np.conj(largest))
-        grid, nodes = (np.linspace(0.0, 1.0, size) for size in (len(moves), system.nodes))
-        moves = np.apply_along_axis(lambda own: np.interp(nodes, grid, own), 0, moves)
+        moves = displacements(system, modes.motions[0])
         least = float(self.spectrum[0][0])
-        return Stability(directions, least, _mode(moves), self.asymmetry, complex(first), reason)
-
-
-def _mode(moves: np.ndarray) -> np.ndarray:
-    """Return displacements (nodes, strands, 3) with maximum 1; a single strand has no axis."""
-    # a mode of pure torsion does not move the line
-    moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)
-    return moves[:, 0] if moves.shape[1] == 1 else moves
+        return Stability(directions, least, in_unit(moves), self.asymmetry, complex(first), reason)
 
 
 def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:

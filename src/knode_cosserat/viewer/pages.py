@@ -60,7 +60,11 @@ def write_page(text: str, path: Path) -> Path:
 
 def document(shown: dict[str, Any], connects: str = "'none'") -> str:
     """The page with a scene in it; `connects` says where its security policy lets it connect to."""
-    imports = {name: _data_url(file) for name, file in MODULES.items()}
+    imports = {}
+    for name, file in MODULES.items():
+        # under its own name in the browser's console, instead of its whole text
+        code = (_text(file) + f"\n//# sourceURL=knode-cosserat/{file}\n").encode("utf-8")
+        imports[name] = "data:text/javascript;base64," + base64.b64encode(code).decode("ascii")
     parts = {
         "TITLE": html.escape(str(shown["title"])),
         "POLICY": _POLICY + connects,
@@ -83,12 +87,6 @@ def for_script(value: Any) -> str:
 
 def _text(file: str) -> str:
     return (HERE / file).read_text(encoding="utf-8")
-
-
-def _data_url(file: str) -> str:
-    # under its own name in the browser's console, instead of its whole text
-    code = (_text(file) + f"\n//# sourceURL=knode-cosserat/{file}\n").encode("utf-8")
-    return "data:text/javascript;base64," + base64.b64encode(code).decode("ascii")
 
 
 # servers

@@ -248,7 +248,7 @@ def _law_residual(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
 def _points(knowledge: System, residual: Structured, data: Dataset) -> tuple[Any, Any]:
     """Return points and strains at the starts of all segments and, if the scheme uses them, then the ends."""
     segments, formula = data.segments, data.space.formula
-    starts = _starts(knowledge, segments)
+    starts = jax.vmap(lambda sample: start_point(knowledge, sample))(segments), segments.z
     if formula.stages or not data.space.implicit:
         return starts
     ends = jax.vmap(lambda sample: end_point(knowledge, sample))(segments), segments.z_next
@@ -265,10 +265,6 @@ def _points(knowledge: System, residual: Structured, data: Dataset) -> tuple[Any
 
 
 _rotations = jax.jit(jax.vmap(rotation_matrix))
-
-
-def _starts(knowledge: System, data: Samples) -> tuple[Any, Any]:
-    return jax.vmap(lambda sample: start_point(knowledge, sample))(data), data.z
 
 
 _corrected_strains = jax.jit(jax.vmap(semi_discrete.strains, in_axes=(None, 0)))
