@@ -14,12 +14,13 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.law import InternalState, MaterialLaw
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import StepCoefficients, used_places
+from knode_cosserat.solvers.history import StepCoefficients, repeated_record_history, used_places
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
@@ -138,27 +139,30 @@ def _step(
     """Return the equilibrium at the nodes, its error, a linearised step of its history, and its units."""
     space, used, ny = Lobatto4(), used_places(system, Lobatto4()), system.y_layout.size
     still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
-    y = still_state(system, space, control, guess).y
-    _, y, found = TimeIntegration(still).solve(system, control[None], y)
+    begun = still_state(system, space, control, guess)
+    _, y, found = TimeIntegration(still).solve(system, control[None], begun.y)
+    if not Ends.of(system).held:
+        # a robot that can move as a whole has no single equilibrium, but a step from rest
+        past = repeated_record_history(system, settings, begun.records, begun.y, 0.0)
+        _, after, found = TimeIntegration(settings, 1.0 / c0).solve(system, control[None], past)
+        y = after.y[0]
     records = still_state(system, space, control, y).records[:used]
     steps = StepCoefficients.of(settings, 1.0 / c0, settings.memory)
-    past, count = np.stack([records] * settings.memory), system.z_layout.size
+    before, count = np.stack([records] * settings.memory), system.z_layout.size
     scale = np.concatenate([system.scales().y, np.ones(records.shape[1] - ny - count), np.ones(count)])
     unit = np.tile(scale, used)
 
-    def after(vectors: np.ndarray) -> np.ndarray:
+    def stepped(vectors: np.ndarray) -> np.ndarray:
         m = vectors.shape[1]
         d_past = np.zeros((settings.memory, *records.shape, m))
         d_past[0] = vectors.reshape(*records.shape, m)
-        state = TangentState(past, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
-        changes, solved = (
-            Changes(np.zeros((1, system.control_layout.size, m))),
-            (found.records, found.unknowns),
-        )
+        state = TangentState(before, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
+        changes = Changes(np.zeros((1, system.control_layout.size, m)))
+        solved = found.records, found.unknowns
         moved, _ = tangent_time_loop(steps, solved, (system, control[None]), changes, state)
         return np.asarray(moved.d_records[0].reshape(len(vectors), m))
 
-    return found.records[0, :, :ny], float(found.error[0]), after, unit
+    return found.records[0, :, :ny], float(found.error[0]), stepped, unit
 
 
 def _largest(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

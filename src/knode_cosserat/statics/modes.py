@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.statics.dynamics import displacements, in_unit, linearised_modes
+from knode_cosserat.statics.dynamics import RESOLVED, displacements, in_unit, linearised_modes
 from knode_cosserat.statics.stability import checked_equilibrium
 from knode_cosserat.trajectory import Trajectory
 
@@ -54,9 +54,10 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
     rod has each bending mode twice, in two planes.
 
     Args:
-        equilibrium: result of `kc.equilibrium` for one robot, or a trajectory that has come to rest.
+        equilibrium: result of `kc.equilibrium` for one robot, or a trajectory that has come to rest, such as
+            `kc.simulate` of a rod with two free ends.
         row: index of the row.
-        count: most modes; modes that two grids do not agree on are left out.
+        count: most modes; those that two grids do not agree on, and motions of the whole robot, are left out.
 
     Raises:
         ValueError: the row is no equilibrium, the motion has no linearisation (friction), it is too large for
@@ -66,9 +67,11 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
         raise ValueError(f"count is {count}; allowed is 1 or more")
     system, y, _, control = checked_equilibrium(equilibrium, row)
     found = linearised_modes(system, y, control)
-    slowest = np.argsort(np.abs(found.values), kind="stable")[:count]
-    values, other = found.values[slowest], found.coarse[slowest]
-    error = np.abs(values - other) / np.maximum(np.abs(values), np.finfo(float).tiny) / 15.0
+    apart = np.abs(found.values - found.coarse)
+    # not motions of the whole robot, which cost nothing
+    agreed = np.flatnonzero(apart <= RESOLVED * np.abs(found.values))
+    slowest = agreed[np.argsort(np.abs(found.values[agreed]), kind="stable")][:count]
+    values, error = found.values[slowest], apart[slowest] / np.abs(found.values[slowest]) / 15.0
     shapes = list[np.ndarray]()
     for value, motion in zip(values, found.motions[slowest], strict=True):
         shape = displacements(system, motion)
