@@ -1,15 +1,16 @@
 """Every kind of robot is learned from one short trajectory: a modulus 30 % off, and an unseen control."""
 
+import jax
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.learning.structured.fit import _rates, _starts
+from knode_cosserat.learning.structured.fit import _rates
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.routing import Helical
 from knode_cosserat.rods.surroundings import Plane
-from knode_cosserat.solvers.segments import pieces, samples
+from knode_cosserat.solvers.segments import pieces, samples, start_point
 
 STEPS, DT = 60, 0.05
 DELRIN = kc.load_robot("delrin-tendon-robot")
@@ -131,7 +132,8 @@ def test_slopes_do_not_go_over_what_acts(laden):
     assert jump > 0.3
     assert np.abs(slope).max() < 0.2 * jump / 0.05
     # and they are those of the equations
-    rates = np.asarray(_rates(LADEN, *_starts(LADEN, data.segments))).reshape(-1, 10, 19)
+    starts = jax.vmap(lambda sample: start_point(LADEN, sample))(data.segments)
+    rates = np.asarray(_rates(LADEN, starts, data.segments.z)).reshape(-1, 10, 19)
     found = np.asarray(data.segments.slope).reshape(-1, 10, 19) / 0.5
     # the force's and the moment's, and where it is; what hardly changes is not known as well
     for name in "pnm":

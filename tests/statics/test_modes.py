@@ -9,12 +9,11 @@ from knode_cosserat.rods.ends import Clamped, Free, Pinned
 L, RADIUS, E, DENSITY = 1.0, 0.001, 1e9, 1e3
 EI, MASS = E * np.pi * RADIUS**4 / 4, DENSITY * np.pi * RADIUS**2
 TIME = L**2 * np.sqrt(MASS / EI)
-#: roots of the characteristic equations: clamped and free, pinned, clamped
+#: roots of the characteristic equations: clamped and free, pinned, clamped; None: two free ends
 ROOTS = {
     Free: [1.87510407, 4.69409113, 7.85475744, 10.99554073, 14.13716839],
     Pinned: [3.92660231, 7.06858275, 10.21017612, 13.35176878, 16.49336143],
     Clamped: [4.73004074, 7.85320462, 10.99560784, 14.13716549, 17.27875966],
-    # both ends free: the roots of clamped ends
     None: [4.73004074, 7.85320462, 10.99560784, 14.13716549, 17.27875966],
 }
 
@@ -46,9 +45,8 @@ def test_frequencies_and_shapes_of_a_beam(end):
 
 def test_damping_of_the_material():
     """Kelvin and Voigt: the ratio is half of frequency times time constant."""
-    constant = 0.02 * TIME
+    constant, slow = 0.02 * TIME, np.square(ROOTS[Free][:2]) / TIME
     found = kc.statics.modes(beam(Free, nodes=11, bending_damping=constant * EI), count=4)
-    slow = np.square(ROOTS[Free][:2]) / TIME
     np.testing.assert_allclose(found.damping, np.repeat(0.5 * slow * constant, 2), rtol=2e-3)
     np.testing.assert_allclose(np.abs(found.values), np.repeat(slow, 2), rtol=2e-3)
     assert "damping ratio" in repr(found) and len(repr(found).splitlines()) == 5
