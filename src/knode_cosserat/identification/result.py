@@ -53,7 +53,7 @@ class Identified:
             the mean of what they would change.
         next_experiment: controls that would tell most about these; None if all is decided.
         ensemble: random samples of the robots that agree with the recordings, spread as held-out ones are;
-            `ensemble.predict(controls, dt).interval(0.95)` is the band of a prediction. None for parameters.
+            `ensemble.predict(controls, dt).interval(0.95)` is a band of predictions. None for parameters.
         estimates: their numbers with 95 % intervals.
         correlation: correlation of the numbers' errors, in the order of `estimates` (n, n).
         nominal_error: by recording, root mean square error of the tip of the nominal robot (m).
