@@ -203,16 +203,13 @@ class Search:
             except SearchError:
                 continue
             if np.sum(np.log(found.scale)) < np.sum(np.log(point.scale)):
-                point = found
+                point, rollouts, units = found, self.solved(found.x), self.units(found.scale)
         return point
 
     def over(
-        self,
-        x: Float[np.ndarray, " n"],
-        free: Bool[np.ndarray, " n"],
-        parts: Sequence[float],
+        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], parts: Sequence[float],
         skipped: int = 0,
-    ) -> Float[np.ndarray, " n"]:
+    ) -> Float[np.ndarray, " n"]:  # fmt: skip
         """Return coordinates after searches over parts of the longest motion, without the first ones."""
         data = self.misfit.data
         longest = max(len(it.control) - it.moves for it in data)

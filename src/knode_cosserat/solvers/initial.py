@@ -150,10 +150,10 @@ def _last_state(
     made = initial.settings
     if made is not None and made.time is None:
         return None
-    places, other = (
+    grid_before, grid = (
         (it.discontinuities.places, it.nodes, strand_count(it), it.mixed) for it in (initial.system, system)
     )
-    if made is None or made.space != settings.space or places != other:
+    if made is None or made.space != settings.space or grid_before != grid:
         if len(initial.time) < 2:
             return None
         numeric: Any = jnp if is_traced(initial) else np

@@ -16,7 +16,7 @@ import numpy as np
 
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.law import InternalState, MaterialLaw
-from knode_cosserat.rods.strands import in_strands, strand_of
+from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.grid import grid_of
@@ -31,8 +31,8 @@ from knode_cosserat.solvers.space import Lobatto4
 GRIDS = ((11, 21), (21, 41))
 #: largest number of history terms of a step on the finer grid; beyond, eigenvalues take minutes
 MOST_TERMS = 4000
-#: number of vectors side by side, of the largest factors that are wanted, and of vectors at most
-BLOCK, WANTED, MOST = 16, 40, 640
+#: vectors side by side; largest factors that are wanted of each strand, and most vectors for each of them
+BLOCK, WANTED, MOST = 16, 40, 16
 #: residual of an eigenvector, as a fraction of its factor
 CONVERGED = 1e-9
 #: c0 of the step in natural units: near the lowest frequencies, which are thereby the most accurate
@@ -102,7 +102,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
         off = np.max(np.abs(in_strands(system, solved - guess)[..., layout.slice("p")]))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
-        factors, vectors = _largest(step, unit)
+        factors, vectors = _largest_eigenvalues(step, unit, WANTED * strand_count(system))
         found.append(RATE * (1.0 - 1.0 / factors))
     coarse, fine = found
     nearest = np.abs(fine[:, None] - coarse).argmin(axis=1)
@@ -140,17 +140,17 @@ def _step(
     space, used, ny = Lobatto4(), used_places(system, Lobatto4()), system.y_layout.size
     still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
     begun = still_state(system, space, control, guess)
-    _, y, found = TimeIntegration(still).solve(system, control[None], begun.y)
-    if not Ends.of(system).held:
+    if Ends.of(system).held:
+        _, y, found = TimeIntegration(still).solve(system, control[None], begun.y)
+    else:
         # a robot that can move as a whole has no single equilibrium, but a step from rest
         past = repeated_record_history(system, settings, begun.records, begun.y, 0.0)
         _, after, found = TimeIntegration(settings, 1.0 / c0).solve(system, control[None], past)
         y = after.y[0]
     records = still_state(system, space, control, y).records[:used]
     steps = StepCoefficients.of(settings, 1.0 / c0, settings.memory)
-    before, count = np.stack([records] * settings.memory), system.z_layout.size
-    scale = np.concatenate([system.scales().y, np.ones(records.shape[1] - ny - count), np.ones(count)])
-    unit = np.tile(scale, used)
+    before = np.stack([records] * settings.memory)
+    unit = np.tile(np.concatenate([system.scales().y, np.ones(records.shape[1] - ny)]), used)
 
     def stepped(vectors: np.ndarray) -> np.ndarray:
         m = vectors.shape[1]
@@ -165,7 +165,9 @@ def _step(
     return found.records[0, :, :ny], float(found.error[0]), stepped, unit
 
 
-def _largest(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _largest_eigenvalues(
+    step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray, wanted: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the largest eigenvalues of a linear map of vectors, and their vectors (count, m).
 
     By a block Krylov method, which finds multiple eigenvalues as well (Saad 2011, section 6.5).
@@ -173,6 +175,7 @@ def _largest(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray) -> tupl
     Args:
         step: map of vectors side by side (count, BLOCK).
         unit: unit of each number (count,).
+        wanted: number of eigenvalues, or more than there are.
     """
     fresh = np.linalg.qr(np.random.default_rng(0).normal(size=(len(unit), BLOCK)))[0]
     basis = images = np.zeros((len(unit), 0))
@@ -180,11 +183,11 @@ def _largest(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray) -> tupl
         basis = np.concatenate([basis, fresh], axis=1)
         images = np.concatenate([images, step(unit[:, None] * fresh) / unit[:, None]], axis=1)
         values, small = np.linalg.eig(basis.T @ images)
-        largest = np.argsort(-np.abs(values))[:WANTED]
+        largest = np.argsort(-np.abs(values))[:wanted]
         values, vectors = values[largest], basis @ small[:, largest]
         off = np.linalg.norm(images @ small[:, largest] - vectors * values, axis=0)
         known = (np.abs(values) > STILL) & (off <= CONVERGED * np.abs(values))
-        if known.all() or basis.shape[1] + BLOCK > min(MOST, len(unit)):
+        if known.all() or basis.shape[1] + BLOCK > min(MOST * wanted, len(unit)):
             # none beyond one that did not converge
             count = int(np.argmin(np.append(known, False)))
             return values[:count], unit[:, None] * vectors[:, :count]
@@ -204,7 +207,7 @@ def displacements(system: System, motion: np.ndarray) -> np.ndarray:
     return np.apply_along_axis(lambda own: np.interp(nodes, grid, own), 0, moves)
 
 
-def in_unit(moves: np.ndarray) -> np.ndarray:
+def normalised(moves: np.ndarray) -> np.ndarray:
     """Return displacements (nodes, strands, 3) with maximum 1; a single strand has no axis."""
     # a mode of pure torsion does not move the line
     moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)

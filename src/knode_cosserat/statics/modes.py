@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.statics.dynamics import RESOLVED, displacements, in_unit, linearised_modes
+from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalised
 from knode_cosserat.statics.stability import checked_equilibrium
 from knode_cosserat.trajectory import Trajectory
 
@@ -78,5 +78,5 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
         for same in np.flatnonzero(np.abs(values[: len(shapes)] - value) < SAME * abs(value)):
             other = shapes[same].reshape(shape.shape)
             shape = shape - other * np.vdot(other, shape) / np.vdot(other, other)
-        shapes.append(in_unit(shape))
+        shapes.append(normalised(shape))
     return Modes(values, error, np.stack(shapes))

@@ -31,7 +31,7 @@ from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
-from knode_cosserat.statics.dynamics import displacements, in_unit, linearised_modes
+from knode_cosserat.statics.dynamics import displacements, linearised_modes, normalised
 from knode_cosserat.statics.stiffness import NEEDED, Pieces, divided, firm, joined, narrow, symmetric, wide
 from knode_cosserat.trajectory import Trajectory
 
@@ -260,7 +260,7 @@ class _Variation:
                 f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
             )
         moves = (self.free @ vectors[:, 0]).reshape(-1, strand_count(system), 6)[self.nodes, :, :3]
-        return Stability(count, least, in_unit(moves), self.asymmetry, None, reason, neutral)
+        return Stability(count, least, normalised(moves), self.asymmetry, None, reason, neutral)
 
     def by_motion(self, system: System, y: np.ndarray, control: np.ndarray) -> Stability:
         """Return the stability of a robot whose loads have no potential."""
@@ -278,7 +278,7 @@ class _Variation:
             )
         moves = displacements(system, modes.motions[0])
         least = float(self.spectrum[0][0])
-        return Stability(directions, least, in_unit(moves), self.asymmetry, complex(first), reason)
+        return Stability(directions, least, normalised(moves), self.asymmetry, complex(first), reason)
 
 
 def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:
