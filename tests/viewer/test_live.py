@@ -136,11 +136,14 @@ def test_a_slow_solve_is_cancelled_or_replaced_by_a_newer_control(robot, slow_so
             give({"command": "reset"})
             message = await connection.until(lambda head: not isinstance(head, dict) and head[0] == 7)
             assert numbers(message)[0][1] == np.float32(DT)
+            # dropped solves end: nothing goes on in the background
+            async with asyncio.timeout(30.0):
+                while len(slow_solves) < 3:
+                    await asyncio.sleep(0.002)
         finally:
             running.cancel()
 
     asyncio.run(moved())
-    # dropped solves have ended: nothing goes on in the background
     assert slow_solves == [1, 3, 6]
 
 
