@@ -123,12 +123,8 @@ class SpreadLoad(Stretched, Load):
 
     def load(self, point: RodPoint) -> Wrench:
         """Return the load on the rod per length, zero outside of its stretch."""
-        wrench = self.wrench(point.motion, point.input)
-        if (self.begin, self.end) == (0.0, 1.0):
-            return wrench
-        length = point.rod.length
-        acts = (point.s >= self.begin * length) & (point.s <= self.end * length)
-        return Wrench(*(jnp.where(acts, term, 0.0) for term in wrench))
+        within = self.within(point)
+        return Wrench(*(within * term for term in self.wrench(point.motion, point.input)))
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:

@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 from typing import Any, ClassVar, NamedTuple, Self
 
+import jax.numpy as jnp
 from jaxtyping import Float
 
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
@@ -65,7 +66,7 @@ class Contribution:
     at the base (`base_fields`) requires a condition at the tip (`tip_fields`, `tip_rows`).
     """
 
-    #: True for the robot's actuators: the names of their controls have no prefix
+    #: True for the robot's actuators: the names of their controls have no prefix, unless two are the same
     actuates: ClassVar[bool] = False
     #: True if the part may hold the robot against loads
     held: ClassVar[bool] = False
@@ -139,6 +140,10 @@ class Contribution:
         """Return the form in which the part's control enters the equations; by default the control."""
         return control
 
+    def usual_control(self, rod: Any, field: Field) -> float | None:
+        """Return a high value of a control, for sliders that begin at zero; None if the unit decides it."""
+        return None
+
     # the tendons of its robot
 
     def transmitted(self, point: RodPoint, tension: Float[Any, " c"]) -> Float[Any, " c"]:
@@ -195,8 +200,8 @@ def eased(system: Any, part: float) -> Any:
 class Stretched(Part):
     """A part along a stretch of the rod, by fractions of its length."""
 
-    begin: float = place("where it begins", default=0.0)
-    end: float = place("where it ends", default=1.0)
+    begin: float = place("where it begins", default=0.0, kw_only=True)
+    end: float = place("where it ends", default=1.0, kw_only=True)
 
     def __check_init__(self) -> None:
         super().__check_init__()
@@ -209,3 +214,10 @@ class Stretched(Part):
     def cuts(self) -> tuple[float, ...]:
         """Places where it begins and ends."""
         return tuple(end for end in (self.begin, self.end) if end > 0.0)
+
+    def within(self, point: RodPoint) -> Any:
+        """Return 1 at a point of its stretch, 0 elsewhere."""
+        if (self.begin, self.end) == (0.0, 1.0):
+            return 1.0
+        length = point.rod.length
+        return jnp.where((point.s >= self.begin * length) & (point.s <= self.end * length), 1.0, 0.0)

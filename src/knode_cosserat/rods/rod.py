@@ -155,11 +155,16 @@ class SlenderRod(System):
     @functools.cached_property
     def control_layout(self) -> Layout:  # type: ignore[override]
         """Layout of the parts' controls."""
+        fields = [
+            (name, part.actuates, field) for name, part in self.parts.items() for field in part.control_fields
+        ]
+        actuators = [field.name for _, actuates, field in fields if actuates]
         return Layout(
             *(
-                field if part.actuates else field._replace(name=f"{name}_{field.name}")
-                for name, part in self.parts.items()
-                for field in part.control_fields
+                field
+                if actuators.count(field.name) == 1 and actuates
+                else field._replace(name=f"{name}_{field.name}")
+                for name, actuates, field in fields
             )
         )
 

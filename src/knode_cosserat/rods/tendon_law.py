@@ -1,6 +1,7 @@
 """The material's law of a rod together with its tendons: v and u if n and m include both.
 
-At one point of the rod, in the material frame, with tendon i at rᵢ(s) = (x, y, 0) under the tension Tᵢ,
+Chambers are tendons that push: their tension is negative. At one point of the rod, in the material frame,
+with tendon i at rᵢ(s) = (x, y, 0) under the tension Tᵢ,
 
     K_v v + Σ Tᵢ tᵢ = a,     K_u u + Σ Tᵢ rᵢ × tᵢ = b,     tᵢ = ṗᵢ/|ṗᵢ|,     ṗᵢ = v + u × rᵢ + rᵢ′
 
@@ -9,6 +10,8 @@ keeps the paper's y and z). For K positive definite and Tᵢ ≥ 0 there is exac
 minimum of the strictly convex energy ½ vᵀK_v v + ½ uᵀK_u u + Σ Tᵢ |ṗᵢ| - aᵀv - bᵀu. Its second derivative is
 
     J = diag(K_v, K_u) + Σ Tᵢ/|ṗᵢ| (WᵢᵀWᵢ - gᵢgᵢᵀ),     Wᵢ = [I, -r̂ᵢ],     gᵢ = Wᵢᵀtᵢ = (tᵢ, rᵢ × tᵢ)
+
+A tension may depend on the stretch λᵢ = |ṗᵢ|: the energy then has ∫Tᵢ dλᵢ, and J the term Tᵢ′ gᵢgᵢᵀ.
 
 Tendons rotate little relative to the rod, so J is nearly constant. Three or four corrections with J of the
 unbent rod and tendons, `unbent_flexibility`, usually solve the law. This J does not change during the
@@ -54,8 +57,32 @@ class TendonLaw(NamedTuple):
     #: the tendons' places (m) and their derivative along the rod; the third components are not used
     r: Float[Any, "c 3"]
     r_s: Float[Any, "c 3"]
-    #: T (N), not negative; 0 for a tendon that has ended
+    #: T (N), negative for a chamber; 0 for a tendon that has ended
     tension: Float[Any, " c"]
+    #: increase of T by the stretch (`Stretching`); None: none
+    stretching: Any = None
+
+
+class Stretching(NamedTuple):
+    """Increase of the tension by the stretch λ of its path: slope λ + EA (σ(λ)/E - (λ - 1)).
+
+    σ is Yeoh's stress of an incompressible material (1993) for C₁ = E/6, and ratios c₂ and c₃ of C₂ and C₃ to
+    it: σ/E = (λ - λ⁻²)/3 (1 + 2 c₂ J + 3 c₃ J²), J = λ² + 2/λ - 3. With c₂ = c₃ = 0 it is neo-Hookean.
+    """
+
+    #: N
+    slope: Float[Any, " c"]
+    #: EA (N), c₂ and c₃
+    axial: Float[Any, " c"]
+    second: Float[Any, " c"]
+    third: Float[Any, " c"]
+
+    def tension(self, stretch: Float[Any, " c"]) -> Float[Any, " c"]:
+        """Return the increase of T (N)."""
+        shorter = 1.0 / stretch
+        J = stretch * stretch + 2.0 * shorter - 3.0
+        stress = (stretch - shorter * shorter) / 3.0 * (1.0 + J * (2.0 * self.second + 3.0 * self.third * J))
+        return self.slope * stretch + self.axial * (stress - stretch + 1.0)
 
 
 def stretches(
@@ -102,19 +129,34 @@ class Tendons(NamedTuple):
     tension: Float[Any, " c"]
     #: T without friction: an approximation that is often known before y
     nominal_tension: Float[Any, " c"]
+    #: increase of T by the stretch; None: none
+    stretching: Stretching | None = None
+
+    def beside(self, others: Tendons | None) -> Tendons:
+        """Return these and other tendons of the rod."""
+        if others is None:
+            return self
+        sets = others, self
+        stretching = None
+        if others.stretching is not None or self.stretching is not None:
+            parts = (one.stretching or Stretching(*np.zeros((4, *one.tension.shape))) for one in sets)
+            stretching = Stretching(*map(jnp.concatenate, zip(*parts, strict=True)))
+        return Tendons(*map(jnp.concatenate, zip(*(one[:4] for one in sets), strict=True)), stretching)
 
     def strains(self, elastic: dict[str, Elastic]) -> Fields:
         """Return v and u of the rod's elastic laws with the tendons."""
         v, u = elastic["v"], elastic["u"]
         load = jnp.concatenate([v.stress, u.stress])
-        nominal = TendonLaw(v.stiffness, u.stiffness, load, self.r, self.r_s, self.nominal_tension)
-        law = TendonLaw(v.softened, u.softened, load, self.r, self.r_s, self.tension)
+        paths, stretching = (load, self.r, self.r_s), self.stretching
+        nominal = TendonLaw(v.stiffness, u.stiffness, *paths, self.nominal_tension, stretching)
+        law = TendonLaw(v.softened, u.softened, *paths, self.tension, stretching)
         return dict(zip("vu", tendon_strains(law, unbent_flexibility(nominal)), strict=True))
 
     def stresses(self, strains: Fields) -> Fields:
         """Return the tendons' part of Rᵀn and Rᵀm."""
-        n, m = tendon_wrench(strains["v"], strains["u"], self.r, self.r_s, self.tension)
-        return {"v": n, "u": m}
+        g, shorter = _levers(jnp.concatenate([strains["v"], strains["u"]]), self.r, self.r_s)
+        loads = dot(g, _pull(shorter, self))
+        return {"v": loads[:3], "u": loads[3:]}
 
 
 # x is the concatenation of v and u
@@ -144,10 +186,17 @@ def _levers(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) ->
     return jnp.stack([tx, ty, tz, ry * tz, -rx * tz, rx * ty - ry * tx]), shorter
 
 
-def _residual(x: Any, g: Any, law: TendonLaw) -> Float[Any, "6"]:
+def _pull(shorter: Any, law: TendonLaw | Tendons) -> Float[Any, " c"]:
+    """Return Tᵢ, from 1/|ṗᵢ|."""
+    if law.stretching is None:
+        return law.tension
+    return law.tension + law.stretching.tension(1.0 / shorter)
+
+
+def _residual(x: Any, g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6"]:
     """Return the law's residual at x."""
     elastic = jnp.concatenate([dot(law.K_v, x[:3]), dot(law.K_u, x[3:])])
-    return elastic + dot(g, law.tension) - law.load
+    return elastic + dot(g, _pull(shorter, law)) - law.load
 
 
 def _stiffness(g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6 6"]:
@@ -157,7 +206,12 @@ def _stiffness(g: Any, shorter: Any, law: TendonLaw) -> Float[Any, "6 6"]:
     # rows of Wᵢ: independent of x, and so constant if r is
     W = [jnp.stack(row) for row in ((one, o, o, o, o, -ry), (o, one, o, o, o, rx), (o, o, one, ry, -rx, o))]
     spread = sum(row[:, None] * row[None, :] for row in W)
-    stiffer = jnp.sum(law.tension * shorter * (spread - g[:, None] * g[None, :]), axis=2)
+    along, pulled = g[:, None] * g[None, :], _pull(shorter, law) * shorter
+    stiffer = jnp.sum(pulled * (spread - along), axis=2)
+    if law.stretching is not None:
+        stretch = 1.0 / shorter
+        growth = jax.jvp(law.stretching.tension, (stretch,), (jnp.ones_like(stretch),))[1]
+        stiffer = stiffer + jnp.sum(growth * along, axis=2)
     nothing = np.zeros((3, 3))
     upper = jnp.concatenate([law.K_v, nothing], axis=1)
     lower = jnp.concatenate([nothing, law.K_u], axis=1)
@@ -176,7 +230,7 @@ def _turn(dx: Any, shorter: Any, r: Any) -> Any:
 
 def _unturned(law: TendonLaw) -> Float[Any, "6"]:
     """Return the solution with unrotated tendons: a better initial guess far from the unbent rod."""
-    free = -_residual(np.zeros(6), _levers(UNBENT, law.r, law.r_s)[0], law)
+    free = -_residual(np.zeros(6), *_levers(UNBENT, law.r, law.r_s), law)
     return jnp.concatenate([dot(inverse(law.K_v), free[:3]), dot(inverse(law.K_u), free[3:])])
 
 
@@ -188,7 +242,7 @@ def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
         """Return minus the flexibility times the residual at x, and the rotation of a tendon by it."""
         flexibility, law = known
         g, shorter = _levers(x, law.r, law.r_s)
-        dx = -jnp.sum(flexibility * _residual(x, g, law), axis=1)
+        dx = -jnp.sum(flexibility * _residual(x, g, shorter, law), axis=1)
         return dx, _turn(dx, shorter, law.r)
 
     def unsolved(reached: Any) -> Any:
@@ -202,7 +256,7 @@ def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
         g, shorter = _levers(x, law.r, law.r_s)
         # slower than a written-out inverse, but quick to compile
         root = jnp.linalg.cholesky(_stiffness(g, shorter, law))
-        dx = -jax.scipy.linalg.cho_solve((root, True), _residual(x, g, law))
+        dx = -jax.scipy.linalg.cho_solve((root, True), _residual(x, g, shorter, law))
         turned = _turn(dx, shorter, law.r)
         # damping that guarantees descent for a convex function with |f‴| ≤ 3 f″ (Sun & Tran-Dinh 2019)
         near = turned < SMALL
@@ -247,16 +301,22 @@ def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:
     x = _solution(*primals)
     # the derivative does not depend on the initial flexibility
     (_, law), (_, tangents) = primals, tangents
-    moves = TendonLaw(*(not isinstance(tangent, SymbolicZero) for tangent in tangents))
+    leaves, shape = jax.tree.flatten(law)
+    changes = jax.tree.leaves(tangents, is_leaf=lambda leaf: isinstance(leaf, SymbolicZero))
+    flags = [not isinstance(change, SymbolicZero) for change in changes]
+    moves = jax.tree.unflatten(shape, flags)
     g, shorter = _in_turn(_levers(x, law.r, law.r_s))
 
     def residual(*moving: Any) -> Any:
         values = iter(moving)
-        changed = TendonLaw(*(next(values) if m else p for m, p in zip(moves, law, strict=True)))
-        return _residual(x, _levers(x, changed.r, changed.r_s)[0] if moves.r or moves.r_s else g, changed)
+        changed = jax.tree.unflatten(
+            shape, [next(values) if moved else leaf for moved, leaf in zip(flags, leaves, strict=True)]
+        )
+        levers = _levers(x, changed.r, changed.r_s) if moves.r or moves.r_s else (g, shorter)
+        return _residual(x, *levers, changed)
 
-    moving = [p for m, p in zip(moves, law, strict=True) if m]
-    along = [t for m, t in zip(moves, tangents, strict=True) if m]
+    moving = [leaf for moved, leaf in zip(flags, leaves, strict=True) if moved]
+    along = [change for moved, change in zip(flags, changes, strict=True) if moved]
     _, change = jax.jvp(residual, moving, along)
     return x, -dot_by_rows(small_inverse(_stiffness(g, shorter, law)), change)
 

@@ -346,6 +346,10 @@ def sliders(system: System) -> list[dict[str, Any]]:
 def _range(system: System, field: Field) -> tuple[float, float, float]:
     robot = physics_of(system)
     length = float(robot.length)
+    for part in getattr(robot, "parts", {}).values():
+        usual = [part.usual_control(robot, one) for one in part.control_fields if field.name.endswith(one.name)]
+        if usual and usual[0] is not None:
+            return 0.0, min(_nice(usual[0]), field.high), 0.0
     if field.name == "tension" and hasattr(robot, "routes_at"):
         bending = float(np.asarray(robot.Kbt)[0, 0])
         if robot.moment_arm is not None:  # one radian by a single tendon
