@@ -88,7 +88,10 @@ CANE = Cane(length=0.5, mass=0.2, bending=0.1, damping=5e-3, nodes=5)
 ROBOTS = {
     "robot": ROBOT, "model": MODEL, "model of a model": with_network(MODEL, 1), "own": CANE,
     "model of own": with_network(CANE, 2),
+    "arm": kc.load_robot("three-chamber-arm").replace(nodes=5),
 }  # fmt: skip
+#: means of the controls of robots whose controls are not the paper's four tensions
+MEANS = {"own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4]}
 
 
 class Made(NamedTuple):
@@ -107,7 +110,7 @@ class Made(NamedTuple):
 @functools.cache
 def made(kind: str) -> Made:
     robot = ROBOTS[kind]
-    mean = np.array([6.0, 5.0, 4.0, 5.0] if robot.control_layout.size == 4 else [0.3, 0.1])
+    mean = np.array(MEANS.get(kind, [6.0, 5.0, 4.0, 5.0]))
     controls = mean * (1.0 + 0.3 * np.sin(2.0 * np.pi * DT * np.arange(1, STEPS + 1) / 0.4)[:, None])
     rest = kc.equilibrium(robot, controls[0])
     motion = kc.simulate(robot, controls, DT, initial=rest)

@@ -253,3 +253,9 @@ def test_design_pareto(run):
     assert fine.all() and values[1] == pytest.approx(1e3 * 0.03 * 9.81 * 0.2**3 / (3 * EI), rel=5e-3)
     # a straight tendon bends the rod evenly: T r L² / 2EI
     assert values[0] == pytest.approx(1e3 * 15.0 * 0.01 * 0.2**2 / (2 * EI), rel=2e-2)
+
+
+@CAMPAIGN
+def test_syringe_or_regulator(run):
+    moved = run("syringe_or_regulator", points=7)
+    assert 0.01 < moved["syringes"] < 0.7 * moved["regulators"]
