@@ -101,7 +101,8 @@ class Replace:
     """Replaces parameters by name, such as `youngs_modulus` or `loads.0.mass`; one number each.
 
     Numbers of one parameter are its components ("vector"), its diagonal (one number or three), the
-    coefficients of a residual, or the first entry of a matrix or list that is multiplied as a whole ("multiple").
+    coefficients of a residual, or the first entry of a matrix or list that is multiplied as a whole
+    ("multiple").
     """
 
     parameters: tuple[str, ...]

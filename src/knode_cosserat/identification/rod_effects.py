@@ -49,7 +49,9 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     L = float(nominal.length)
     if nominal.youngs_modulus is None:
         modulus = Number("cross_section.stiffness", "", 1.0, 0.5, 1e-3, 1e3, True)
-        stiffness = Effect("stiffness", "factor of the table's stiffness", (modulus,), _with_table, basic=True)
+        stiffness = Effect(
+            "stiffness", "factor of the table's stiffness", (modulus,), _with_table, basic=True
+        )
     else:
         modulus = Number("youngs_modulus", "Pa", float(nominal.youngs_modulus), 0.5, 1e3, 2e12, True)
         stiffness = Effect(
@@ -105,11 +107,11 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     viscous = Number("bending_damping", "N m2 s", damping, 1.5, 1e-9, 1e2, True)
     tip = Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1)
     if nominal.density is None:
-        mass = "cross_section.mass_per_length"
-        density = Number(mass, "kg/m", float(nominal.mass_per_length), 0.1, 1e-9, 1e6, True)
+        mass = Replace(("cross_section.mass_per_length",), "multiple")
+        density = Number(mass.parameters[0], "kg/m", float(nominal.mass_per_length), 0.1, 1e-9, 1e6, True)
     else:
-        mass = "density"
-        density = Number(mass, "kg/m3", float(nominal.density), 0.1, 1.0, 1e5, True)
+        mass = Replace(("density",))
+        density = Number("density", "kg/m3", float(nominal.density), 0.1, 1.0, 1e5, True)
     ribs = [(k, mass) for k, mass in masses if mass > 0.0]
     known = tuple(Number(f"loads[{k}].mass", "kg", mass, 0.3, 0.0, 1e4, True) for k, mass in ribs)
     effects = [
@@ -133,7 +135,7 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             "tip mass", "mass at the tip beyond what is known", (tip,),
             Replace((f"loads.{len(nominal.loads)}.mass",)), _with_tip_mass,
         ),
-        Effect("mass along the rod", "density of the rod", (density,), Replace((mass,), "multiple")),
+        Effect("mass along the rod", "density of the rod", (density,), mass),
     ]  # fmt: skip
     if known:
         change = Replace(tuple(f"loads.{k}.mass" for k, _ in ribs))
@@ -200,7 +202,13 @@ def _with_sleeve(robot: Any, values: list[Any]) -> Any:
 
 
 def _with_table(robot: Any, values: list[Any]) -> Any:
-    names = ("bending_stiffness", "bending_stiffness_y", "torsional_stiffness", "axial_stiffness", "shear_stiffness")
+    names = (
+        "bending_stiffness",
+        "bending_stiffness_y",
+        "torsional_stiffness",
+        "axial_stiffness",
+        "shear_stiffness",
+    )
     table = {name: getattr(robot.cross_section, name) for name in names}
     scaled = {f"cross_section.{name}": one * values[0] for name, one in table.items() if one is not None}
     return robot.replace(**scaled)

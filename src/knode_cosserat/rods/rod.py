@@ -80,20 +80,15 @@ class SlenderRod(System):
     mixed: ClassVar[bool] = False
 
     length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
-    radius: Any = parameter(
-        "m", "radius of the rod; required without a cross_section", low=1e-6, high=0.5, default=None
-    )
+    # required, unless the cross-section states them
+    radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5, default=None)
     density: Any = parameter(
-        "kg/m3", "density of the rod, ribs spread over it included; required without a tabulated section",
-        low=1.0, high=100e3, default=None,
-    )  # fmt: skip
-    youngs_modulus: Any = parameter(
-        "Pa", "Young's modulus; required without a tabulated section", low=1e3, high=2e12, default=None
+        "kg/m3", "density of the rod, ribs spread over it included", low=1.0, high=100e3, default=None
     )
+    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12, default=None)
     tip_radius: Any = parameter(
-        "m", "radius at the tip of a round rod that tapers linearly; by default the same as at the base",
-        low=1e-6, high=0.5, default=None,
-    )  # fmt: skip
+        "m", "radius at the tip, to which a round rod tapers linearly", low=1e-6, high=0.5, default=None
+    )
     shear_modulus: Any = parameter(
         "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
     )
@@ -134,17 +129,19 @@ class SlenderRod(System):
         if not self.base_end.anywhere:
             raise ParameterError(f"base_end is {self.base_end.kind}; that is allowed as tip_end only")
         form = self.cross_section
-        material = form is None or form.is_homogeneous
-        for name in ("radius", "density", "youngs_modulus", "shear_modulus"):
-            applies, other = (
-                (form is None, "cross_section") if name == "radius" else (material, "tabulated cross_section")
-            )
+        homogeneous = getattr(form, "is_homogeneous", True)
+        for name, applies, other in (
+            ("radius", form is None, "cross_section"),
+            ("density", homogeneous, "tabulated cross_section"),
+            ("youngs_modulus", homogeneous, "tabulated cross_section"),
+            ("shear_modulus", homogeneous, "tabulated cross_section"),
+        ):
             value = getattr(self, name)
-            if value is None and applies and name != "shear_modulus":
+            if applies and value is None and name != "shear_modulus":
                 raise ParameterError(f"{name} is missing; required is {name}, or a {other}")
             if value is not None and not applies:
                 raise ParameterError(f"{name} and a {other} are given; allowed is one of them")
-        if self.tip_radius is not None and form is not None and not form.tapers:
+        if self.tip_radius is not None and not getattr(form, "tapers", True):
             raise ParameterError(
                 f"tip_radius is given with a {form.kind} cross_section; allowed is a round or hollow one. "
                 "Use sections with a stretch, such as {kind: stretch, radius: [1, -0.5]}"
@@ -171,7 +168,9 @@ class SlenderRod(System):
             present["cross_section"] = self.cross_section
         if self.tip_radius is not None:
             present["taper"] = FunctionSection(
-                function=lambda part, _: Differences(1.0 + (self.tip_radius / self.section.radius - 1.0) * part)
+                function=lambda part, _: Differences(
+                    1.0 + (self.tip_radius / self.section.radius - 1.0) * part
+                )
             )
         return present | {f"{name}{k}": part for name, parts in lists.items() for k, part in enumerate(parts)}
 

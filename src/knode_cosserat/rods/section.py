@@ -1,8 +1,8 @@
 """Cross-sections, with their stiffness and inertia, and their changes along a rod.
 
-The stiffness of a section is Kse = diag(GA, GA, EA) and Kbt, which has E times the second moments of area about
-two axes, and G times the torsion constant J. J is the polar moment for round sections only (Saint-Venant
-1855). The inertia has ρ times the second moments, about the rod's axis their sum.
+Kse = diag(GA, GA, EA), and Kbt has E times the second moments of area about two axes and G times the torsion
+constant J. J is the polar moment for round sections only (Saint-Venant 1855). The inertia has ρ times the
+second moments, about the rod's axis their sum.
 """
 
 from __future__ import annotations
@@ -135,8 +135,8 @@ def rectangle_torsion(width: Any, height: Any) -> Any:
     The limit 1 of each tanh has a known sum, 31/32 ζ(5). The rest decays as exp(-nπa/b).
     """
     a, b = jnp.maximum(width, height), jnp.minimum(width, height)
-    n = np.arange(1.0, 12.0, 2.0)
-    rest = jnp.sum((1.0 - jnp.tanh(0.5 * np.pi * n * (a / b))) / n**5)
+    n, ratio = np.arange(1.0, 12.0, 2.0), jnp.expand_dims(a / b, -1)
+    rest = jnp.sum((1.0 - jnp.tanh(0.5 * np.pi * n * ratio)) / n**5, axis=-1)
     return a * b**3 * (1.0 / 3.0 - 64.0 / np.pi**5 * (b / a) * (ODD_FIFTH_POWERS - rest))
 
 
