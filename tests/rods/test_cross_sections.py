@@ -84,7 +84,7 @@ def test_torsion_of_rectangles():
             slope = jax.grad(rectangle_torsion, argnums=(0, 1))(x, y)
             # homogeneous of degree 4 (Euler), and symmetric
             assert x * slope[0] + y * slope[1] == pytest.approx(4.0 * expected, rel=1e-12)
-            assert slope[0] == pytest.approx(jax.grad(rectangle_torsion, argnums=1)(y, x), rel=1e-12)
+            assert float(slope[0]) == pytest.approx(float(jax.grad(rectangle_torsion, 1)(y, x)), rel=1e-12)
 
 
 def test_stiffness_and_inertia_are_integrals_over_the_area():
@@ -248,7 +248,7 @@ def test_a_table_bends_as_the_integral_of_its_compliance(tmp_path):
 
 @pytest.mark.slow
 def test_a_table_moves_as_stretches_with_the_same_values():
-    """Piecewise constant by a steep rise; and linear stiffness in two stretches."""
+    """Linear stiffness in two stretches."""
     radius = 0.004
     EI, EA, mass = E * np.pi * radius**4 / 4, E * np.pi * radius**2, DENSITY * np.pi * radius**2
     factors = np.array([1.0, 0.7, 0.3])
@@ -259,7 +259,7 @@ def test_a_table_moves_as_stretches_with_the_same_values():
     stretches = (
         kc.robots.Stretch(end=0.4, stiffness=[1.0, -0.3]), kc.robots.Stretch(begin=0.4, stiffness=[0.7, -0.4])
     )  # fmt: skip
-    falling = {"gravity": [3.0, 0.0, -9.81]}
+    falling = {"gravity": [20.0, 0.0, -9.81]}
     tabulated, stretched = rod(table, **falling), rod(radius=radius, sections=stretches, **falling)
     found, expected = (
         kc.simulate(robot, np.zeros((10, 0)), 0.05).position for robot in (tabulated, stretched)
@@ -290,9 +290,13 @@ def test_a_strip_buckles_about_its_weak_axis(angle):
     critical = np.pi**2 * weak / (4 * L**2)
     kinds = [kc.statics.stability(held(strip, [0, 0, -part * critical])).kind for part in (0.99, 1.01)]
     assert kinds == ["stable", "divergence"]
-    moved = held(strip, [1e-4 * critical, 1e-4 * critical, -1.1 * critical])
+    s = np.linspace(0.0, L, 11)
+    bent = np.stack([0.6 * s * s / L, 0.6 * s * s / L, s], axis=1) @ turn(angle).T
+    pressed_down = strip.replace(**{"loads.0.force": [0.0, 0.0, -1.1 * critical]})
+    moved = kc.equilibrium(pressed_down, np.zeros(0), initial=bent, space=SPACE)
     tip = turn(angle).T @ moved.tip_position[0]
-    assert abs(tip[1]) > 0.2 * L and abs(tip[0]) < 1e-3 * L
+    assert moved.result[0] == kc.Result.CONVERGED and kc.statics.stability(moved).stable
+    assert abs(tip[1]) > 0.4 * L and abs(tip[0]) < 1e-6 * L
 
 
 @pytest.mark.slow

@@ -141,7 +141,7 @@ class SlenderRod(System):
                 raise ParameterError(f"{name} is missing; required is {name}, or a {other}")
             if value is not None and not applies:
                 raise ParameterError(f"{name} and a {other} are given; allowed is one of them")
-        if self.tip_radius is not None and not getattr(form, "tapers", True):
+        if self.tip_radius is not None and isinstance(form, CrossSection) and not form.tapers:
             raise ParameterError(
                 f"tip_radius is given with a {form.kind} cross_section; allowed is a round or hollow one. "
                 "Use sections with a stretch, such as {kind: stretch, radius: [1, -0.5]}"
