@@ -144,7 +144,7 @@ def test_what_is_missing_is_refused_by_both(key):
         content = {name: value for name, value in robot.items() if name != key}
         assert not CHECK.is_valid(content) and not loads(content)
     content = copy.deepcopy(ROBOTS["delrin-tendon-robot"])
-    del content["parameters"]["length"]
+    del content["parameters"]["radius"]
     assert not CHECK.is_valid(content) and not loads(content)
 
 

@@ -67,6 +67,7 @@ class ParallelRobot(Bundle):
     """
 
     strand_class: ClassVar[type[System]] = _Leg
+    alternatives: ClassVar[tuple[tuple[str, ...], ...]] = _Leg.alternatives
     length: Any = _of_rod("length")
     radius: Any = _of_rod("radius")
     density: Any = _of_rod("density")

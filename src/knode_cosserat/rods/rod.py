@@ -78,6 +78,9 @@ class SlenderRod(System):
     """
 
     mixed: ClassVar[bool] = False
+    alternatives: ClassVar[tuple[tuple[str, ...], ...]] = (
+        ("radius", "density", "youngs_modulus"), ("cross_section",)
+    )  # fmt: skip
 
     length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
     # required, unless the cross-section states them
@@ -485,7 +488,7 @@ class SlenderRod(System):
 
     def scales(self) -> Scales:
         """Return the scales of a beam: length L, force EI/L², moment EI/L, time L² √(ρA/EI)."""
-        L, EI = self.length, self.Kbt[0, 0]
+        L, EI = self.length, jnp.minimum(self.Kbt[0, 0], self.Kbt[1, 1])
         T = L * L * jnp.sqrt(self.mass_per_length / EI)
         sizes: Fields = {"p": L, "n": EI / (L * L), "m": EI / L, "q": L / T, "w": 1.0 / T}
         for part in self.parts.values():
