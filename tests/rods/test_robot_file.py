@@ -183,7 +183,7 @@ def test_matrices(matrix):
     ("changes", "parts"),
     [
         # missing and unknown
-        ({"radius": None}, ["parameters: the key 'radius' is missing", "length, radius, density"]),
+        ({"radius": None}, ["radius is missing; required is radius, or a cross_section"]),
         ({"youngs_module": "1.0"}, ["the key 'youngs_module' is unknown", "did you mean youngs_modulus?"]),
         ({"name": "x"}, ["parameters: the key 'name' is unknown", "length, radius"]),
         ({"1": "2"}, ["the key 1 is unknown"]),

@@ -25,6 +25,7 @@ FAMILIES = {
     "Load": "Loads: `loads`",
     "Effect": "Further physics: `effects`",
     "Obstacle": "Surroundings: `surroundings`",
+    "CrossSection": "Cross-section: `cross_section`",
     "SectionChange": "Sections: `sections`",
     "Routing": "Tendon routing: `routing`",
     "LoadCells": "Load cells: `load_cells`",

@@ -105,6 +105,8 @@ def parameters(system: System) -> dict[str, dict[str, Any]]:
 
 def derived(system: System) -> dict[str, dict[str, Any]]:
     """Return quantities that follow from the parameters, in the same form."""
+    import jax
+
     from knode_cosserat.rods.loads import AttachedMass
     from knode_cosserat.rods.rod import SlenderRod
 
@@ -112,9 +114,12 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     if not isinstance(system, SlenderRod):
         return {}
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
+    if not system.is_uniform:
+        still, s = np.zeros(system.control_layout.size), (np.arange(1000.0) + 0.5) / 1000.0 * system.length
+        mass = np.mean(jax.vmap(lambda at: system.material(at, still).rhoA + 0.0 * at)(s)) * system.length
     attached = sum(float(load.mass) for load in system.loads if isinstance(load, AttachedMass))
     return {
-        "G": _quantity(system.G, "Pa", "shear modulus"),
+        **({} if system.youngs_modulus is None else {"G": _quantity(system.G, "Pa", "shear modulus")}),
         "Kse": _quantity(np.diag(Kse), "N", "stiffness of shear, shear and extension"),
         "Kbt": _quantity(np.diag(Kbt), "N m2", "stiffness of bending, bending and torsion"),
         "mass": _quantity(mass, "kg", "mass of the rod"),

@@ -470,6 +470,9 @@ def in_order(cls: type) -> dict[str, Any]:
 class Parametrised(eqx.Module):
     """Base of systems and their parts: parameters, stated in the class and passed by name."""
 
+    #: for the schema: sets of optional entries, of which one is required
+    alternatives: ClassVar[tuple[tuple[str, ...], ...]] = ()
+
     def __new__(cls, *args: Any, **fields: Any) -> Self:
         """Raise `ParameterError` that lists the known names; Python's own message would not."""
         for name in fields.keys() - {field.name for field in dataclasses.fields(cls)}:
@@ -563,7 +566,7 @@ def _part_text(part: Any) -> str:
     return "{" + ", ".join(entries) + "}"
 
 
-def object_schema(cls: type, families: dict[str, Any], **more: Any) -> dict[str, Any]:
+def object_schema(cls: type[Parametrised], families: dict[str, Any], **more: Any) -> dict[str, Any]:
     """Return the JSON Schema of a class's mapping; the families of its parts are added to `families`."""
     defaults = {field.name: field.default for field in dataclasses.fields(cls)}
     known = {name: one.schema(defaults[name], families) for name, one in in_order(cls).items()}
@@ -576,6 +579,7 @@ def object_schema(cls: type, families: dict[str, Any], **more: Any) -> dict[str,
         "properties": known | more,
         "required": [name for name in parameters_of(cls) if defaults[name] is dataclasses.MISSING],
         "additionalProperties": False,
+        **({"anyOf": [{"required": list(names)} for names in cls.alternatives]} if cls.alternatives else {}),
     }
 
 
