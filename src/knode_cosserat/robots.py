@@ -1,10 +1,10 @@
 """Robots: their classes and files, and the parts, parameters and layouts of one's own.
 
-Parts are in modules: `ends`, `loads`, `routing`, `section`, `surroundings`, `tendons`; the forms of a
-material's law are in `law`.
+Parts are in modules: `ends`, `fluids`, `loads`, `magnets`, `routing`, `section`, `surroundings`, `tendons`;
+the forms of a material's law are in `law`.
 """
 
-from knode_cosserat.rods import ends, law, loads, routing, section, surroundings, tendons
+from knode_cosserat.rods import ends, fluids, law, loads, magnets, routing, section, surroundings, tendons
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
@@ -36,8 +36,10 @@ __all__ = [
     "TendonRobot",
     "Wrench",
     "ends",
+    "fluids",
     "law",
     "loads",
+    "magnets",
     "parameter",
     "robot_schema",
     "routing",
