@@ -1,4 +1,4 @@
-"""Magnets in fields: elastica, buckling, energy and reciprocity of dipoles, a catheter in a rotating field."""
+"""Magnets in fields: elastica, buckling, energy and reciprocity of dipoles, a catheter that follows."""
 
 import jax
 import numpy as np
@@ -18,21 +18,23 @@ EI = E * np.pi * RADIUS**4 / 4
 UNIT = EI / L**2
 
 
-def rod(field, nodes=11, **changes):
-    """A rod that is magnetised along its axis."""
-    given = {
-        "length": L, "radius": RADIUS, "density": 1700.0, "youngs_modulus": E, "bending_damping": 1e-9,
-        "gravity": [0.0, 0.0, 0.0], "loads": (Magnet(magnetisation=[0.0, 0.0, UNIT], field=field),),
-    }  # fmt: skip
-    return kc.robots.SlenderRod(**given | changes, nodes=nodes)
+PLAIN = kc.robots.SlenderRod(
+    length=L, radius=RADIUS, density=1700.0, youngs_modulus=E, bending_damping=1e-9, nodes=11,
+    gravity=[0.0, 0.0, 0.0],
+)  # fmt: skip
+#: magnetised along its axis in a uniform field, in that of a dipole, and at its tip: one compiled program
+MAGNETIC = PLAIN.replace(
+    loads=(Magnet(), Magnet(field=DipoleField([0.0, 0.0, 1.0], [0.0, 0.0, 0.0])), PointMagnet())
+)
 
 
-def uniform(B, **more):
-    return rod(UniformField(flux_density=B), **more)
+def uniform(B, nodes=11, magnetisation=UNIT):
+    changes = {"loads.0.magnetisation": [0.0, 0.0, magnetisation], "loads.0.field.flux_density": B}
+    return MAGNETIC.replace(nodes=nodes, **changes)
 
 
-def rest(robot, control=(), space="lobatto4"):
-    return kc.equilibrium(robot, np.array(control, dtype=float), space=space)
+def rest(robot, space="lobatto4"):
+    return kc.equilibrium(robot, np.zeros(0), space=space)
 
 
 # uniform fields
@@ -75,29 +77,26 @@ def test_a_small_deflection_with_a_field_along_the_rod(along):
     np.testing.assert_allclose(turned, theta, atol=1e-6 * np.abs(theta).max())
 
 
+@pytest.mark.slow
 def test_a_field_against_the_magnetisation_buckles_the_rod():
-    critical = np.pi**2 / 4
-    below, above = (kc.statics.stability(rest(uniform([0.0, 0.0, -c * critical]))) for c in (0.999, 1.001))
+    critical, near = np.pi**2 / 4, np.array([0.999, 1.001])
+    below, above = (kc.statics.stability(rest(uniform([0.0, 0.0, -c * critical], nodes=6))) for c in near)
     assert below.stable and not above.stable and above.asymmetry < 1e-6
-    # its least eigenvalue is zero there
-    assert critical * (0.999 + 0.002 * below.least / (below.least - above.least)) == pytest.approx(
-        critical, rel=2e-6
-    )
+    # the least eigenvalue is zero there
+    found = near[0] + (near[1] - near[0]) * below.least / (below.least - above.least)
+    assert found == pytest.approx(1.0, abs=3e-6)
 
 
 def test_a_magnet_at_the_tip_is_a_moment_that_turns_with_it():
     """EI θ' = m B cos θ_L along the rod, whose line is a circle."""
-    magnet = PointMagnet(moment=[0.0, 0.0, UNIT * L], field=UniformField(flux_density=[1.3, 0.0, 0.0]))
-    found = rest(uniform([0.0, 0.0, 0.0], loads=(magnet,)))
+    robot = MAGNETIC.replace(**{
+        "loads.2.moment": [0.0, 0.0, UNIT * L], "loads.2.field.flux_density": [1.3, 0.0, 0.0],
+    })  # fmt: skip
+    found = rest(robot)
     angle = brentq(lambda angle: angle - 1.3 * np.cos(angle), 0.0, 1.5, xtol=1e-15)
     np.testing.assert_allclose(np.asarray(found.part("u"))[0, :, 1], angle / L, rtol=1e-8)
     circle = L / angle * np.array([1.0 - np.cos(angle), 0.0, np.sin(angle)])
     np.testing.assert_allclose(found.tip_position[0], circle, atol=1e-6 * L)
-    # the same as a short magnetised stretch, to the order of its length
-    short = Magnet(magnetisation=[0.0, 0.0, UNIT * 1e3], begin=0.999, field=magnet.field)
-    np.testing.assert_allclose(
-        rest(uniform([0.0, 0.0, 0.0], loads=(short,))).tip_position[0], circle, atol=1e-3 * L
-    )
 
 
 # dipoles
@@ -126,11 +125,11 @@ def test_the_wrench_of_a_dipole_is_the_slope_of_its_energy(seed):
         m = Rotation.from_rotvec(turn).apply(motion.R @ own)
         return -m @ flux(motion.p + x, PLACE, MOMENT)
 
-    h, none = 1e-5, np.zeros(3)
+    h, none = 1e-5 * np.linalg.norm(motion.p - PLACE), np.zeros(3)
     slope = [(energy(h * e) - energy(-h * e)) / (2 * h) for e in np.eye(3)]
     turned = [(energy(none, h * e) - energy(none, -h * e)) / (2 * h) for e in np.eye(3)]
-    np.testing.assert_allclose(force, -np.array(slope), rtol=1e-6)
-    np.testing.assert_allclose(couple, -np.array(turned), rtol=1e-6)
+    for own, expected in ((force, slope), (couple, turned)):
+        np.testing.assert_allclose(own, -np.array(expected), atol=1e-7 * np.linalg.norm(expected))
 
 
 def test_a_dipole_and_a_magnet_exchange_momentum():
@@ -153,14 +152,13 @@ def test_a_field_is_finite_at_the_dipole_itself():
 
 
 def test_a_far_dipole_bends_as_the_uniform_field_at_the_rod():
-    far = np.array([100.0, 0.0, 0.0])
-    strong = DipoleField(far, [2e6 / 4, 0.0, 0.0])
-    B = flux(np.array([0.0, 0.0, L / 2]), far, strong.moment)
-    loads = [Magnet(magnetisation=[0.0, 0.0, 1e7 * UNIT], field=field) for field in
-             (strong, UniformField(flux_density=B))]  # fmt: skip
-    one, other = (rest(uniform([0.0, 0.0, 0.0], loads=(load,))).tip_position[0] for load in loads)
+    far, moment = np.array([100.0, 0.0, 0.0]), np.array([5e5, 0.0, 0.0])
+    B, strong = flux(np.array([0.0, 0.0, L / 2]), far, moment), 1e7 * UNIT
+    one = rest(uniform(B, magnetisation=strong)).tip_position[0]
+    dipole = {"magnetisation": [0.0, 0.0, strong], "field.position": far, "field.moment": moment}
+    other = rest(MAGNETIC.replace(**{f"loads.1.{name}": value for name, value in dipole.items()}))
     assert one[0] > 0.2 * L
-    np.testing.assert_allclose(one, other, atol=1e-3 * L)
+    np.testing.assert_allclose(one, other.tip_position[0], atol=1e-3 * L)
 
 
 def test_controls_move_and_turn_a_dipole():
@@ -171,9 +169,7 @@ def test_controls_move_and_turn_a_dipole():
     moved = flux(p, PLACE + change[:3], MOMENT + change[3:])
     np.testing.assert_allclose(controlled.flux(p, change), moved, rtol=1e-9)
     turning = DipoleField(PLACE, MOMENT, controlled=("moment",))
-    np.testing.assert_allclose(
-        turning.flux(p, change[3:]), flux(p, PLACE, MOMENT + change[3:]), rtol=1e-9
-    )
+    np.testing.assert_allclose(turning.flux(p, change[3:]), flux(p, PLACE, MOMENT + change[3:]), rtol=1e-9)
 
 
 # the catheter of the catalog
@@ -198,15 +194,15 @@ def test_the_catheter_follows_a_rotating_field(catheter):
     radius = begun.tip_position[0, 0]
     assert 0.1 < radius / float(catheter.length) < 0.9
     field = rotating(100, dt, period=2.0)
-    found = kc.simulate(catheter, field, dt, initial=begun)
+    found = kc.simulate(catheter, field, dt, initial=begun, between="linear")
     assert found.all_valid
     tip = np.asarray(found.tip_position)[1:]
-    still = np.asarray(kc.equilibria(catheter, field[::25]).tip_position)
+    still = np.asarray(kc.solvers.equilibria(catheter, field[::25]).tip_position)
     np.testing.assert_allclose(np.hypot(*still[:, :2].T), radius, rtol=1e-6)
     # it turns once, on the circle of its equilibria, behind the field by a few degrees
     lag = np.angle(np.exp(1j * (np.arctan2(field[:, 1], field[:, 0]) - np.arctan2(tip[:, 1], tip[:, 0]))))
-    assert np.all(np.abs(lag) < np.radians(5)) and np.mean(lag[50:]) > 0.0
-    np.testing.assert_allclose(np.hypot(*tip[:, :2].T), radius, rtol=0.02)
+    assert np.all(np.abs(lag) < np.radians(5)) and np.all(lag[50:] > 0.0)
+    np.testing.assert_allclose(np.hypot(*tip[:, :2].T), radius, rtol=0.03)
 
 
 def test_it_is_differentiable_and_runs_in_batches(catheter):
@@ -234,7 +230,7 @@ def test_robot_files_hold_magnets():
         Magnet(magnetisation=[0.0, 0.0, 0.02], begin=0.5, field=UniformField([0.0, 0.0, 1e-2], True)),
         PointMagnet(moment=[0.0, 0.0, 1e-3], field=DipoleField(PLACE, MOMENT, controlled=("moment",))),
     )
-    text = format_robot(uniform([0.0, 0.0, 0.0], loads=loads))
+    text = format_robot(PLAIN.replace(loads=loads))
     assert "field: {kind: dipole, position: [0.05, 0.02, -0.03]" in text
     found = parse_robot(text, "here").loads
     assert repr(found) == repr(loads) and found[1].field.controlled == ("moment",)
@@ -255,7 +251,7 @@ def test_robot_files_hold_magnets():
     ],
 )  # fmt: skip
 def test_wrong_magnets_are_refused_in_one_line(load, words):
-    text = format_robot(uniform([0.0, 0.0, 0.0], loads=()))
+    text = format_robot(PLAIN)
     with pytest.raises(RobotFileError) as caught:
         parse_robot(text.replace("format: 1", "format: 2") + f"  loads: [{load}]\n", "mine.yaml")
     assert f"mine.yaml: {words}" in str(caught.value) and "\n" not in str(caught.value)

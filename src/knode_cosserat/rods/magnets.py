@@ -88,7 +88,9 @@ class DipoleField(MagneticField):
     def control_fields(self) -> tuple[Field, ...]:
         """Three components of each controlled value: of the position, then of the moment."""
         fields = {
-            "position": [Field(axis, 1, "m", f"position of the dipole along {axis}, added") for axis in "xyz"],
+            "position": [
+                Field(axis, 1, "m", f"position of the dipole along {axis}, added") for axis in "xyz"
+            ],
             "moment": [Field(f"m{axis}", 1, "A m2", f"its moment along {axis}, added") for axis in "xyz"],
         }
         return tuple(field for name in fields if name in self.controlled for field in fields[name])
