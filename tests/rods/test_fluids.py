@@ -266,6 +266,16 @@ def test_it_is_differentiable_and_runs_in_batches(arm):
         assert both.tip_position[k, -1, 0] == pytest.approx(float(tip(robot)), abs=1e-10)
 
 
+@pytest.mark.slow
+def test_its_numbers_are_identified(arm):
+    truth = kc.simulate(arm, np.zeros((STEPS, 0)), DT)
+    names = ["loads.0.drag", "loads.0.added_mass"]
+    guess = arm.replace(**{names[0]: 0.8, names[1]: 1.3})
+    found = kc.identify(guess, [truth], parameters=names)
+    for name, exact in zip(names, (1.1, 1.0), strict=True):
+        assert found[name].value == pytest.approx(exact, rel=1e-4)
+
+
 def test_robot_files_hold_a_fluid():
     rod = wet(fluid=Fluid(stream=STREAM, added_mass=0.9)).replace(
         loads=(Fluid(stream=STREAM), Tail(span=0.02))

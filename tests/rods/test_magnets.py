@@ -180,7 +180,7 @@ def catheter():
     return kc.load_robot("magnetic-catheter")
 
 
-def rotating(steps, dt, period, size=8e-3):
+def rotating(steps, dt, period, size=4e-3):
     """A field that turns about the axis, from one along x, in T."""
     angle = 2 * np.pi * dt * np.arange(1, steps + 1) / period
     return size * np.stack([np.cos(angle), np.sin(angle), 0.0 * angle], axis=1)
@@ -189,7 +189,7 @@ def rotating(steps, dt, period, size=8e-3):
 def test_the_catheter_follows_a_rotating_field(catheter):
     assert catheter.control_layout.names == ("load0_Bx", "load0_By", "load0_Bz")
     assert [field.unit for field in catheter.control_layout.fields] == ["T"] * 3
-    dt, start = 0.02, np.array([8e-3, 0.0, 0.0])
+    dt, start = 0.02, np.array([4e-3, 0.0, 0.0])
     begun = kc.equilibrium(catheter, start)
     radius = begun.tip_position[0, 0]
     assert 0.1 < radius / float(catheter.length) < 0.9
@@ -220,6 +220,16 @@ def test_it_is_differentiable_and_runs_in_batches(catheter):
     together = kc.simulate(robots, np.stack([field, field]), 0.02)
     for k, one in enumerate(robots):
         np.testing.assert_allclose(together[k].y, kc.simulate(one, field, 0.02).y, atol=1e-11)
+
+
+@pytest.mark.slow
+def test_its_numbers_are_identified(catheter):
+    field = rotating(40, 0.02, period=1.0)
+    truth = kc.simulate(catheter, field, 0.02)
+    guess = catheter.replace(**{"loads.0.magnetisation": [1e-3, 0.0, 0.04], "youngs_modulus": 2.9e6})
+    found = kc.identify(guess, [truth], parameters=["loads.0.magnetisation", "youngs_modulus"])
+    np.testing.assert_allclose(found.robot.loads[0].magnetisation, [0.0, 0.0, 0.047], atol=1e-6)
+    assert float(found.robot.youngs_modulus) == pytest.approx(3e6, rel=1e-4)
 
 
 # files
