@@ -158,6 +158,13 @@ def test_bend_by_pressure(run):
 
 
 @CAMPAIGN
+def test_magnetic_catheter(run):
+    still, slow, fast = (np.hypot(*path[:, :2].T) for path in run("magnetic_catheter", turns=2).values())
+    np.testing.assert_allclose(slow, still[0], rtol=1e-2)
+    assert np.mean(fast[60:]) > 1.1 * still[0]
+
+
+@CAMPAIGN
 def test_calibrate_parameters(run):
     found = run("calibrate_parameters", steps=40)
     for name, true in (("youngs_modulus", 2.757903e9), ("bending_damping", 0.03)):

@@ -1,10 +1,22 @@
 """Robots: their classes and files, and the parts, parameters and layouts of one's own.
 
-Parts are in modules: `chambers`, `ends`, `loads`, `routing`, `section`, `surroundings`, `tendons`; the forms
-of a material's law are in `law`.
+Parts are in modules: `chambers`, `ends`, `fluids`, `loads`, `magnets`, `routing`, `section`, `surroundings`,
+`tendons`, `tubes`; the forms of a material's law are in `law`.
 """
 
-from knode_cosserat.rods import chambers, ends, law, loads, routing, section, surroundings, tendons
+from knode_cosserat.rods import (
+    chambers,
+    ends,
+    fluids,
+    law,
+    loads,
+    magnets,
+    routing,
+    section,
+    surroundings,
+    tendons,
+    tubes,
+)
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
@@ -37,12 +49,15 @@ __all__ = [
     "Wrench",
     "chambers",
     "ends",
+    "fluids",
     "law",
     "loads",
+    "magnets",
     "parameter",
     "robot_schema",
     "routing",
     "section",
     "surroundings",
     "tendons",
+    "tubes",
 ]

@@ -40,6 +40,19 @@ def variable_curvature():
     return robot, *(pushed(T, 0.4, np.arange(3.0)) for T in (1.5, 2.2))
 
 
+def magnetic():
+    robot = kc.load_robot("magnetic-catheter")
+    return robot, *(pushed(T, 2e-3, np.arange(3.0)) for T in (1.5, 2.2))
+
+
+def in_water():
+    robot = kc.robots.SlenderRod(
+        length=0.3, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=11, bending_damping=2e-4,
+        base_end=Driven(axes=("x", "ry")), loads=(kc.robots.fluids.Fluid(),),
+    )  # fmt: skip
+    return robot, *(pushed(T, [0.03, 0.4], np.array([0.0, 1.0])) for T in (1.5, 2.2))
+
+
 def helical_tendons():
     routing = tuple(Helical(0.02, angle, 0.25) for angle in FOUR)
     robot = kc.robots.RoutedTendonRobot.like(DELRIN, routing=routing)
@@ -57,7 +70,8 @@ def with_ribs():
 
 
 SYSTEMS = {
-    each.__name__: each for each in (driven_in_contact, variable_curvature, helical_tendons, reels, with_ribs)
+    each.__name__: each
+    for each in (driven_in_contact, variable_curvature, magnetic, in_water, helical_tendons, reels, with_ribs)
 }
 
 

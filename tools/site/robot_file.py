@@ -23,6 +23,7 @@ HEAD = "| name | meaning | kind | unit | accepted | default |\n| --- | --- | ---
 FAMILIES = {
     "End": "Ends: `base_end`, `tip_end`",
     "Load": "Loads: `loads`",
+    "MagneticField": "Magnetic fields: `field` of magnets",
     "Effect": "Further physics: `effects`",
     "Obstacle": "Surroundings: `surroundings`",
     "CrossSection": "Cross-section: `cross_section`",
@@ -56,8 +57,12 @@ def page() -> str:
         after = "No further entries." if one and not rows else HEAD + "\n".join(rows)
         parts += [f"## `{kind}`", _first(cls), after]
     families: dict[str, type] = {}
-    for cls in KINDS.values():
-        families |= {slot.family.__name__: slot.family for slot in slots_of(cls).values()}
+    holders: list[type] = list(KINDS.values())
+    for cls in holders:  # it grows: parts may hold parts
+        for slot in slots_of(cls).values():
+            if slot.family.__name__ not in families:
+                families[slot.family.__name__] = slot.family
+                holders += kinds_of(slot.family).values()
     for name, family in families.items():
         parts += [f"## {FAMILIES[name]}", _first(family)]
         for kind, cls in kinds_of(family).items():
