@@ -140,7 +140,7 @@ def _simulated() -> list[Check]:
     except Exception as error:  # any failure is a result of the check
         return [Check("simulation", False, f"{type(error).__name__}: {' '.join(str(error).split())}")]
     solved = bool(moved.all_valid and np.max(moved.residual) <= 1e-8)
-    weight = float(robot.density * np.pi * robot.radius**2 * robot.length * robot.gravity[2])
+    weight = float(robot.mass_per_length * robot.length * robot.gravity[2])
     off = abs(carried / weight - 1.0)
     balance = f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}"
     return [

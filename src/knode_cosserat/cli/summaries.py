@@ -114,7 +114,7 @@ def derived(system: System) -> dict[str, dict[str, Any]]:
     Kse, Kbt, mass = np.asarray(system.Kse), np.asarray(system.Kbt), system.mass_per_length * system.length
     attached = sum(float(load.mass) for load in system.loads if isinstance(load, AttachedMass))
     return {
-        "G": _quantity(system.G, "Pa", "shear modulus"),
+        **({} if system.youngs_modulus is None else {"G": _quantity(system.G, "Pa", "shear modulus")}),
         "Kse": _quantity(np.diag(Kse), "N", "stiffness of shear, shear and extension"),
         "Kbt": _quantity(np.diag(Kbt), "N m2", "stiffness of bending, bending and torsion"),
         "mass": _quantity(mass, "kg", "mass of the rod"),

@@ -101,7 +101,7 @@ class Replace:
     """Replaces parameters by name, such as `youngs_modulus` or `loads.0.mass`; one number each.
 
     Numbers of one parameter are its components ("vector"), its diagonal (one number or three), the
-    coefficients of a residual, or the first entry of a matrix that is multiplied as a whole ("multiple").
+    coefficients of a residual, or the first entry of a matrix or list that is multiplied as a whole ("multiple").
     """
 
     parameters: tuple[str, ...]
@@ -117,8 +117,8 @@ class Replace:
         elif self.kind == "coefficients":
             numbers = numbers.reshape(np.shape(_stated(robot, name)))
         elif self.kind == "multiple":
-            matrix = _stated(robot, name)
-            numbers = matrix * (values[0] / matrix[0, 0])
+            whole = _stated(robot, name)
+            numbers = whole * (values[0] / whole.reshape(-1)[0])
         return robot.replace(**{name: numbers})
 
 

@@ -87,7 +87,7 @@ def library_model(
         more: further effects, such as plain parameters.
     """
     if not isinstance(nominal, RoutedTendonRobot):
-        offset = float(nominal.tendon_offset) or OFFSET * float(nominal.radius)
+        offset = float(nominal.tendon_offset) or OFFSET * float(nominal.section.radius)
         nominal = RoutedTendonRobot.like(nominal, tendon_offset=offset)
     usual = Usual(
         float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1))),

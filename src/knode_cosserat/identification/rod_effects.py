@@ -13,7 +13,7 @@ from knode_cosserat.identification.effects import Usual, along_axes, register
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.relaxation import Relaxation
-from knode_cosserat.rods.section import Sleeve, Stretch
+from knode_cosserat.rods.section import ABOUT_X, ABOUT_Y, COUPLED, Sleeve, Stretch
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat.rotation import quaternion_of, quaternion_product
 
@@ -47,7 +47,14 @@ def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
 
 def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     L = float(nominal.length)
-    modulus = Number("youngs_modulus", "Pa", float(nominal.youngs_modulus), 0.5, 1e3, 2e12, True)
+    if nominal.youngs_modulus is None:
+        modulus = Number("cross_section.stiffness", "", 1.0, 0.5, 1e-3, 1e3, True)
+        stiffness = Effect("stiffness", "factor of the table's stiffness", (modulus,), _with_table, basic=True)
+    else:
+        modulus = Number("youngs_modulus", "Pa", float(nominal.youngs_modulus), 0.5, 1e3, 2e12, True)
+        stiffness = Effect(
+            "stiffness", "Young's modulus", (modulus,), Replace(("youngs_modulus",)), basic=True
+        )
     curvature = (
         *along_axes("curvature", "1/m", 0.3 / L, "xy"), *along_axes("curvature_slope", "1/m", 0.6 / L, "xy")
     )  # fmt: skip
@@ -56,8 +63,8 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
         Number("sleeve.length", "", 0.15, 0.5, 0.01, 0.6, True, shape=True),
     )
     axes = tuple(Number(label, "", 0.0, 0.1, -0.9, 0.9) for label in ("anisotropy", "anisotropy_turned"))
-    return [
-        Effect("stiffness", "Young's modulus", (modulus,), Replace(("youngs_modulus",)), basic=True),
+    effects = [
+        stiffness,
         Effect(
             "rest curvature", "curvature of the unloaded rod, constant and linear along it", curvature,
             _with_curvature, _stretchable,
@@ -67,8 +74,11 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             _with_taper, _stretchable,
         ),
         Effect("sleeve", "stiffer base of the rod", sleeve, _with_sleeve, _sleeved, usual=True),
-        Effect("stiffness axes", "difference of the bending stiffness about two axes", axes, _with_axes),
     ]  # fmt: skip
+    if nominal.youngs_modulus is not None:
+        about = "difference of the bending stiffness about two axes"
+        effects.append(Effect("stiffness axes", about, axes, _with_axes))
+    return effects
 
 
 def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
@@ -94,7 +104,12 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     )
     viscous = Number("bending_damping", "N m2 s", damping, 1.5, 1e-9, 1e2, True)
     tip = Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1)
-    density = Number("density", "kg/m3", float(nominal.density), 0.1, 1.0, 1e5, True)
+    if nominal.density is None:
+        mass = "cross_section.mass_per_length"
+        density = Number(mass, "kg/m", float(nominal.mass_per_length), 0.1, 1e-9, 1e6, True)
+    else:
+        mass = "density"
+        density = Number(mass, "kg/m3", float(nominal.density), 0.1, 1.0, 1e5, True)
     ribs = [(k, mass) for k, mass in masses if mass > 0.0]
     known = tuple(Number(f"loads[{k}].mass", "kg", mass, 0.3, 0.0, 1e4, True) for k, mass in ribs)
     effects = [
@@ -118,7 +133,7 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             "tip mass", "mass at the tip beyond what is known", (tip,),
             Replace((f"loads.{len(nominal.loads)}.mass",)), _with_tip_mass,
         ),
-        Effect("mass along the rod", "density of the rod", (density,), Replace(("density",))),
+        Effect("mass along the rod", "density of the rod", (density,), Replace((mass,), "multiple")),
     ]  # fmt: skip
     if known:
         change = Replace(tuple(f"loads.{k}.mass" for k, _ in ribs))
@@ -184,13 +199,19 @@ def _with_sleeve(robot: Any, values: list[Any]) -> Any:
     return _section(robot, Sleeve, stiffening=values[0], length=values[1])
 
 
+def _with_table(robot: Any, values: list[Any]) -> Any:
+    names = ("bending_stiffness", "bending_stiffness_y", "torsional_stiffness", "axial_stiffness", "shear_stiffness")
+    table = {name: getattr(robot.cross_section, name) for name in names}
+    scaled = {f"cross_section.{name}": one * values[0] for name, one in table.items() if one is not None}
+    return robot.replace(**scaled)
+
+
 def _with_axes(robot: Any, values: list[Any]) -> Any:
+    """Change the stiffness to C (1 + A) Cᵀ, from C Cᵀ of the section and A = [[a, b], [b, -a]]."""
     a, b = values
-    EI = robot.section.second_moment * robot.youngs_modulus
-    GJ = 2.0 * robot.section.second_moment * robot.G
-    zero = jnp.zeros(())
-    rows = [[EI * (1.0 + a), EI * b, zero], [EI * b, EI * (1.0 - a), zero], [zero, zero, GJ]]
-    return robot.replace(bending_stiffness=jnp.stack([jnp.stack(row) for row in rows]))
+    C = jnp.linalg.cholesky(jnp.asarray(robot.section.Kbt))
+    change = a * (ABOUT_X - ABOUT_Y) + b * COUPLED
+    return robot.replace(bending_stiffness=C @ (np.eye(3) + change) @ C.T)
 
 
 def _rotated(robot: Any, values: list[Any]) -> Any:

@@ -17,11 +17,12 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.parameters import ParameterError, parameter
+from knode_cosserat.rods.parameters import ParameterError, parameter, stated_of
 from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, SlenderRod
+from knode_cosserat.rods.section import CrossSection
 from knode_cosserat.rods.strands import Bundle, in_strands
-from knode_cosserat.rods.system import Scales, System, is_traced
+from knode_cosserat.rods.system import Discontinuities, Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 #: indices in a leg's y at which the fields after p begin
@@ -47,7 +48,7 @@ def _of_rod(name: str) -> Any:
     """Return a field that states a parameter as `_Leg` does."""
     stated = _Leg.__dataclass_fields__[name]
     default = {} if stated.default is dataclasses.MISSING else {"default": stated.default}
-    return dataclasses.field(metadata=stated.metadata, **default)
+    return dataclasses.field(metadata=stated.metadata, kw_only=True, **default)
 
 
 class ParallelRobot(Bundle):
@@ -70,6 +71,8 @@ class ParallelRobot(Bundle):
     radius: Any = _of_rod("radius")
     density: Any = _of_rod("density")
     youngs_modulus: Any = _of_rod("youngs_modulus")
+    tip_radius: Any = _of_rod("tip_radius")
+    cross_section: CrossSection | None = _of_rod("cross_section")
     base_radius: Any = parameter("m", "radius of the circle on which the legs begin", low=0.0, high=20.0)
     platform_radius: Any = parameter("m", "radius of the platform's circle of joints", low=0.0, high=20.0)
     base_angles: Any = parameter(
@@ -126,6 +129,11 @@ class ParallelRobot(Bundle):
         return Layout(("displacement", self.strands, "m", "displacement of each leg's base along z"))
 
     @property
+    def discontinuities(self) -> Discontinuities:  # type: ignore[override]
+        """Kinks of tabulated legs."""
+        return Discontinuities(() if self.cross_section is None else self.cross_section.cuts)
+
+    @property
     def inertia(self) -> Float[Any, "3 3"]:
         """The platform's inertia about its centre, in its frame (kg m²)."""
         if self.platform_inertia is not None:
@@ -160,7 +168,7 @@ class ParallelRobot(Bundle):
 
     def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
         """Return straight unloaded legs if the joints face each other, else an estimate by slender beams."""
-        L, EI, count = self.length, self.strand.Kbt[0, 0], self.strands
+        L, EI, count = self.length, jnp.asarray(self.strand.Kbt)[:2, :2], self.strands
         begin, end = _on_circle(self.base_radius, self.base_angles), self.joints
         facing, off = jnp.sum(begin * end), jnp.sum(begin[:, 1] * end[:, 0] - begin[:, 0] * end[:, 1])
         # rotation of the platform that brings its joints nearest to the base's, if it is defined
@@ -179,11 +187,12 @@ class ParallelRobot(Bundle):
         h = jnp.concatenate(
             [(jnp.cos(twist) * one)[:, None], 0.5 * slope * across, (jnp.sin(twist) * one)[:, None]], axis=1
         )
-        n = jnp.concatenate([EI * sheared * away, zero[:, None]], axis=1)
-        m = jnp.concatenate([EI * bent * across, zero[:, None]], axis=1)
+        stiff = across @ EI
+        n = jnp.concatenate([sheared * stiff[:, 1:], -sheared * stiff[:, :1], zero[:, None]], axis=1)
+        m, u = (jnp.concatenate([bent * each, zero[:, None]], axis=1) for each in (stiff, across))
         v = jnp.tile(self.strand.v_star, (count, 1))
         state = jnp.concatenate([p, h, n, m, jnp.zeros((count, 6))], axis=1)
-        return state.reshape(-1), jnp.concatenate([v, m / EI], axis=1).reshape(-1)
+        return state.reshape(-1), jnp.concatenate([v, u], axis=1).reshape(-1)
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at the base: the actuators' positions along z."""
@@ -227,7 +236,7 @@ class ParallelRobot(Bundle):
 
 
 #: rod parameters that a leg takes from the robot
-LEG = tuple(name for name in ParallelRobot.parameters() if name in _Leg.parameters())
+LEG = tuple(name for name in stated_of(ParallelRobot) if name in stated_of(_Leg))
 
 
 class _PlatformEnds(Ends, of=ParallelRobot):

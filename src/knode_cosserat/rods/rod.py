@@ -28,11 +28,14 @@ from knode_cosserat.rods.section import (
     ALONG,
     INWARD,
     POISSON_RATIO,
-    CircularSection,
+    CrossSection,
     Differences,
+    FunctionSection,
     Material,
+    Section,
     SectionChange,
     differences_at,
+    round_section,
     shape_at_rest,
 )
 from knode_cosserat.rods.surroundings import Obstacle
@@ -65,7 +68,7 @@ AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 class SlenderRod(System):
-    """A round rod that is driven by its ends, loads and sections, and in contact with its surroundings.
+    """A rod that is driven by its ends, loads and sections, and in contact with its surroundings.
 
     With controlled curvature or stiffness of its `sections` it is a variable-curvature robot. With a driven
     base and obstacles it is the soft slender robot of Xun, Zheng & Kruszewski (2024).
@@ -77,9 +80,20 @@ class SlenderRod(System):
     mixed: ClassVar[bool] = False
 
     length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
-    radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5)
-    density: Any = parameter("kg/m3", "density of the rod, ribs spread over it included", low=1.0, high=100e3)
-    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
+    radius: Any = parameter(
+        "m", "radius of the rod; required without a cross_section", low=1e-6, high=0.5, default=None
+    )
+    density: Any = parameter(
+        "kg/m3", "density of the rod, ribs spread over it included; required without a tabulated section",
+        low=1.0, high=100e3, default=None,
+    )  # fmt: skip
+    youngs_modulus: Any = parameter(
+        "Pa", "Young's modulus; required without a tabulated section", low=1e3, high=2e12, default=None
+    )
+    tip_radius: Any = parameter(
+        "m", "radius at the tip of a round rod that tapers linearly; by default the same as at the base",
+        low=1e-6, high=0.5, default=None,
+    )  # fmt: skip
     shear_modulus: Any = parameter(
         "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
     )
@@ -93,7 +107,10 @@ class SlenderRod(System):
         "N", "Kse; by default diag(GA, GA, EA)", shape="matrix", low=1e-9, high=1e15, default=None
     )
     bending_stiffness: Any = parameter(
-        "N m2", "Kbt; by default diag(EI, EI, 2GI)", shape="matrix", low=1e-15, high=1e9, default=None
+        "N m2", "Kbt; by default diag(EI, EI, GJ)", shape="matrix", low=1e-15, high=1e9, default=None
+    )
+    cross_section: CrossSection | None = slot(
+        "cross-section; none: solid and round, with the radius", CrossSection, default=None
     )
     sections: tuple[SectionChange, ...] = slot(
         "sections that differ from the rod", SectionChange, many=True, default=()
@@ -116,6 +133,22 @@ class SlenderRod(System):
     def __check_init__(self) -> None:
         if not self.base_end.anywhere:
             raise ParameterError(f"base_end is {self.base_end.kind}; that is allowed as tip_end only")
+        form = self.cross_section
+        material = form is None or form.is_homogeneous
+        for name in ("radius", "density", "youngs_modulus", "shear_modulus"):
+            applies, other = (
+                (form is None, "cross_section") if name == "radius" else (material, "tabulated cross_section")
+            )
+            value = getattr(self, name)
+            if value is None and applies and name != "shear_modulus":
+                raise ParameterError(f"{name} is missing; required is {name}, or a {other}")
+            if value is not None and not applies:
+                raise ParameterError(f"{name} and a {other} are given; allowed is one of them")
+        if self.tip_radius is not None and form is not None and not form.tapers:
+            raise ParameterError(
+                f"tip_radius is given with a {form.kind} cross_section; allowed is a round or hollow one. "
+                "Use sections with a stretch, such as {kind: stretch, radius: [1, -0.5]}"
+            )
 
     # parts
 
@@ -133,8 +166,14 @@ class SlenderRod(System):
             "section": self.sections, "obstacle": self.surroundings, "load": self.loads,
             "effect": self.effects,
         }  # fmt: skip
-        ends: dict[str, Contribution] = {"base": self.base_end, "tip": self.tip_end}
-        return ends | {f"{name}{k}": part for name, parts in lists.items() for k, part in enumerate(parts)}
+        present: dict[str, Contribution] = {"base": self.base_end, "tip": self.tip_end}
+        if self.cross_section is not None:
+            present["cross_section"] = self.cross_section
+        if self.tip_radius is not None:
+            present["taper"] = FunctionSection(
+                function=lambda part, _: Differences(1.0 + (self.tip_radius / self.section.radius - 1.0) * part)
+            )
+        return present | {f"{name}{k}": part for name, parts in lists.items() for k, part in enumerate(parts)}
 
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]
@@ -194,14 +233,29 @@ class SlenderRod(System):
     # derived quantities
 
     @property
-    def section(self) -> CircularSection:
-        """The rod's cross-section outside `sections`."""
-        return CircularSection(self.radius)
+    def section(self) -> Section:
+        """The rod's cross-section at the base, outside `sections`."""
+        return self.section_at(0.0)
+
+    def section_at(self, part: Any) -> Section:
+        """Return the cross-section at a fraction of the length, without its changes by `sections`."""
+        form = self.cross_section
+        return round_section(self, self.radius) if form is None else form.section(self, part)
+
+    @functools.cached_property
+    def changes(self) -> tuple[SectionChange, ...]:
+        """Changes of the cross-section along the rod: `sections`, and the taper."""
+        return tuple(part for part in self.parts.values() if isinstance(part, SectionChange))
+
+    @property
+    def is_uniform(self) -> bool:
+        """True if section and material are the same along the rod."""
+        return not self.changes and (self.cross_section is None or self.cross_section.is_uniform)
 
     @property
     def mass_per_length(self) -> Any:
-        """ρA (kg/m)."""
-        return self.density * self.section.area
+        """ρA (kg/m) at the base."""
+        return self.section.rhoA
 
     @property
     def G(self) -> Any:
@@ -210,19 +264,23 @@ class SlenderRod(System):
             return self.shear_modulus
         return self.youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
 
+    def Kse_at(self, part: Any) -> Float[Any, "3 3"]:
+        """Return the stiffness of shear and extension (N): the parameter, or by default the section's."""
+        return self.section_at(part).Kse if self.shear_stiffness is None else self.shear_stiffness
+
+    def Kbt_at(self, part: Any) -> Float[Any, "3 3"]:
+        """Return the stiffness of bending and twisting (N·m²): the parameter, or by default the section's."""
+        return self.section_at(part).Kbt if self.bending_stiffness is None else self.bending_stiffness
+
     @property
     def Kse(self) -> Float[Any, "3 3"]:
-        """Stiffness of shear and extension (N): the parameter, or by default from moduli and section."""
-        if self.shear_stiffness is not None:
-            return self.shear_stiffness
-        return self.section.shear_stiffness(self.youngs_modulus, self.G)
+        """Stiffness of shear and extension (N) at the base."""
+        return self.Kse_at(0.0)
 
     @property
     def Kbt(self) -> Float[Any, "3 3"]:
-        """Stiffness of bending and twisting (N·m²): the parameter, or by default from moduli and section."""
-        if self.bending_stiffness is not None:
-            return self.bending_stiffness
-        return self.section.bending_stiffness(self.youngs_modulus, self.G)
+        """Stiffness of bending and twisting (N·m²) at the base."""
+        return self.Kbt_at(0.0)
 
     @property
     def v_star(self) -> np.ndarray:
@@ -236,11 +294,13 @@ class SlenderRod(System):
 
     def material(self, s: Any, control: Any) -> Material:
         """Return section and material at arclength s (m)."""
+        part = s / self.length
+        section = self.section_at(part)
         plain = Material(
-            self.Kse, self.shear_damping, self.Kbt, self.bending_damping, self.u_star,
-            self.mass_per_length, self.density * self.section.inertia, self.radius,
+            self.Kse_at(part), self.shear_damping, self.Kbt_at(part), self.bending_damping, self.u_star,
+            section.rhoA, section.rhoJ, section.radius,
         )  # fmt: skip
-        if not self.sections:
+        if not self.changes:
             return plain
         radius, stiffness, curvature = self.differences(s, control)
         area = radius * radius
@@ -252,7 +312,7 @@ class SlenderRod(System):
 
     def differences(self, s: Any, control: Any) -> Differences:
         """Return the sections' changes at s (m)."""
-        return differences_at(self.sections, s / self.length, self.section_controls(control))
+        return differences_at(self.changes, s / self.length, self.section_controls(control))
 
     # the law of the strains
 
@@ -274,8 +334,9 @@ class SlenderRod(System):
 
     @property
     def bending_frequency(self) -> Any:
-        """First bending frequency (Hz) of the bare rod, clamped at the base, by beam theory."""
-        EI, mass = np.asarray(self.Kbt)[..., 0, 0], self.mass_per_length * self.length
+        """First bending frequency (Hz) of the bare uniform rod, clamped at the base, by beam theory."""
+        EI = np.linalg.eigvalsh(np.asarray(self.Kbt)[..., :2, :2])[..., 0]
+        mass = self.mass_per_length * self.length
         return FIRST_ROOT**2 / (2 * np.pi) * np.sqrt(EI / (mass * self.length**3))
 
     # the equations
@@ -507,9 +568,10 @@ class _RodObserved(Observed, of=SlenderRod):
         _, s, _, y, y_t, control, *_ = point
         layout, strains = self.system.y_layout, self.system.z_layout
         (q, w), (q_t, w_t) = ([layout.get(state, name) for name in ("q", "w")] for state in (y, y_t))
-        J = np.diag([1.0, 1.0, 2.0])
+        material = self.system.material(s, control)
+        J = material.rhoJ / material.rhoJ[0, 0]
         acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
-        bent = strains.get(point.z, "u") - self.system.material(s, control).u_star
+        bent = strains.get(point.z, "u") - material.u_star
         return jnp.concatenate([acceleration, spin, q, w, bent, strains.get(point.z_t, "u")])
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
@@ -530,15 +592,19 @@ class _RodObserved(Observed, of=SlenderRod):
         return rod.with_internal(jnp.concatenate([rod.v_star, u_star]))
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
-        """Return the sections' factors on stiffness and damping; None without sections."""
+        """Return stiffness and damping relative to the base's; None for a uniform rod."""
         rod = self.system
-        if not rod.sections:
+        if rod.is_uniform:
             return None
-        radius, stiffness, _ = rod.differences(s, control)
+        material, radius = rod.material(s, control), rod.differences(s, control).radius
         area = radius * radius
+        stiffness = [
+            jnp.sum(K * np.eye(3), axis=1) / jnp.sum(base * np.eye(3), axis=1)
+            for K, base in ((material.Kse, rod.Kse), (material.Kbt, rod.Kbt))
+        ]
         others = jnp.ones(rod.z_layout.size - 6)
-        damping = jnp.concatenate([jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area])
-        return jnp.concatenate([damping * stiffness, others]), jnp.concatenate([damping, others])
+        damping = [jnp.full(3, 1.0) * area, jnp.full(3, 1.0) * area * area]
+        return jnp.concatenate([*stiffness, others]), jnp.concatenate([*damping, others])
 
 
 def _joined(layout: Layout, *parts: tuple[Any, ...]) -> Layout:

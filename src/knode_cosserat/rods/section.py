@@ -1,8 +1,14 @@
-"""Cross-sections, with their stiffness and inertia."""
+"""Cross-sections, with their stiffness and inertia, and their changes along a rod.
+
+The stiffness of a section is Kse = diag(GA, GA, EA) and Kbt, which has E times the second moments of area about
+two axes, and G times the torsion constant J. J is the polar moment for round sections only (Saint-Venant
+1855). The inertia has ρ times the second moments, about the rod's axis their sum.
+"""
 
 from __future__ import annotations
 
 import abc
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,49 +20,271 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Pose
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, choice, parameter
-from knode_cosserat.rods.parts import Stretched
+from knode_cosserat.rods.parameters import ParameterError, choice, parameter, places
+from knode_cosserat.rods.parts import Part, Stretched
+from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, turned
 
 #: d₃: along the rod
 ALONG = np.array([0.0, 0.0, 1.0])
 #: diagonal matrices of the axes across and along the rod
 ACROSS, AXIAL = np.diag([1.0, 1.0, 0.0]), np.diag(ALONG)
+#: matrices of bending about x, about y, and of their coupling
+ABOUT_X, ABOUT_Y = np.diag([1.0, 0.0, 0.0]), np.diag([0.0, 1.0, 0.0])
+COUPLED = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 0.0]])
 #: equal steps for integrating the shape of a rod that is curved at rest; section edges split them further
 REST_STEPS = 50
 #: points are moved into an interval by this fraction of it, so that one-sided values are used at its ends
 INWARD = 1e-9
 #: the paper's G = E / (2 (1 + 0.3)), for a robot without a shear modulus
 POISSON_RATIO = 0.3
+#: sum of 1/n⁵ over odd n, with ζ(5)
+ODD_FIFTH_POWERS = 31.0 / 32.0 * 1.0369277551433699
 
 
-class CircularSection(NamedTuple):
-    """A solid round section of the given radius (m)."""
+def _angle() -> Any:
+    """Return a field for the direction of principal axes."""
+    return parameter("rad", "angle about the rod from x to its x axis", low=-10.0, high=10.0, default=0.0)
 
+
+def _tabulated(unit: str, meaning: str, low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
+    """Return a field for values along the rod."""
+    return parameter(unit, meaning, shape="list", low=low, high=high, default=default)
+
+
+class Section(NamedTuple):
+    """Stiffness and inertia of a cross-section at one place."""
+
+    #: stiffness of shear, and of extension (N)
+    GA: Any
+    EA: Any
+    #: bending stiffness about x and y, and their coupling (N·m²)
+    EI: tuple[Any, Any, Any]
+    #: torsional stiffness (N·m²)
+    GJ: Any
+    #: mass per length (kg/m)
+    rhoA: Any
+    #: inertia per length about x and y, and their coupling (kg·m)
+    rhoI: tuple[Any, Any, Any]
+    #: radius of the circle around it (m)
     radius: Any
 
     @property
-    def area(self) -> Any:
-        """Area, πr² (m²)."""
-        return np.pi * self.radius**2
+    def Kse(self) -> Float[Any, "3 3"]:
+        """Kse = diag(GA, GA, EA): shear and extension (N)."""
+        return self.GA * ACROSS + self.EA * AXIAL
 
     @property
-    def second_moment(self) -> Any:
-        """Second moment of area about a diameter, πr⁴/4 (m⁴)."""
-        return np.pi * self.radius**4 / 4.0
+    def Kbt(self) -> Float[Any, "3 3"]:
+        """Kbt: bending about two axes and twisting, diag(EI, EI, GJ) for a round section (N·m²)."""
+        return _tensor(self.EI, self.GJ)
 
     @property
-    def inertia(self) -> Float[Any, "3 3"]:
-        """J = diag(I, I, 2I): second moments about the material axes (m⁴)."""
-        return self.second_moment * np.diag([1.0, 1.0, 2.0])
+    def rhoJ(self) -> Float[Any, "3 3"]:
+        """Inertia per length about the material axes (kg·m)."""
+        return _tensor(self.rhoI, self.rhoI[0] + self.rhoI[1])
 
-    def shear_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
-        """Return Kse = diag(GA, GA, EA): shear and extension (N)."""
-        return self.area * (shear_modulus * ACROSS + youngs_modulus * AXIAL)
 
-    def bending_stiffness(self, youngs_modulus: Any, shear_modulus: Any) -> Float[Any, "3 3"]:
-        """Return Kbt = diag(EI, EI, 2GI): bending and twisting (N·m²)."""
-        return self.second_moment * (youngs_modulus * ACROSS + 2.0 * shear_modulus * AXIAL)
+def _tensor(across: tuple[Any, Any, Any], axial: Any) -> Float[Any, "3 3"]:
+    """Return a symmetric matrix from its entries xx, yy, xy and zz; the rod is along a principal axis."""
+    xx, yy, xy = across
+    return xx * ABOUT_X + yy * ABOUT_Y + xy * COUPLED + axial * AXIAL
+
+
+def homogeneous(rod: Any, area: Any, moments: tuple[Any, Any, Any], torsion: Any, radius: Any) -> Section:
+    """Return a section of the rod's material.
+
+    Args:
+        rod: the rod, with its moduli and density.
+        area: area (m²).
+        moments: second moments of area about x and y, and their coupling (m⁴).
+        torsion: torsion constant (m⁴).
+        radius: radius of the circle around it (m).
+    """
+    E, G, rho = rod.youngs_modulus, rod.G, rod.density
+    xx, yy, xy = moments
+    return Section(
+        G * area, E * area, (E * xx, E * yy, E * xy), G * torsion,
+        rho * area, (rho * xx, rho * yy, rho * xy), radius,
+    )  # fmt: skip
+
+
+def round_section(rod: Any, radius: Any, inner_radius: Any = 0.0) -> Section:
+    """Return a solid or hollow round section: A = π(r² - rᵢ²), I = π(r⁴ - rᵢ⁴)/4, J = 2I."""
+    I = np.pi * (radius**4 - inner_radius**4) / 4.0
+    return homogeneous(rod, np.pi * (radius**2 - inner_radius**2), (I, I, 0.0), 2.0 * I, radius)
+
+
+def turned_axes(about_x: Any, about_y: Any, angle: Any) -> tuple[Any, Any, Any]:
+    """Return the entries xx, yy, xy of a tensor with principal axes at an angle (rad) from x and y."""
+    c, s = jnp.cos(angle), jnp.sin(angle)
+    return (
+        c * c * about_x + s * s * about_y,
+        s * s * about_x + c * c * about_y,
+        c * s * (about_x - about_y),
+    )
+
+
+def rectangle_torsion(width: Any, height: Any) -> Any:
+    """Return the torsion constant of a rectangle (m⁴), by Saint-Venant's series (Timoshenko & Goodier 1951).
+
+    With the sides a ≥ b,
+
+        J = a b³ (1/3 - 64/π⁵ b/a Σ tanh(nπa/2b) / n⁵),    n = 1, 3, 5, …
+
+    The limit 1 of each tanh has a known sum, 31/32 ζ(5). The rest decays as exp(-nπa/b).
+    """
+    a, b = jnp.maximum(width, height), jnp.minimum(width, height)
+    n = np.arange(1.0, 12.0, 2.0)
+    rest = jnp.sum((1.0 - jnp.tanh(0.5 * np.pi * n * (a / b))) / n**5)
+    return a * b**3 * (1.0 / 3.0 - 64.0 / np.pi**5 * (b / a) * (ODD_FIFTH_POWERS - rest))
+
+
+class CrossSection(Part):
+    """A cross-section of a rod, in place of a solid round one of the rod's `radius`."""
+
+    #: True if it has the density and the moduli of the rod
+    is_homogeneous: ClassVar[bool] = True
+    #: True if the rod may have a `tip_radius`
+    tapers: ClassVar[bool] = False
+
+    @property
+    def is_uniform(self) -> bool:
+        """True if it is the same along the rod."""
+        return True
+
+    @abc.abstractmethod
+    def section(self, rod: Any, part: Any) -> Section:
+        """Return stiffness and inertia at a fraction of the length."""
+
+
+class HollowSection(CrossSection):
+    """A tube."""
+
+    kind: ClassVar[str] = "hollow"
+    tapers: ClassVar[bool] = True
+
+    radius: Any = parameter("m", "outer radius", low=1e-6, high=0.5)
+    inner_radius: Any = parameter("m", "inner radius, less than the outer one", low=0.0, high=0.5)
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        if not is_traced(self) and not np.all(np.less(self.inner_radius, self.radius)):
+            raise ParameterError(
+                f"HollowSection: inner_radius is {self.inner_radius:g}; allowed is less than radius, "
+                f"{self.radius:g}"
+            )
+
+    def section(self, rod: Any, part: Any) -> Section:
+        """Return the section of a tube."""
+        return round_section(rod, self.radius, self.inner_radius)
+
+
+class EllipticSection(CrossSection):
+    """A solid ellipse: I = πab³/4 about the semi-axis a, J = πa³b³/(a² + b²)."""
+
+    kind: ClassVar[str] = "elliptic"
+
+    semi_axis_x: Any = parameter("m", "semi-axis along x", low=1e-6, high=0.5)
+    semi_axis_y: Any = parameter("m", "semi-axis along y", low=1e-6, high=0.5)
+    angle: Any = _angle()
+
+    def section(self, rod: Any, part: Any) -> Section:
+        """Return the section of an ellipse."""
+        a, b = self.semi_axis_x, self.semi_axis_y
+        area = np.pi * a * b
+        moments = turned_axes(area * b**2 / 4.0, area * a**2 / 4.0, self.angle)
+        torsion = area * a**2 * b**2 / (a**2 + b**2)
+        return homogeneous(rod, area, moments, torsion, jnp.maximum(a, b))
+
+
+class RectangularSection(CrossSection):
+    """A solid rectangle: I = bh³/12, and the torsion constant of Saint-Venant."""
+
+    kind: ClassVar[str] = "rectangular"
+
+    width: Any = parameter("m", "side along x", low=1e-6, high=1.0)
+    height: Any = parameter("m", "side along y", low=1e-6, high=1.0)
+    angle: Any = _angle()
+
+    def section(self, rod: Any, part: Any) -> Section:
+        """Return the section of a rectangle."""
+        w, h = self.width, self.height
+        moments = turned_axes(w * h**3 / 12.0, h * w**3 / 12.0, self.angle)
+        return homogeneous(rod, w * h, moments, rectangle_torsion(w, h), 0.5 * jnp.sqrt(w * w + h * h))
+
+
+class TabulatedSection(CrossSection):
+    """Measured stiffness and mass per length, with linear interpolation along the rod.
+
+    Each list has one value for each place in `at`, or one value for the whole rod. A homogeneous section
+    with the same E I and E A gives the inertia about the axes, ρI = ρA EI/EA.
+    """
+
+    kind: ClassVar[str] = "tabulated"
+    is_homogeneous: ClassVar[bool] = False
+
+    bending_stiffness: Any = _tabulated("N m2", "E I about x", 1e-15, 1e9)
+    torsional_stiffness: Any = _tabulated("N m2", "G J", 1e-15, 1e9)
+    axial_stiffness: Any = _tabulated("N", "E A", 1e-9, 1e15)
+    mass_per_length: Any = _tabulated("kg/m", "mass per length", 1e-9, 1e6)
+    at: tuple[float, ...] | None = places("where the values are, in order")
+    bending_stiffness_y: Any = _tabulated("N m2", "E I about y; by default as about x", 1e-15, 1e9, None)
+    shear_stiffness: Any = _tabulated("N", "G A; by default E A / 2.6", 1e-9, 1e15, None)
+    angle: Any = _angle()
+    radius: Any = parameter(
+        "m", "outer radius, for contact and drawings; by default of a round section with its E I and E A",
+        low=1e-6, high=0.5, default=None,
+    )  # fmt: skip
+
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        at = self.at or (0.0,)
+        if not all(np.diff(at) > 0.0):
+            raise ParameterError(f"TabulatedSection: at is {list(at)}; allowed is places in order")
+        for name, stated in self.parameters().items():
+            count = 1 if stated.shape != "list" or name == "at" else np.size(getattr(self, name))
+            if count not in (1, len(at)):
+                raise ParameterError(
+                    f"TabulatedSection: {name} has {count} values; allowed is 1, or one for each of the "
+                    f"{len(at)} places in at"
+                )
+
+    @property
+    def is_uniform(self) -> bool:
+        """True if there is one place only."""
+        return len(self.at or ()) < 2
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Kinks of the interpolation."""
+        return tuple(place for place in self.at or () if 0.0 < place < 1.0)
+
+    def _value(self, values: Any, part: Any) -> Any:
+        """Return the linear interpolation at a fraction of the length, constant beyond the table."""
+        if np.shape(values)[-1] == 1:
+            return values[..., 0]
+        at = np.array(self.at)
+        rises = jnp.diff(values) * jnp.clip((part - at[:-1]) / np.diff(at), 0.0, 1.0)
+        return values[..., 0] + jnp.sum(rises, axis=-1)
+
+    def section(self, rod: Any, part: Any) -> Section:
+        """Return the table's values at a fraction of the length."""
+        about_x, GJ, EA, rhoA = (
+            self._value(values, part)
+            for values in (
+                self.bending_stiffness, self.torsional_stiffness, self.axial_stiffness, self.mass_per_length
+            )
+        )  # fmt: skip
+        about_y = about_x if self.bending_stiffness_y is None else self._value(self.bending_stiffness_y, part)
+        GA = EA / (2.0 * (1.0 + POISSON_RATIO))
+        if self.shear_stiffness is not None:
+            GA = self._value(self.shear_stiffness, part)
+        EI = turned_axes(about_x, about_y, self.angle)
+        xx, yy, xy = EI
+        per_area = rhoA / EA
+        radius = 2.0 * jnp.sqrt(jnp.maximum(about_x, about_y) / EA) if self.radius is None else self.radius
+        return Section(GA, EA, EI, GJ, rhoA, (per_area * xx, per_area * yy, per_area * xy), radius)
 
 
 class Material(NamedTuple):

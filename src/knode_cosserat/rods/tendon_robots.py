@@ -287,11 +287,6 @@ class VirtualRobot(TendonRod):
         """Controls of the tendons."""
         return _VirtualTendons(self.tendon_count)
 
-    def stiffness(self, s: Any) -> Float[Any, "3 3"]:
-        """Return Kbt at s (N·m²), increased within the sleeve."""
-        inside = jnp.exp(-((s / self.sleeve_length) ** 2))
-        return self.Kbt * (1.0 + (self.sleeve_factor - 1.0) * inside)
-
     def tendon_moment(self, s: Any, control: Any, u: Any, u_t: Float[Any, "3"]) -> Float[Any, "3"]:
         """Return Σ T_i r_i × d₃ (N·m) at s, material frame, at the rate of curvature u_t."""
         x, y = jnp.cos(self.tendon_angles), jnp.sin(self.tendon_angles)
@@ -305,6 +300,9 @@ class VirtualRobot(TendonRod):
         n, m = self.stresses(y)
         pulled = n - jnp.sum(jnp.asarray(control)) * np.array([0.0, 0.0, 1.0])
         moment = jax.tree_util.Partial(VirtualRobot.tendon_moment, self, s, jnp.asarray(control))
-        v = Viscoelastic(self.Kse, self.shear_damping, pulled + self.Kse @ self.v_star)
-        u = Viscoelastic(self.stiffness(s), self.bending_damping, m, moment=moment)
-        return MaterialLaw({"v": v, "u": u})
+        material = self.material(s, control)
+        inside = jnp.exp(-((s / self.sleeve_length) ** 2))
+        Kbt = material.Kbt * (1.0 + (self.sleeve_factor - 1.0) * inside)
+        bent = m if not self.sections else m + dot(Kbt, material.u_star)
+        v = Viscoelastic(material.Kse, material.Bse, pulled + material.Kse @ self.v_star)
+        return MaterialLaw({"v": v, "u": Viscoelastic(Kbt, material.Bbt, bent, moment=moment)})

@@ -50,6 +50,7 @@ from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, parameter, place, places
 from knode_cosserat.rods.parts import Contribution, Effect, Part, RodPoint
 from knode_cosserat.rods.routing import path_lengths
+from knode_cosserat.rods.section import ABOUT_X, ABOUT_Y, ACROSS, COUPLED
 from knode_cosserat.rods.tendon_law import Tendons, stretches
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot
@@ -540,15 +541,20 @@ class RibSpacing(Part):
         return self.at or ()
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
-        """Return the law with the loss of bending stiffness.
+        """Return the law with the loss of bending stiffness, about each principal axis its own.
 
         Tendons press on the bent rod, including its curvature at rest.
         """
         Kbt, length = law.strains["u"].softened, point.rod.length
-        stiffness = 0.5 * (Kbt[0, 0] + Kbt[1, 1])
+        mean, half = 0.5 * (Kbt[0, 0] + Kbt[1, 1]), 0.5 * (Kbt[0, 0] - Kbt[1, 1])
+        # apart by more than rounding, for the derivative of equal ones
+        apart = jnp.sqrt(half**2 + Kbt[0, 1] ** 2 + (1e-8 * mean) ** 2)
+        principal = mean + apart * np.array([1.0, -1.0])
         softening = self.softening + self.softening_at(point.s / length) * length**2
-        lost = 1.0 - pressed(3.0 * softening * jnp.sum(tension(point)) / stiffness)
-        return law.with_strain("u", law.strains["u"].soften(lost * stiffness * np.diag([1.0, 1.0, 0.0])))
+        lost = principal * (1.0 - pressed(3.0 * softening * jnp.sum(tension(point)) / principal))
+        away = half * (ABOUT_X - ABOUT_Y) + Kbt[0, 1] * COUPLED
+        loss = 0.5 * jnp.sum(lost) * ACROSS + 0.5 * (lost[0] - lost[1]) / apart * away
+        return law.with_strain("u", law.strains["u"].soften(loss))
 
 
 def pressed(w: Any) -> Any:

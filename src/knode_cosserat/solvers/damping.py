@@ -69,7 +69,8 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
             if not getattr(strand, "is_undamped", False):
                 continue
             frequency = float(np.min(strand.bending_frequency))
-            stiffness = float(np.max(np.asarray(strand.Kbt)[..., 0, 0]))
+            bending = np.asarray(strand.Kbt)[..., :2, :2]
+            stiffness = float(np.max(np.linalg.eigvalsh(bending)[..., 0]))
         damping = LOSS_FACTOR * stiffness / (2.0 * np.pi * frequency)
         warnings.warn(
             "bending_damping is 0 and nothing else damps the motion: vibrations do not decay, and "

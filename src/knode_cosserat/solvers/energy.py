@@ -90,7 +90,7 @@ class RodEnergy:
         middle = (points[1:] + points[:-1]) / 2.0
         known = np.arange(segments + 1.0)
 
-        if rod.sections:
+        if not rod.is_uniform:
             own = materials(rod, middle * self.length / segments, np.asarray(control))
             self.Kse, self.Kbt, self.u_star = (np.asarray(x) for x in (own.Kse, own.Kbt, own.u_star))
         else:
@@ -204,7 +204,7 @@ class RodEnergy:
         p_s, n, m, _ = self.stress
         along, size = np.sum(n * p_s, axis=1), np.linalg.norm(n, axis=1)
         P = np.max(np.maximum(-along, (size * np.linalg.norm(p_s, axis=1) - along) / 2.0))
-        every = slice(None) if self.rod.sections else slice(1)
+        every = slice(1) if self.rod.is_uniform else slice(None)
         P += np.max(size) ** 2 / np.min(np.linalg.eigvalsh(self.Kse[every]))
         K = np.min(np.linalg.eigvalsh(self.Kbt[every]))
         c = self.length / np.pi * (1.0 if all(free) else 2.0)

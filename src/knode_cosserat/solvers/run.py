@@ -180,8 +180,8 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
         return
     ny, nz = system.y_layout.size, system.z_layout.size
     z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
-    radius = np.asarray(strand.radius)[..., None]
-    if strand.sections:
+    radius = np.asarray(strand.section.radius)[..., None]
+    if not strand.is_uniform:
         still = np.zeros(system.control_layout.size)
         # on the far side of the ends of sections, inside the rod, as z
         s = (np.arange(system.nodes) + 0.2 * INWARD) / (system.nodes - 1)

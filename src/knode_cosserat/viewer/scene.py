@@ -20,7 +20,8 @@ import numpy as np
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.loads import AttachedMass
-from knode_cosserat.rods.strands import strand_count
+from knode_cosserat.rods.rod import SlenderRod
+from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
@@ -252,13 +253,11 @@ def _short(values: Any) -> Any:
 
 
 def _radii(robot: Any, s: np.ndarray) -> np.ndarray:
-    radius = getattr(robot, "radius", None)
-    if radius is None or np.ndim(radius):
-        return np.full(len(s), SLIM * float(robot.length))
-    if getattr(robot, "sections", ()):
-        none = np.zeros(robot.control_layout.size)
-        return np.asarray(jax.vmap(lambda at: robot.material(at, none).radius + 0.0 * at)(s))
-    return np.full(len(s), float(radius))
+    strand = strand_of(robot)
+    if not isinstance(strand, SlenderRod):
+        return np.full(len(s), float(getattr(robot, "radius", SLIM * float(robot.length))))
+    none = np.zeros(robot.control_layout.size)
+    return np.asarray(jax.vmap(lambda at: strand.material(at, none).radius + 0.0 * at)(s))
 
 
 def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | None:
