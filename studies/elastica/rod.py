@@ -192,7 +192,10 @@ def _check(robot: Any) -> None:
     if not isinstance(robot, TendonRod):
         raise ParameterError(f"robot is a {type(robot).__name__}; allowed is a robot with tendons")
     parts: dict[str, Any] = {"sections": robot.sections, "surroundings": robot.surroundings}
-    parts |= {name: getattr(robot, name, None) for name in ("cross_section", "tip_radius", "routing", "tendon_twist", "reels")}
+    parts |= {
+        name: getattr(robot, name, None)
+        for name in ("cross_section", "tip_radius", "routing", "tendon_twist", "reels")
+    }
     for name, part in parts.items():
         if part is not None and part != ():
             raise ParameterError(f"robot has {name}; the stand-in is a uniform rod with straight tendons")

@@ -49,7 +49,9 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     L = float(nominal.length)
     if nominal.youngs_modulus is None:
         modulus = Number("cross_section.stiffness", "", 1.0, 0.5, 1e-3, 1e3, True)
-        stiffness = Effect("stiffness", "factor of the table's stiffness", (modulus,), _with_table, basic=True)
+        stiffness = Effect(
+            "stiffness", "factor of the table's stiffness", (modulus,), _with_table, basic=True
+        )
     else:
         modulus = Number("youngs_modulus", "Pa", float(nominal.youngs_modulus), 0.5, 1e3, 2e12, True)
         stiffness = Effect(
@@ -200,7 +202,13 @@ def _with_sleeve(robot: Any, values: list[Any]) -> Any:
 
 
 def _with_table(robot: Any, values: list[Any]) -> Any:
-    names = ("bending_stiffness", "bending_stiffness_y", "torsional_stiffness", "axial_stiffness", "shear_stiffness")
+    names = (
+        "bending_stiffness",
+        "bending_stiffness_y",
+        "torsional_stiffness",
+        "axial_stiffness",
+        "shear_stiffness",
+    )
     table = {name: getattr(robot.cross_section, name) for name in names}
     scaled = {f"cross_section.{name}": one * values[0] for name, one in table.items() if one is not None}
     return robot.replace(**scaled)
