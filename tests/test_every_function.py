@@ -15,6 +15,7 @@ from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, Residual, network
 from knode_cosserat.learning.structured.residual import CURVED, LINEAR, Structured, expansion
+from knode_cosserat.rods.parameters import value_at
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
 from knode_cosserat.solvers import semi_discrete
@@ -118,7 +119,7 @@ def made(kind: str) -> Made:
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
-    return "bending" if robot.control_layout.size == 2 else "youngs_modulus"
+    return {2: "bending", 3: "effects.0.offset"}.get(robot.control_layout.size, "youngs_modulus")
 
 
 def fitted(robot: kc.System, it: Made, config: kc.FitConfig) -> Any:
@@ -167,13 +168,14 @@ def identified(robot: kc.System, it: Made, measured: bool) -> Any:
     name = name_of_a_parameter(robot)
     data: Any = it.motion
     if measured:  # they begin unloaded
-        data = kc.recordings.Measurements.of(kc.simulate(robot, it.controls, DT), (0.5, 1.0))
+        data = kc.recordings.Measurements.of(
+            kc.simulate(robot, it.controls, DT, space="lobatto4"), (0.5, 1.0)
+        )
     found = kc.identify(robot, [data], parameters=[name])
     assert type(found.robot) is type(robot)
-    np.testing.assert_allclose(
-        getattr(nominal_model(found.robot), name), getattr(nominal_model(robot), name), rtol=1e-3
-    )
-    return getattr(nominal_model(found.robot), name)
+    value, true = (value_at(nominal_model(one), name) for one in (found.robot, robot))
+    np.testing.assert_allclose(value, true, rtol=1e-3)
+    return value
 
 
 def predicted(robot: kc.System, it: Made) -> Any:
@@ -269,7 +271,8 @@ def test_files_figures_and_the_viewer_take_every_robot(kind, tmp_path):
     kc.viewer.export_scene(trajectory, tmp_path / "a.html")
     assert drawing.drawing(robot, np.arange(robot.nodes))["model"] is isinstance(robot, kc.KNODE)
     assert len(drawing.sliders(robot)) == robot.control_layout.size
-    assert kc.controls.parse("constant:1.0", 3, DT, robot).shape == (3, robot.control_layout.size)
+    text = ";".join(f"{name}=constant:1.0" for name in kc.controls.labels(robot.control_layout))
+    assert kc.controls.parse(text, 3, DT, robot).shape == (3, robot.control_layout.size)
 
 
 def same(found: kc.System, expected: kc.System) -> None:
