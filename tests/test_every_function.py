@@ -90,9 +90,13 @@ ROBOTS = {
     "robot": ROBOT, "model": MODEL, "model of a model": with_network(MODEL, 1), "own": CANE,
     "model of own": with_network(CANE, 2),
     "arm": kc.load_robot("three-chamber-arm").replace(nodes=5),
+    "tubes": kc.load_robot("three-tube-robot").replace(nodes=13),
 }  # fmt: skip
 #: means of the controls of robots whose controls are not the paper's four tensions
-MEANS = {"own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4]}
+MEANS = {
+    "own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4],
+    "tubes": [1.0, 0.02, -0.5, 0.01, 0.3, 0.02],
+}  # fmt: skip
 
 
 class Made(NamedTuple):
@@ -119,7 +123,7 @@ def made(kind: str) -> Made:
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
-    return {2: "bending", 3: "effects.0.offset"}.get(robot.control_layout.size, "youngs_modulus")
+    return {2: "bending", 3: "effects.0.offset", 6: "tubes.1.curvature"}.get(robot.control_layout.size, "youngs_modulus")
 
 
 def fitted(robot: kc.System, it: Made, config: kc.FitConfig) -> Any:
