@@ -33,7 +33,9 @@ def main(out: str = "syringe_or_regulator.png", points: int = 49, payload: float
     moved = {}
     for name, robot in drives.items():
         pulled = kc.solvers.equilibria(robot.replace(loads=(weight,)), controls[name])
-        axes.plot(*(1e3 * pulled.tip_position[:, :2].T), "--", label=f"{name}, {1e3 * payload:g} g pull along y")
+        axes.plot(
+            *(1e3 * pulled.tip_position[:, :2].T), "--", label=f"{name}, {1e3 * payload:g} g pull along y"
+        )
         moved[name] = float(np.mean(np.linalg.norm(pulled.tip_position - turn.tip_position, axis=1)))
         print(f"{name}: the payload moves the tip by {1e3 * moved[name]:.1f} mm")
     axes.set(xlabel="x at the tip (mm)", ylabel="y at the tip (mm)", aspect="equal")

@@ -266,3 +266,9 @@ def test_design_pareto(run):
 def test_syringe_or_regulator(run):
     moved = run("syringe_or_regulator", points=7)
     assert 0.01 < moved["syringes"] < 0.7 * moved["regulators"]
+
+
+@CAMPAIGN
+def test_concentric_tubes(run):
+    jumps = run("concentric_tubes", steps=120)
+    assert jumps[0.7] < 30.0 < 90.0 < jumps[1.6]

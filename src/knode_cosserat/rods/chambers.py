@@ -64,9 +64,7 @@ class Chambers(Stretched, Effect):
         "control: pressure (Pa), or volume that a pump delivers (m3), of a liquid or of a gas",
         ("pressure", "liquid", "gas"), "pressure",
     )  # fmt: skip
-    lowest: Any = parameter(
-        "Pa", "lowest pressure that a control may have", low=-1e9, high=0.0, default=None
-    )
+    lowest: Any = parameter("Pa", "lowest pressure that a control may have", low=-1e9, high=0.0, default=None)
     highest: Any = parameter(
         "Pa", "highest pressure that a control may have", low=0.0, high=1e9, default=None
     )

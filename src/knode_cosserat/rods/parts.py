@@ -97,6 +97,10 @@ class Contribution:
         """Return the names of the fields of y that are unknown at the base; the part's others are zero."""
         return ()
 
+    def base_y(self, point: RodPoint) -> Fields:
+        """Return the part's fields of y at the base that follow from the unknowns there, in `point.y`."""
+        return {}
+
     def tip_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
         """Return the fields of the part's conditions at the tip."""
         return ()

@@ -43,6 +43,7 @@ from knode_cosserat.rods.parameters import (
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES, System, is_traced
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot, VirtualRobot
+from knode_cosserat.rods.tubes import ConcentricTubeRobot
 
 #: formats of files. The first had numbers only; a robot without choices and parts is still written in it
 FORMATS = (1, 2)
@@ -58,6 +59,7 @@ KINDS: dict[str, type[System]] = {
     "slender-rod": SlenderRod,
     "virtual-robot": VirtualRobot,
     "parallel-robot": ParallelRobot,
+    "concentric-tube-robot": ConcentricTubeRobot,
 }
 
 #: distance (m) of the tendons from the axis of the paper's robot

@@ -466,7 +466,11 @@ class SlenderRod(System):
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
         held = self.base_end.pose(AT_ORIGIN, self.end_controls(control)[0])
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
-        return self.y_layout.replaced(y, self.base_unknowns, unknowns)
+        y = self.y_layout.replaced(y, self.base_unknowns, unknowns)
+        for part, point in self.at_parts(RodPoint(self, 0.0, t, y, None, control)):
+            for name, value in part.base_y(point).items():
+                y = self.y_layout.replaced(y, (name,), value)
+        return y
 
     def pose(self, y: Any) -> Pose:
         """Return the pose in a packed y."""
@@ -505,7 +509,7 @@ class SlenderRod(System):
         return Scales(of(self.y_layout), of(Ends.of(self).layout))
 
 
-class _RodEnds(Ends, of=SlenderRod):
+class RodEnds(Ends, of=SlenderRod):
     """Ends of a rod, and the conditions of its parts."""
 
     system: SlenderRod

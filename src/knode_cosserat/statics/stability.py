@@ -7,7 +7,8 @@ of negative eigenvalues is constant. Buckling between two nodes is counted too.
 
 Loads that follow the rod may have no potential. The stiffness is then unsymmetric on any grid, and its
 eigenvalues decide nothing: Beck's column flutters at 20.05 EI/L² and has no other critical load. The
-eigenvalues of its linearised motion decide (`dynamics`), with the robot's own damping.
+eigenvalues of its linearised motion decide (`dynamics`), with the robot's own damping. They also decide for
+robots with further unknowns than forces and moments, such as tensions of reels, or torsions of tubes.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ class Stability(NamedTuple):
     #: 16 parts), or for loads without a potential growing modes
     unstable_directions: int
     #: the smallest eigenvalue of the stiffness's symmetric part, in natural units (EI/L): with a potential it
-    #: is zero at the onset of buckling or snapping
+    #: is zero at the onset of buckling or snapping; NaN for a robot with further unknowns, such as reels
     least: float
     #: (nodes, 3): displacement of the line in the direction of the smallest eigenvalue, or in the fastest
     #: growing mode, with maximum 1; for several rods (nodes, rods, 3)
@@ -129,7 +130,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
 
     Raises:
         ValueError: the row is no equilibrium; the system is not made of rods with positions and orientations;
-            or its y has further energetic variables (such as tendons on reels).
+            or it has further unknowns, and its motions are not resolved.
     """
     system, y, z, control = checked_equilibrium(equilibrium, row)
     space = (equilibrium.settings or Settings()).space
@@ -149,6 +150,8 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     y, layout = y.copy(), strand_of(system).y_layout
     for name in set(Observed.of(strand_of(system)).velocities) & set(layout.names):
         in_strands(system, y)[..., layout.slice(name)] = 0.0
+    if set(strand_of(system).base_unknowns) - set(NEEDED):
+        return _by_motion(system, y, control)
     by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * strand_count(system) <= POINTS]
     return _decided(system, y, control, by)
 
@@ -265,20 +268,26 @@ class _Variation:
     def by_motion(self, system: System, y: np.ndarray, control: np.ndarray) -> Stability:
         """Return the stability of a robot whose loads have no potential."""
         try:
-            modes = linearised_modes(system, y, control)
+            found = _by_motion(system, y, control)
         except ValueError as error:
             return self.by_energy(system, -1, reason=f"loads without a potential; {error}")
-        first, growing, doubtful = modes.values[0], modes.growing, modes.undecided
-        directions, reason = int(np.sum(growing)), ""
-        if not directions and np.any(doubtful):
-            directions, first = -1, modes.values[doubtful][0]
-            reason = (
-                f"loads without a potential; a mode's growth rate of {first.real:.2g} 1/s is uncertain by "
-                f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
-            )
-        moves = displacements(system, modes.motions[0])
-        least = float(self.spectrum[0][0])
-        return Stability(directions, least, normalised(moves), self.asymmetry, complex(first), reason)
+        reason = found.reason and f"loads without a potential; {found.reason}"
+        return found._replace(least=float(self.spectrum[0][0]), asymmetry=self.asymmetry, reason=reason)
+
+
+def _by_motion(system: System, y: np.ndarray, control: np.ndarray) -> Stability:
+    """Return the stability by growth rates, without the energy's `least` and `asymmetry`."""
+    modes = linearised_modes(system, y, control)
+    first, growing, doubtful = modes.values[0], modes.growing, modes.undecided
+    directions, reason = int(np.sum(growing)), ""
+    if not directions and np.any(doubtful):
+        directions, first = -1, modes.values[doubtful][0]
+        reason = (
+            f"a mode's growth rate of {first.real:.2g} 1/s is uncertain by "
+            f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
+        )
+    moves = normalised(displacements(system, modes.motions[0]))
+    return Stability(directions, np.nan, moves, np.nan, complex(first), reason)
 
 
 def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:

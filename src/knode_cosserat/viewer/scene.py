@@ -346,7 +346,9 @@ def _range(system: System, field: Field) -> tuple[float, float, float]:
     robot = physics_of(system)
     length = float(robot.length)
     for part in getattr(robot, "parts", {}).values():
-        usual = [part.usual_control(robot, one) for one in part.control_fields if field.name.endswith(one.name)]
+        usual = [
+            part.usual_control(robot, one) for one in part.control_fields if field.name.endswith(one.name)
+        ]
         if usual and usual[0] is not None:
             return 0.0, min(_nice(usual[0]), field.high), 0.0
     if field.name == "tension" and hasattr(robot, "routes_at"):

@@ -1,0 +1,296 @@
+"""Robots of concentric tubes: precurved tubes in one another, which are turned and pushed at their bases.
+
+Tubes share their centreline and turn freely about it; clearance and friction are neglected (Dupont, Lock,
+Itkowitz & Butler 2010; Rucker, Jones & Webster 2010). In a frame that does not twist (u_z = 0), tube i has
+the angle θᵢ and the curvature κᵢ at rest, in the direction of θᵢ. With its stiffnesses EIᵢ, GJᵢ and torsion
+τᵢ,
+
+    Rᵀm = Σ EIᵢ (u - κᵢ) + τᵢ d₃,      θᵢ_s = τᵢ/GJᵢ,      τᵢ_s = EIᵢ d₃·(u × κᵢ) + torque of friction
+
+over the tubes that are present. τ₁ follows from Rᵀm. Each τᵢ is zero where its tube ends. Behind the plate
+the tubes are straight over the length dᵢ, so that θᵢ = αᵢ + dᵢ τᵢ/GJᵢ at the plate, with the rotation αᵢ.
+Neighbours resist relative rotation by a viscous torque: a snap is then a fast motion.
+
+Insertion. A tube ends, and begins to be curved, at lengths βᵢ and βᵢ - cᵢ that the controls move. In order,
+these lengths are the bounds of 2n intervals, each of which takes 1/2n of the grid, whatever its length is.
+The balance is multiplied by the rate of arclength along the grid. Inertia by the speed of insertion is
+neglected.
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.law import Fields, MaterialLaw
+from knode_cosserat.rods.layout import Field
+from knode_cosserat.rods.parameters import ParameterError, parameter, place, slot
+from knode_cosserat.rods.parts import Part, RodPoint
+from knode_cosserat.rods.rod import RodEnds, SlenderRod
+from knode_cosserat.rods.section import POISSON_RATIO, CrossSection, Material, Section
+from knode_cosserat.rotation import dot, rotation_matrix
+
+
+class Tube(Part):
+    """A tube: straight, and then curved over its last part, or curved all along."""
+
+    kind: ClassVar[str] = "tube"
+
+    radius: Any = parameter("m", "outer radius", low=1e-6, high=0.5)
+    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
+    density: Any = parameter("kg/m3", "density", low=1.0, high=100e3)
+    inner_radius: Any = parameter("m", "inner radius", low=0.0, high=0.5, default=0.0)
+    curvature: Any = parameter(
+        "1/m", "κ, curvature at rest of its last part", low=-1e3, high=1e3, default=0.0
+    )
+    curved: Any = parameter(
+        "m", "c, length of the curved part; by default all of the tube", low=0.0, high=20.0, default=None
+    )
+    transmission: Any = parameter(
+        "m", "d, length behind the plate without insertion; the tube cannot be inserted by more", low=0.0,
+        high=20.0, default=0.0,
+    )  # fmt: skip
+    shear_modulus: Any = parameter(
+        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
+    )
+    end: float = place("where it ends without insertion", low=1e-3, default=1.0, kw_only=True)
+
+
+class _Tubes(CrossSection):
+    """All tubes of a robot, as its cross-section and actuators."""
+
+    is_homogeneous: ClassVar[bool] = False
+    actuates: ClassVar[bool] = True
+    is_uniform: ClassVar[bool] = False
+
+    tubes: tuple[Tube, ...]
+    friction: Any
+    length: Any
+
+    def values(self, name: str) -> Float[Any, " n"]:
+        """Return a parameter of each tube."""
+        return jnp.stack([jnp.asarray(getattr(tube, name), dtype=float) for tube in self.tubes])
+
+    @property
+    def shear_moduli(self) -> Float[Any, " n"]:
+        """G of each tube (Pa)."""
+        return jnp.stack([
+            jnp.asarray(tube.youngs_modulus / (2.0 + 2.0 * POISSON_RATIO) if tube.shear_modulus is None
+                        else tube.shear_modulus)
+            for tube in self.tubes
+        ])  # fmt: skip
+
+    @property
+    def area(self) -> Float[Any, " n"]:
+        """Area of each tube (m²)."""
+        return np.pi * (self.values("radius") ** 2 - self.values("inner_radius") ** 2)
+
+    @property
+    def moment(self) -> Float[Any, " n"]:
+        """Second moment of area of each tube (m⁴)."""
+        return np.pi / 4.0 * (self.values("radius") ** 4 - self.values("inner_radius") ** 4)
+
+    @property
+    def EI(self) -> Float[Any, " n"]:
+        """Bending stiffness of each tube (N·m²)."""
+        return self.values("youngs_modulus") * self.moment
+
+    @property
+    def GJ(self) -> Float[Any, " n"]:
+        """Torsional stiffness of each tube (N·m²)."""
+        return 2.0 * self.shear_moduli * self.moment
+
+    @property
+    def control_fields(self) -> tuple[Field, ...]:
+        """Rotation and insertion of each tube."""
+        fields = []
+        for k, tube in enumerate(self.tubes, 1):
+            fields.append(Field(f"rotation_{k}", 1, "rad", f"rotation of tube {k} at its base"))
+            field = Field(f"insertion_{k}", 1, "m", f"displacement of tube {k} along the rod, at its base")
+            # limits of a batch, or of a traced robot, are not checked
+            ends = self.length, tube.transmission
+            if not any(isinstance(end, jax.core.Tracer) or np.ndim(end) for end in ends):
+                field = field._replace(low=-tube.end * float(self.length), high=float(tube.transmission))
+            fields.append(field)
+        return tuple(fields)
+
+    @property
+    def cuts(self) -> tuple[float, ...]:
+        """Bounds of the intervals."""
+        count = len(self.tubes) + sum(tube.curved is not None for tube in self.tubes)
+        return tuple(k / count for k in range(1, count))
+
+    # the grid
+
+    def lengths(self, rod: Any, input: Any) -> tuple[list[Any], list[Any]]:
+        """Return the arclengths (m) beyond the plate at which each tube begins to be curved, and ends."""
+        ends = [tube.end * rod.length + input[2 * k + 1] for k, tube in enumerate(self.tubes)]
+        return [
+            None if tube.curved is None else jnp.maximum(end - tube.curved, 0.0)
+            for tube, end in zip(self.tubes, ends, strict=True)
+        ], ends
+
+    def arclength(self, rod: Any, s: Any, input: Any) -> tuple[Any, Any]:
+        """Return the arclength (m) beyond the plate at s on the grid, and its rate along the grid."""
+        curved, ends = self.lengths(rod, input)
+        bounds = [bound for bound in (*curved, *ends) if bound is not None]
+        # odd-even transposition sort: the engine has no sort
+        for turn in range(len(bounds)):
+            for k in range(turn % 2, len(bounds) - 1, 2):
+                low, high = bounds[k], bounds[k + 1]
+                bounds[k], bounds[k + 1] = jnp.minimum(low, high), jnp.maximum(low, high)
+        widths = jnp.diff(jnp.stack(bounds), prepend=0.0)
+        at = s / rod.length * len(bounds)
+        first = np.arange(len(bounds))
+        inside = jnp.where((at >= first) & (at < first + 1), 1.0, 0.0)
+        # the tip belongs to the last interval
+        inside = jnp.where((first == len(bounds) - 1) & (at >= len(bounds)), 1.0, inside)
+        passed = jnp.clip(at - first, 0.0, 1.0)
+        return jnp.sum(passed * widths), jnp.sum(inside * widths) * len(bounds) / rod.length
+
+    def present(self, rod: Any, s: Any, input: Any) -> tuple[Float[Any, " n"], Float[Any, " n"]]:
+        """Return 1 for each tube that is present at s on the grid, and its curvature at rest (1/m)."""
+        at, _ = self.arclength(rod, s, input)
+        curved, ends = self.lengths(rod, input)
+        # exact at the tip, where the longest tube ends
+        ends = jnp.stack(ends)
+        there = jnp.where((at < ends) | (ends >= jnp.max(ends)), 1.0, 0.0)
+        bent = [1.0 if begin is None else jnp.where(at >= begin, 1.0, 0.0) for begin in curved]
+        return there, there * self.values("curvature") * jnp.stack(bent)
+
+    def section(self, rod: Any, part: Any, there: Any = 1.0) -> Section:
+        """Return the sum of the tubes that are present; all of them are at the base."""
+        bending, inertia = jnp.sum(there * self.EI), jnp.sum(there * self.values("density") * self.moment)
+        return Section(
+            jnp.sum(there * self.shear_moduli * self.area),
+            jnp.sum(there * self.values("youngs_modulus") * self.area),
+            (bending, bending, 0.0), jnp.sum(there * self.GJ),
+            jnp.sum(there * self.values("density") * self.area), (inertia, inertia, 0.0),
+            jnp.max(there * self.values("radius")),
+        )  # fmt: skip
+
+    # the equations
+
+    def y_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
+        """Return θ, and τ of all tubes but the first."""
+        n = len(self.tubes)
+        torsion = (("torsion", n - 1, "N m", "torsion of the tubes from the second on"),) if n > 1 else ()
+        return (("angle", n, "rad", "angle of each tube about the rod"), *torsion)
+
+    def base_fields(self, rod: Any) -> tuple[str, ...]:
+        """Return the torsion's name."""
+        return ("torsion",) if len(self.tubes) > 1 else ()
+
+    def tip_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
+        """Return the torsion at the tubes' ends."""
+        n = len(self.tubes) - 1
+        return (("torsion", n, "N m", "torsion at the ends of the tubes from the second on"),) if n else ()
+
+    def tip_rows(self, point: RodPoint) -> Any:
+        """Return the torsion at the tubes' ends: it is constant beyond them."""
+        return -point.get("torsion") if len(self.tubes) > 1 else None
+
+    def scales(self, rod: Any, sizes: Fields) -> Fields:
+        """Return the rod's moment for a torsion."""
+        return {"torsion": sizes["m"]} if len(self.tubes) > 1 else {}
+
+    def torsions(self, point: RodPoint) -> Float[Any, " n"]:
+        """Return τᵢ (N·m): the first tube has what the others leave of Rᵀm."""
+        total = dot(rotation_matrix(point.get("h")).T, point.get("m"))[2:]
+        if len(self.tubes) == 1:
+            return total
+        others = point.get("torsion")
+        return jnp.concatenate([total - jnp.sum(others), others])
+
+    def base_y(self, point: RodPoint) -> Fields:
+        """Return the angles at the plate."""
+        behind = self.values("transmission") - point.input[1::2]
+        return {"angle": point.input[::2] + behind * self.torsions(point) / self.GJ}
+
+    def rest_curvatures(self, point: RodPoint) -> tuple[Any, Any]:
+        """Return 1 for each tube that is present, and κᵢ (n, 2) in the frame of the rod."""
+        there, curvature = self.present(point.rod, point.s, point.input)
+        angle = point.get("angle")
+        return there, jnp.stack([-curvature * jnp.sin(angle), curvature * jnp.cos(angle)], axis=1)
+
+    def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
+        """Return the law with the moment of the tubes' curvatures, in a frame that does not twist."""
+        _, curvatures = self.rest_curvatures(point)
+        u = law.strains["u"]
+        moment = jnp.sum(self.EI[:, None] * curvatures, axis=0)
+        stress = jnp.concatenate([u.stress[:2] + moment, jnp.zeros(1)])
+        return law.with_strain("u", u._replace(stress=stress))
+
+    def rates(self, point: RodPoint) -> Fields:
+        """Return θᵢ_s and τᵢ_s."""
+        (there, curvatures), u = self.rest_curvatures(point), point.get("u")
+        turned = {"angle": there * self.torsions(point) / self.GJ}
+        if len(self.tubes) == 1:
+            return turned
+        torque = self.EI * (u[0] * curvatures[:, 1] - u[1] * curvatures[:, 0])
+        spin = point.rod.y_layout.get(point.y_t, "angle")
+        # between neighbours that are both present
+        sliding = self.friction * there[1:] * there[:-1] * (spin[1:] - spin[:-1])
+        dragged = jnp.concatenate([sliding, jnp.zeros(1)]) - jnp.concatenate([jnp.zeros(1), sliding])
+        return turned | {"torsion": (torque - dragged)[1:]}
+
+
+class ConcentricTubeRobot(SlenderRod):
+    """A robot of concentric tubes, the innermost first; `length` is that of the longest without insertion."""
+
+    radius: ClassVar[Any] = None
+    density: ClassVar[Any] = None
+    youngs_modulus: ClassVar[Any] = None
+    tip_radius: ClassVar[Any] = None
+    shear_modulus: ClassVar[Any] = None
+    shear_stiffness: ClassVar[Any] = None
+    bending_stiffness: ClassVar[Any] = None
+    sections: ClassVar[Any] = ()
+
+    tubes: tuple[Tube, ...] = slot("tubes, the innermost first", Tube, many=True, default=())
+    tube_friction: Any = parameter(
+        "N s", "viscous torque between neighbouring tubes, by length and relative rate of rotation", low=0.0,
+        high=1e3, default=1e-5,
+    )  # fmt: skip
+
+    def __check_init__(self) -> None:
+        if not self.tubes:
+            raise ParameterError("tubes is []; allowed is one or more, the innermost first")
+        if max(tube.end for tube in self.tubes) < 1.0:
+            raise ParameterError("no tube ends at the tip; allowed is an end of 1 for the longest")
+        for k, (inner, outer) in enumerate(zip(self.tubes, self.tubes[1:], strict=False), 1):
+            if any(
+                isinstance(one, jax.core.Tracer) or np.ndim(one) for one in (inner.radius, outer.inner_radius)
+            ):
+                continue
+            if inner.radius > outer.inner_radius:
+                raise ParameterError(
+                    f"tube {k} has a radius of {inner.radius:g} m, and tube {k + 1} an inner_radius of "
+                    f"{outer.inner_radius:g} m; allowed are tubes in one another, the innermost first"
+                )
+
+    cross_section: ClassVar[Any] = property(lambda self: _Tubes(self.tubes, self.tube_friction, self.length))
+
+    def material(self, s: Any, control: Any) -> Material:
+        """Return the sum of the tubes that are present."""
+        part, input = next(one for one in self.inputs(control) if isinstance(one[0], _Tubes))
+        section = part.section(self, s, part.present(self, s, input)[0])
+        return Material(
+            section.Kse, self.shear_damping, section.Kbt, self.bending_damping, self.u_star,
+            section.rhoA, section.rhoJ, section.radius,
+        )  # fmt: skip
+
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """Return y_s by the grid."""
+        part, input = next(one for one in self.inputs(control) if isinstance(one[0], _Tubes))
+        return super().balance(s, t, y, y_t, z, z_t, control) * part.arclength(self, s, input)[1]
+
+
+class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
+    """Ends of a robot of tubes."""
+
+    rest_is_guess = True

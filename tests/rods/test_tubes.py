@@ -1,0 +1,202 @@
+"""Concentric tubes: closed forms of two tubes, an independent solver of three, bifurcation and snap."""
+
+import itertools
+import re
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_bvp, solve_ivp
+from scipy.optimize import fsolve
+from scipy.spatial.transform import Rotation
+
+import knode_cosserat as kc
+from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.rods.tubes import ConcentricTubeRobot, Tube
+
+L, E, G = 0.2, 6e10, 6e10 / 2.6
+NITINOL = {"youngs_modulus": E, "density": 6450.0}
+#: radii of three tubes
+RADII = np.array([[0.35e-3, 0.2e-3], [0.7e-3, 0.45e-3], [1.1e-3, 0.8e-3]])
+MOMENT = np.pi / 4 * (RADII[:, 0] ** 4 - RADII[:, 1] ** 4)
+EI, GJ = E * MOMENT, 2 * G * MOMENT
+
+
+def tube(k, curvature, **more):
+    return Tube(radius=RADII[k, 0], inner_radius=RADII[k, 1], curvature=curvature, **NITINOL | more)
+
+
+def pair(*curvatures, nodes=11, **more):
+    tubes = tuple(tube(k, curvature) for k, curvature in enumerate(curvatures))
+    return ConcentricTubeRobot(
+        **{"length": L, "gravity": (0.0, 0.0, 0.0), "bending_damping": 1e-5, "nodes": nodes, "tubes": tubes}
+        | more
+    )
+
+
+def rest(robot, control, **options):
+    return kc.equilibrium(robot, control, space="lobatto4", **options)
+
+
+def twisting(*curvatures):
+    """√C of two tubes: their relative angle obeys θ'' = C sin θ."""
+    parallel = EI[0] * EI[1] / (EI[0] + EI[1])
+    return np.sqrt(curvatures[0] * curvatures[1] * parallel * (1 / GJ[0] + 1 / GJ[1]))
+
+
+def test_curvatures_in_one_plane_combine_by_stiffness():
+    for angle, sign in ((0.0, 1.0), (np.pi, -1.0)):
+        u = rest(pair(6.0, 3.0), [0.0, 0.0, angle, 0.0]).part("u")[0, :11]
+        expected = (EI[0] * 6.0 + sign * EI[1] * 3.0) / (EI[0] + EI[1])
+        np.testing.assert_allclose(u[:5], np.tile([0.0, expected, 0.0], (5, 1)), atol=1e-8)
+
+
+def test_two_tubes_twist_like_a_pendulum_with_order_four():
+    errors = []
+    for nodes in (11, 21):  # both tubes end at the tip: the second half of the grid has no length
+        angle = rest(pair(6.0, 5.0, nodes=nodes), [0.0, 0.0, 2.5, 0.0]).part("angle")[0]
+        exact = solve_bvp(
+            lambda s, y: np.stack([y[1], twisting(6.0, 5.0) ** 2 * np.sin(y[0])]),
+            lambda a, b: np.array([a[0] - 2.5, b[1]]),
+            np.linspace(0.0, L, 50), np.stack([np.full(50, 2.5), np.zeros(50)]), tol=1e-11,
+        ).sol(np.linspace(0.0, L, nodes // 2 + 1))[0]  # fmt: skip
+        errors.append(np.abs(np.diff(angle, axis=1)[: nodes // 2 + 1, 0] - exact).max())
+    assert errors[1] < 1e-6
+    assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.3)
+
+
+def test_opposed_tubes_are_unstable_beyond_the_known_product():
+    """Opposite tubes bifurcate where √C L = π/2 (Dupont et al. 2010; Rucker et al. 2010)."""
+    critical = np.pi / 2 / (L * twisting(1.0, 1.0))
+    opposed = [0.0, 0.0, np.pi, 0.0]
+    straight = rest(pair(0.99 * critical, 0.99 * critical, nodes=21), opposed)
+    assert kc.statics.stability(straight).kind == "stable"
+    beyond = rest(pair(1.01 * critical, 1.01 * critical, nodes=21), opposed, initial=straight)
+    if np.ptp(np.diff(beyond.part("angle")[0], axis=1)) < 1e-6:  # still the straight branch
+        assert kc.statics.stability(beyond).kind == "divergence"
+    else:
+        assert kc.statics.stability(beyond).kind == "stable"
+
+
+THREE = {"curved": (0.1, 0.12, 0.1), "curvature": (12.0, 8.0, 4.0), "end": (1.0, 0.7, 0.4)}
+FORCE, LONG, BEHIND = np.array([0.05, -0.1, 0.05]), 0.3, 0.1
+
+
+def three(**more):
+    tubes = tuple(
+        tube(k, THREE["curvature"][k], curved=THREE["curved"][k], end=THREE["end"][k], transmission=BEHIND)
+        for k in range(3)
+    )
+    load = PointWrench(force=FORCE)
+    return pair(**{"length": LONG, "tubes": tubes, "nodes": 25, "loads": (load,)} | more)
+
+
+def by_shooting(control):
+    """Return the tip by the equations of Rucker et al. (2010), inextensible tubes, by shooting."""
+    base = np.zeros(5)
+    for part in (0.25, 0.5, 0.75, 1.0):  # each from the one before: far controls have several solutions
+        base, tip = shooting(part * np.asarray(control), base)
+    return tip
+
+
+def shooting(control, base):
+    rotation, insertion = control[::2], control[1::2]
+    ends = LONG * np.array(THREE["end"]) + insertion
+    begins = np.maximum(ends - THREE["curved"], 0.0)
+    bounds = np.unique([0.0, *begins, *ends])
+
+    def shot(base):
+        torsion = np.array([base[2] - base[3:].sum(), *base[3:]])
+        angle = rotation + (BEHIND - insertion) * torsion / GJ
+        y = np.concatenate([np.zeros(3), [0, 0, 0, 1], base[:3], angle, base[3:]])
+        for low, high in itertools.pairwise(bounds):
+            there = (low + high) / 2 < ends
+            curvature = np.array(THREE["curvature"]) * ((low + high) / 2 > begins) * there
+
+            def rates(s, y, there=there, curvature=curvature):
+                h, angle, torsion = y[3:7], y[10:13], y[13:]
+                R = Rotation.from_quat(h).as_matrix()
+                m = R.T @ y[7:10]
+                x, z = -curvature * np.sin(angle), curvature * np.cos(angle)
+                u = np.append((m[:2] + np.array([EI @ x, EI @ z])) / (EI @ there), 0.0)
+                turned = 0.5 * np.append(h[3] * u + np.cross(h[:3], u), -h[:3] @ u)
+                torque = there * EI * (u[0] * z - u[1] * x)
+                twist = there * np.array([m[2] - torsion.sum(), *torsion]) / GJ
+                return np.concatenate([R[:, 2], turned, -np.cross(R[:, 2], FORCE), twist, torque[1:]])
+
+            y = solve_ivp(rates, (low, high), y, rtol=1e-10, atol=1e-12).y[:, -1]
+        return y
+
+    def unbalanced(x):
+        y = shot(x)
+        return 100 * np.concatenate([y[7:10], y[13:]])
+
+    base = fsolve(unbalanced, base, xtol=1e-12)
+    assert np.abs(unbalanced(base)).max() < 1e-6
+    return base, shot(base)[:3]
+
+
+@pytest.mark.parametrize(
+    "control", [[0.0] * 6, [1.0, -0.05, -0.5, 0.03, 1.3, -0.06], [1.0, -0.15, -0.5, 0.03, 1.0, -0.12]]
+)
+def test_three_tubes_under_a_force_reach_the_tip_of_an_independent_solver(control):
+    found = rest(three(), control).tip_position[0]
+    np.testing.assert_allclose(found, by_shooting(control), atol=1e-5 * LONG)
+
+
+@pytest.mark.slow
+def test_turned_past_their_limit_tubes_snap_and_come_back_another_way():
+    robot = pair(10.0, 10.0, nodes=17, tube_friction=1e-5)
+    angle = np.linspace(0.0, 2 * np.pi, 200)[:, None] * np.array([0.0, 0.0, 1.0, 0.0])
+
+    def turned(rotations):
+        start = rest(robot, rotations[0])
+        return kc.simulate(robot, rotations, 0.02, initial=start)
+
+    there, back = turned(angle), turned(angle[::-1])
+    assert there.all_valid and back.all_valid
+    relative = [np.diff(motion.part("angle")[1:, -1], axis=1)[:, 0] for motion in (there, back)]
+    assert np.max(np.abs(np.diff(relative[0]))) > 0.5
+    # half-way both lag behind: hysteresis
+    assert relative[1][100] - relative[0][100] > 1.0
+    np.testing.assert_allclose(relative[0][-1], 2 * np.pi, atol=0.1)
+
+
+def test_the_tip_has_exact_derivatives_by_every_control():
+    robot = three()
+    control = np.array([1.0, -0.05, -0.5, 0.03, 1.3, -0.06])
+    slopes = kc.statics.configuration(robot, control).jacobian[:3]
+    for k, step in enumerate([1e-4, 1e-5] * 3):
+        ends = [
+            kc.equilibrium(robot, control + sign * step * np.eye(6)[k]).tip_position[0] for sign in (1, -1)
+        ]
+        np.testing.assert_allclose(
+            slopes[:, k], (ends[0] - ends[1]) / (2 * step), atol=2e-4 * np.abs(slopes).max()
+        )
+
+
+def test_the_catalog_s_robot_reads_back_equal(tmp_path):
+    robot = kc.load_robot("three-tube-robot")
+    kc.save_robot(robot, tmp_path / "tubes.yaml")
+    assert jax.tree.all(jax.tree.map(np.array_equal, kc.load_robot(tmp_path / "tubes.yaml"), robot))
+    assert robot.control_layout.names[:3] == ("rotation_1", "insertion_1", "rotation_2")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"tubes": ()}, "tubes is []; allowed is one or more, the innermost first"),
+        ({"tubes": (tube(1, 0.0), tube(0, 0.0))}, "allowed are tubes in one another, the innermost first"),
+        ({"tubes": (tube(0, 0.0, end=0.5),)}, "no tube ends at the tip"),
+    ],
+)
+def test_tubes_that_do_not_fit_stop_with_one_line(changes, message):
+    with pytest.raises(kc.robots.ParameterError, match=re.escape(message)) as error:
+        pair(1.0, 1.0, **changes)
+    assert "\n" not in str(error.value)
+
+
+def test_an_insertion_past_its_end_stops_with_one_line():
+    with pytest.raises(ValueError, match=r"insertion_2 is 0.2 m .*; allowed is below 0.1") as error:
+        kc.equilibrium(three(), [0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
+    assert "\n" not in str(error.value)
