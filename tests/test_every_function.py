@@ -123,7 +123,9 @@ def made(kind: str) -> Made:
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
-    return {2: "bending", 3: "effects.0.offset", 6: "tubes.1.curvature"}.get(robot.control_layout.size, "youngs_modulus")
+    return {2: "bending", 3: "effects.0.offset", 6: "tubes.1.curvature"}.get(
+        robot.control_layout.size, "youngs_modulus"
+    )
 
 
 def fitted(robot: kc.System, it: Made, config: kc.FitConfig) -> Any:
@@ -224,7 +226,10 @@ LACKING = {
         for kind in ("own", "model of own", "tubes")
     },
     **{
-        (name, "tubes"): (kc.recordings.RecordingError, "for rods that are clamped there, with n and m unknown")
+        (name, "tubes"): (
+            kc.recordings.RecordingError,
+            "for rods that are clamped there, with n and m unknown",
+        )
         for name in ("estimate_states", "estimate_states, paper")
     },
 }
@@ -243,10 +248,11 @@ def calls() -> Iterator[Any]:
 def test_every_function_takes_every_robot(name, kind):
     if (name, kind) in LACKING:
         error, words = LACKING[name, kind]
+        call = FUNCTIONS[name]
+        if name == "fit, passive":  # rows that need no simulation
+            call = lambda robot, _: kc.fit(robot, [shown(kind)], PASSIVE)  # noqa: E731
         with pytest.raises(error, match=words):
-            if name == "fit, passive":
-                kc.fit(ROBOTS[kind], [shown(kind)], PASSIVE)
-            FUNCTIONS[name](ROBOTS[kind], made(kind))
+            call(ROBOTS[kind], None if name == "fit, passive" else made(kind))
         return
     found = np.asarray(FUNCTIONS[name](ROBOTS[kind], made(kind)), dtype=float)
     assert found.size and np.all(np.isfinite(found))

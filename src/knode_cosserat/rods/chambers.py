@@ -106,10 +106,15 @@ class Chambers(Stretched, Effect):
         if self.drive != "pressure":
             return (Field("volume", self.count, "m3", f"volume of {self.drive} that the pump delivers"),)
         field = Field("pressure", self.count, "Pa", "gauge pressure of the chamber")
-        for name, limit in (("low", self.lowest), ("high", self.highest)):
-            # limits of a batch, or of a traced robot, are not checked
-            if not (limit is None or isinstance(limit, jax.core.Tracer) or np.ndim(limit)):
-                field = field._replace(**{name: float(limit)})
+        # limits of a batch, or of a traced robot, are not checked
+        low, high = (
+            None if limit is None or isinstance(limit, jax.core.Tracer) or np.ndim(limit) else float(limit)
+            for limit in (self.lowest, self.highest)
+        )
+        if low is not None:
+            field = field._replace(low=low)
+        if high is not None:
+            field = field._replace(high=high)
         return (field,)
 
     def usual_control(self, rod: Any, field: Field) -> float:

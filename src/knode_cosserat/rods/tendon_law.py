@@ -141,7 +141,8 @@ class Tendons(NamedTuple):
         if others.stretching is not None or self.stretching is not None:
             parts = (one.stretching or Stretching(*np.zeros((4, *one.tension.shape))) for one in sets)
             stretching = Stretching(*map(jnp.concatenate, zip(*parts, strict=True)))
-        return Tendons(*map(jnp.concatenate, zip(*(one[:4] for one in sets), strict=True)), stretching)
+        r, r_s, tension, nominal = map(jnp.concatenate, zip(*(one[:4] for one in sets), strict=True))
+        return Tendons(r, r_s, tension, nominal, stretching)
 
     def strains(self, elastic: dict[str, Elastic]) -> Fields:
         """Return v and u of the rod's elastic laws with the tendons."""

@@ -157,8 +157,8 @@ class _Tubes(CrossSection):
         at, _ = self.arclength(rod, s, input)
         curved, ends = self.lengths(rod, input)
         # exact at the tip, where the longest tube ends
-        ends = jnp.stack(ends)
-        there = jnp.where((at < ends) | (ends >= jnp.max(ends)), 1.0, 0.0)
+        last = jnp.stack(ends)
+        there = jnp.where((at < last) | (last >= jnp.max(last)), 1.0, 0.0)
         bent = [1.0 if begin is None else jnp.where(at >= begin, 1.0, 0.0) for begin in curved]
         return there, there * self.values("curvature") * jnp.stack(bent)
 
@@ -242,14 +242,14 @@ class _Tubes(CrossSection):
 class ConcentricTubeRobot(SlenderRod):
     """A robot of concentric tubes, the innermost first; `length` is that of the longest without insertion."""
 
-    radius: ClassVar[Any] = None
-    density: ClassVar[Any] = None
-    youngs_modulus: ClassVar[Any] = None
-    tip_radius: ClassVar[Any] = None
-    shear_modulus: ClassVar[Any] = None
-    shear_stiffness: ClassVar[Any] = None
-    bending_stiffness: ClassVar[Any] = None
-    sections: ClassVar[Any] = ()
+    radius: ClassVar[Any] = None  # type: ignore[misc]
+    density: ClassVar[Any] = None  # type: ignore[misc]
+    youngs_modulus: ClassVar[Any] = None  # type: ignore[misc]
+    tip_radius: ClassVar[Any] = None  # type: ignore[misc]
+    shear_modulus: ClassVar[Any] = None  # type: ignore[misc]
+    shear_stiffness: ClassVar[Any] = None  # type: ignore[misc]
+    bending_stiffness: ClassVar[Any] = None  # type: ignore[misc]
+    sections: ClassVar[Any] = ()  # type: ignore[misc]
 
     tubes: tuple[Tube, ...] = slot("tubes, the innermost first", Tube, many=True, default=())
     tube_friction: Any = parameter(
@@ -273,12 +273,19 @@ class ConcentricTubeRobot(SlenderRod):
                     f"{outer.inner_radius:g} m; allowed are tubes in one another, the innermost first"
                 )
 
-    cross_section: ClassVar[Any] = property(lambda self: _Tubes(self.tubes, self.tube_friction, self.length))
+    #: all tubes
+    cross_section: ClassVar[Any] = property(  # type: ignore[misc]
+        lambda robot: _Tubes(robot.tubes, robot.tube_friction, robot.length)
+    )
+
+    def _tubes(self, control: Any) -> tuple[_Tubes, Any]:
+        """Return the tubes and their control."""
+        return next((part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes))
 
     def material(self, s: Any, control: Any) -> Material:
         """Return the sum of the tubes that are present."""
-        part, input = next(one for one in self.inputs(control) if isinstance(one[0], _Tubes))
-        section = part.section(self, s, part.present(self, s, input)[0])
+        tubes, input = self._tubes(control)
+        section = tubes.section(self, s, tubes.present(self, s, input)[0])
         return Material(
             section.Kse, self.shear_damping, section.Kbt, self.bending_damping, self.u_star,
             section.rhoA, section.rhoJ, section.radius,
@@ -286,8 +293,8 @@ class ConcentricTubeRobot(SlenderRod):
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s by the grid."""
-        part, input = next(one for one in self.inputs(control) if isinstance(one[0], _Tubes))
-        return super().balance(s, t, y, y_t, z, z_t, control) * part.arclength(self, s, input)[1]
+        tubes, input = self._tubes(control)
+        return super().balance(s, t, y, y_t, z, z_t, control) * tubes.arclength(self, s, input)[1]
 
 
 class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
