@@ -18,24 +18,15 @@ RADII = ((0.35e-3, 0.2e-3), (0.7e-3, 0.45e-3))
 
 def pair(curvature: float) -> ConcentricTubeRobot:
     """Return two tubes of nickel-titanium with the same curvature (1/m)."""
-    tubes = tuple(
-        Tube(radius=outer, inner_radius=inner, youngs_modulus=6e10, density=6450.0, curvature=curvature)
-        for outer, inner in RADII
-    )
-    return ConcentricTubeRobot(
-        length=LENGTH,
-        gravity=(0.0, 0.0, 0.0),
-        bending_damping=1e-5,
-        nodes=33,
-        tubes=tubes,
-        tube_friction=1e-4,
-    )
+    nitinol = {"youngs_modulus": 6e10, "density": 6450.0, "curvature": curvature}
+    tubes = tuple(Tube(radius=outer, inner_radius=inner, **nitinol) for outer, inner in RADII)
+    damping = {"bending_damping": 1e-5, "tube_friction": 1e-4}
+    return ConcentricTubeRobot(length=LENGTH, gravity=(0.0, 0.0, 0.0), nodes=33, tubes=tubes, **damping)
 
 
 def limit() -> float:
     """Return the curvature (1/m) beyond which the two tubes snap."""
-    moments = np.array([np.pi / 4 * (outer**4 - inner**4) for outer, inner in RADII])
-    EI, GJ = 6e10 * moments, 2 * 6e10 / 2.6 * moments
+    EI, GJ = pair(1.0).cross_section.EI, pair(1.0).cross_section.GJ
     return float(np.pi / 2 / LENGTH / np.sqrt(EI[0] * EI[1] / EI.sum() * (1 / GJ).sum()))
 
 

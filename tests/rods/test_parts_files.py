@@ -24,6 +24,7 @@ from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.surroundings import Obstacle, Sphere
 from knode_cosserat.rods.tendon_robots import VirtualRobot
 from knode_cosserat.rods.tendons import TendonFriction
+from knode_cosserat.rods.tubes import Tube
 from tests.trajectories import edited
 
 BODY = {"length": 0.5, "radius": 0.005, "density": 1000.0, "youngs_modulus": 1e6}
@@ -87,11 +88,26 @@ ROUTED = {
     "routing": st.none() | st.lists(parts(Routing), min_size=2, max_size=2).map(tuple),
     "friction": st.none() | parts(TendonFriction), "tendon_compliance": st.floats(0.0, 1.0),
 }  # fmt: skip
+#: two tubes in one another
+TUBES = st.tuples(
+    *(
+        st.builds(
+            Tube, radius=st.just(radius), inner_radius=st.just(0.7 * radius), density=st.just(6e3),
+            youngs_modulus=st.floats(1e3, 2e12), curvature=st.floats(-1e3, 1e3),
+            curved=st.none() | st.floats(0.0, 20.0),
+        )
+        for radius in (1e-3, 2e-3)
+    )
+)  # fmt: skip
 FIELDS = {
     "slender-rod": ROD,
     "routed-tendon-robot": ROUTED,
     "tendon-robot": ROD,
     "virtual-robot": {**ROD, **TENDONS},
+    "concentric-tube-robot": {
+        **{name: ROD[name] for name in ("loads", "surroundings", "tip_end")},
+        "tubes": TUBES,
+    },
 }
 
 
@@ -101,7 +117,8 @@ FIELDS = {
 def test_robots_with_parts_come_back_equal(kind, data):
     # a robot of several rods has no parts
     assert {*FIELDS, "parallel-robot"} == set(KINDS)
-    robot = KINDS[kind](**BODY, **data.draw(st.fixed_dictionaries(FIELDS[kind])))
+    body = {"length": 0.5} if kind == "concentric-tube-robot" else BODY
+    robot = KINDS[kind](**body, **data.draw(st.fixed_dictionaries(FIELDS[kind])))
     text = format_robot(robot)
     assert_equal(parse_robot(text, "here"), robot)
     content = yaml.safe_load(text)

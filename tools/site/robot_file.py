@@ -7,7 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.rods.parameters import Choice, Parameter, kinds_of, parameters_of, slots_of, stated_of
+from knode_cosserat.rods.parameters import (
+    Choice,
+    Parameter,
+    in_order,
+    kinds_of,
+    parameters_of,
+    slots_of,
+    stated_of,
+)
 from knode_cosserat.rods.robot_file import KINDS, NODES
 from knode_cosserat.rods.rod import SlenderRod
 
@@ -24,6 +32,7 @@ FAMILIES = {
     "End": "Ends: `base_end`, `tip_end`",
     "Load": "Loads: `loads`",
     "MagneticField": "Magnetic fields: `field` of magnets",
+    "Tube": "Tubes: `tubes`",
     "Effect": "Further physics: `effects`",
     "Obstacle": "Surroundings: `surroundings`",
     "CrossSection": "Cross-section: `cross_section`",
@@ -42,8 +51,8 @@ FAMILIES = {
 
 def page() -> str:
     """Return the reference: kinds of robots, then the families of their parts."""
-    rod = set(parameters_of(SlenderRod)) | set(slots_of(SlenderRod)) | set(stated_of(SlenderRod, Choice))
-    of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, SlenderRod)]
+    rod = set(in_order(SlenderRod))
+    of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, SlenderRod) and rod <= set(in_order(cls))]
     shared = [
         "[Download the schema](robot.schema.json)",
         "## Robots of one rod",
@@ -52,7 +61,7 @@ def page() -> str:
     ]
     parts = []
     for kind, cls in KINDS.items():
-        one = issubclass(cls, SlenderRod)
+        one = cls in of_a_rod
         rows = _rows(cls, None, without=rod) if one else [*_rows(cls, None), _nodes()]
         after = "No further entries." if one and not rows else HEAD + "\n".join(rows)
         parts += [f"## `{kind}`", _first(cls), after]
