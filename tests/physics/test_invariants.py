@@ -198,7 +198,7 @@ def test_damping_only_takes_energy(robot, damping):
     rates = np.concatenate([swinging.velocity, swinging.angular_velocity], axis=-1)
     stiffness, mass = np.zeros((2, 6, 6))
     stiffness[:3, :3], stiffness[3:, 3:] = free.Kse, free.Kbt
-    mass[:3, :3], mass[3:, 3:] = free.mass_per_length * np.eye(3), free.density * free.section.inertia
+    mass[:3, :3], mass[3:, 3:] = free.mass_per_length * np.eye(3), free.section.rhoJ
     # Of a segment: Euler's method strains it as at its start, and its end then moves.
     elastic = np.einsum("tni,ij,tnj->t", strain[:, :-1], stiffness, strain[:, :-1])
     kinetic = np.einsum("tni,ij,tnj->t", rates[:, 1:], mass, rates[:, 1:])

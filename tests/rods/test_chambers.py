@@ -155,6 +155,7 @@ def test_pressure_and_force_are_reciprocal():
     assert pressure == pytest.approx(-work, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ratios", [(0.0, 0.0), (0.4, 0.05)], ids=["neo-Hookean", "Yeoh"])
 @pytest.mark.parametrize("force", [20.0, -20.0])
 def test_the_axial_force_is_hyperelastic(ratios, force):
@@ -180,6 +181,7 @@ def test_small_strains_are_linear():
     assert v[2] - 1.0 == pytest.approx(3 * A / EA, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_an_arm_of_two_segments_moves_and_returns():
     """Names of equal controls have the parts' prefixes; the arm comes to rest at its equilibrium."""
     second = Chambers(angles=(0.5, 2.6, 4.7), offset=r, radius=a, begin=0.5)
@@ -191,6 +193,7 @@ def test_an_arm_of_two_segments_moves_and_returns():
     np.testing.assert_allclose(motion.tip_position[-1], rest.tip_position[0], atol=1e-5 * L)
 
 
+@pytest.mark.slow
 def test_pressures_move_the_tip_with_exact_gradients():
     robot = arm(Hyperelastic(), drive="pressure", **GROWING)
     controls = np.linspace(0.0, P, 12)[:, None] * np.array([1.0, 0.3, 0.0])

@@ -59,7 +59,7 @@ def momenta(found):
     """Momentum, and angular momentum about the origin, of every row."""
     q, w, p = (np.asarray(found.part(name)) for name in "qwp")
     turn, shape = rotations(found.part("h")), q.shape
-    rhoA, rhoJ = float(LOOSE.mass_per_length), DENSITY * np.asarray(LOOSE.section.inertia)
+    rhoA, rhoJ = float(LOOSE.mass_per_length), np.asarray(LOOSE.section.rhoJ)
     moving = rhoA * turn.apply(q.reshape(-1, 3)).reshape(shape)
     spinning = turn.apply((w @ rhoJ).reshape(-1, 3)).reshape(shape)
     return (np.einsum("n,tnk->tk", SIMPSON * L, each) for each in (moving, np.cross(p, moving) + spinning))

@@ -65,6 +65,7 @@ def test_two_tubes_twist_like_a_pendulum_with_order_four():
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.3)
 
 
+@pytest.mark.slow
 def test_opposed_tubes_are_unstable_beyond_the_known_product():
     """Opposite tubes bifurcate where √C L = π/2 (Dupont et al. 2010; Rucker et al. 2010)."""
     critical = np.pi / 2 / (L * twisting(1.0, 1.0))
@@ -136,6 +137,7 @@ def shooting(control, base):
     return base, shot(base)[:3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "control", [[0.0] * 6, [1.0, -0.05, -0.5, 0.03, 1.3, -0.06], [1.0, -0.15, -0.5, 0.03, 1.0, -0.12]]
 )
