@@ -198,6 +198,13 @@ def test_tubes_that_do_not_fit_stop_with_one_line(changes, message):
     assert "\n" not in str(error.value)
 
 
+def test_a_tube_without_a_wall_stops_with_one_line():
+    with pytest.raises(
+        kc.robots.ParameterError, match=r"inner_radius is 0.002; allowed is less than radius, 0.001"
+    ):
+        Tube(radius=0.001, inner_radius=0.002, **NITINOL)
+
+
 def test_an_insertion_past_its_end_stops_with_one_line():
     with pytest.raises(ValueError, match=r"insertion_2 is 0.2 m .*; allowed is below 0.1") as error:
         kc.equilibrium(three(), [0.0, 0.0, 0.0, 0.2, 0.0, 0.0])

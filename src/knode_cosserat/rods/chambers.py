@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, choice, parameter
+from knode_cosserat.rods.parameters import ParameterError, as_number, choice, parameter
 from knode_cosserat.rods.parts import Effect, RodPoint, Stretched
 from knode_cosserat.rods.routing import OffsetPaths, path_lengths
 from knode_cosserat.rods.section import ALONG
@@ -105,25 +105,17 @@ class Chambers(Stretched, Effect):
         """One pressure or volume for each chamber."""
         if self.drive != "pressure":
             return (Field("volume", self.count, "m3", f"volume of {self.drive} that the pump delivers"),)
-        field = Field("pressure", self.count, "Pa", "gauge pressure of the chamber")
-        # limits of a batch, or of a traced robot, are not checked
-        low, high = (
-            None if limit is None or isinstance(limit, jax.core.Tracer) or np.ndim(limit) else float(limit)
-            for limit in (self.lowest, self.highest)
-        )
-        if low is not None:
-            field = field._replace(low=low)
-        if high is not None:
-            field = field._replace(high=high)
-        return (field,)
+        low, high = as_number(self.lowest), as_number(self.highest)
+        limits = (-np.inf if low is None else low, np.inf if high is None else high)
+        meaning = "gauge pressure of the chamber"
+        return (Field("pressure", self.count, "Pa", meaning, low=limits[0], high=limits[1]),)
 
     def usual_control(self, rod: Any, field: Field) -> float:
         """Return the pressure by which one chamber bends the rod by a radian, or a fifth of its volume."""
         if self.drive != "pressure":
             return float(0.2 * self.rest_area * rod.length)
         lever = max(float(self.offset), 1e-6)
-        highest = np.inf if self.highest is None else float(self.highest)
-        return min(float(rod.Kbt[0, 0] / (rod.length * self.rest_area * lever)), highest)
+        return min(float(rod.Kbt[0, 0] / (rod.length * self.rest_area * lever)), field.high)
 
     def _name(self, rod: Any, field: str) -> str:
         """Return the name of one of the part's fields, which other chambers of the rod may have too."""
@@ -150,13 +142,13 @@ class Chambers(Stretched, Effect):
         """Return the law with the chambers' push."""
         r, r_s = self.paths(point.rod).routes(point.s)
         p, (by_stretch, slope) = self.pressure(point), self._area_changes(point, r, r_s)
-        pushed = self.within(point) * self.rest_area * p
+        pushed = self.indicator(point) * self.rest_area * p
         tension = -pushed * (1.0 - by_stretch + 0.5 * self.area_by_pressure * p)
         stretching = None
         if self.area_by_stretch is not None:
             nothing = jnp.zeros_like(pushed)
             stretching = Stretching(-2.0 * slope * pushed, nothing, nothing, nothing)
-        return law._replace(coupling=Tendons(r, r_s, tension, tension, stretching).beside(law.coupling))
+        return law._replace(coupling=Tendons(r, r_s, tension, tension, stretching).joined(law.coupling))
 
     def actuation(self, rod: Any, control: Any) -> Any:
         """Return Σ pᵢ A₀ (N) and Σ pᵢ A₀ rᵢ × d₃ (N·m, two) of straight chambers; otherwise the control."""
@@ -218,7 +210,7 @@ class Chambers(Stretched, Effect):
         stretch = stretches(point.get("v"), point.get("u"), r, r_s)
         by_stretch, slope = self._area_changes(point, r, r_s)
         area = 1.0 - by_stretch + slope * stretch + self.area_by_pressure * self.pressure(point)
-        return {self._name(point.rod, "volume"): self.within(point) * self.rest_area * area * stretch}
+        return {self._name(point.rod, "volume"): self.indicator(point) * self.rest_area * area * stretch}
 
     def tip_rows(self, point: RodPoint) -> Any:
         """Return the residual of the balance of volume."""
@@ -251,4 +243,4 @@ class Hyperelastic(Effect):
         one, axis = jnp.ones(1), np.zeros((1, 3))
         EA = law.strains["v"].stiffness[2, 2]
         excess = Stretching(0.0 * one, EA * one, self.second * one, self.third * one)
-        return law._replace(coupling=Tendons(axis, axis, 0.0 * one, 0.0 * one, excess).beside(law.coupling))
+        return law._replace(coupling=Tendons(axis, axis, 0.0 * one, 0.0 * one, excess).joined(law.coupling))

@@ -123,8 +123,8 @@ class SpreadLoad(Stretched, Load):
 
     def load(self, point: RodPoint) -> Wrench:
         """Return the load on the rod per length, zero outside of its stretch."""
-        within = self.within(point)
-        return Wrench(*(within * term for term in self.wrench(point.motion, point.input)))
+        indicator = self.indicator(point)
+        return Wrench(*(indicator * term for term in self.wrench(point.motion, point.input)))
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:

@@ -413,6 +413,11 @@ def _as_array(value: Any) -> Any:
     return array.astype(float) if array.dtype.kind in "fiu" else value
 
 
+def as_number(value: Any) -> float | None:
+    """Return a number as a float; None for an absent, a traced or a batched one."""
+    return None if value is None or isinstance(value, jax.core.Tracer) or np.ndim(value) else float(value)
+
+
 def _as_matrix(value: Any) -> Any:
     """Return one number or three as a diagonal matrix."""
     value = _as_array(value)

@@ -219,7 +219,7 @@ class Stretched(Part):
         """Places where it begins and ends."""
         return tuple(end for end in (self.begin, self.end) if end > 0.0)
 
-    def within(self, point: RodPoint) -> Any:
+    def indicator(self, point: RodPoint) -> Any:
         """Return 1 at a point of its stretch, 0 elsewhere."""
         if (self.begin, self.end) == (0.0, 1.0):
             return 1.0

@@ -27,7 +27,6 @@ from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
 from knode_cosserat.rods.section import (
     ALONG,
     INWARD,
-    POISSON_RATIO,
     CrossSection,
     Differences,
     FunctionSection,
@@ -37,6 +36,7 @@ from knode_cosserat.rods.section import (
     differences_at,
     round_section,
     shape_at_rest,
+    shear_modulus,
 )
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import Discontinuities, Scales, System
@@ -262,9 +262,7 @@ class SlenderRod(System):
     @property
     def G(self) -> Any:
         """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
-        if self.shear_modulus is not None:
-            return self.shear_modulus
-        return self.youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
+        return shear_modulus(self)
 
     def Kse_at(self, part: Any) -> Float[Any, "3 3"]:
         """Return the stiffness of shear and extension (N): the parameter, or by default the section's."""

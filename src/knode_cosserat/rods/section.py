@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Pose
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, choice, parameter, places
+from knode_cosserat.rods.parameters import ParameterError, as_number, choice, parameter, places
 from knode_cosserat.rods.parts import Part, Stretched
 from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, turned
@@ -140,6 +140,22 @@ def rectangle_torsion(width: Any, height: Any) -> Any:
     return a * b**3 * (1.0 / 3.0 - 64.0 / np.pi**5 * (b / a) * (ODD_FIFTH_POWERS - rest))
 
 
+def shear_modulus(material: Any) -> Any:
+    """Return the shear modulus of a rod or a tube (Pa): the parameter, or by default by Poisson's ratio."""
+    if material.shear_modulus is not None:
+        return material.shear_modulus
+    return material.youngs_modulus / (2.0 * (1.0 + POISSON_RATIO))
+
+
+def check_hollow(tube: Any) -> None:
+    """Raise `ParameterError` unless a tube's inner radius is less than its outer one."""
+    if not is_traced(tube) and not np.all(np.less(tube.inner_radius, tube.radius)):
+        raise ParameterError(
+            f"{type(tube).__name__}: inner_radius is {tube.inner_radius:g}; allowed is less than radius, "
+            f"{tube.radius:g}"
+        )
+
+
 class CrossSection(Part):
     """A cross-section of a rod, in place of a solid round one of the rod's `radius`."""
 
@@ -169,11 +185,7 @@ class HollowSection(CrossSection):
 
     def __check_init__(self) -> None:
         super().__check_init__()
-        if not is_traced(self) and not np.all(np.less(self.inner_radius, self.radius)):
-            raise ParameterError(
-                f"HollowSection: inner_radius is {self.inner_radius:g}; allowed is less than radius, "
-                f"{self.radius:g}"
-            )
+        check_hollow(self)
 
     def section(self, rod: Any, part: Any) -> Section:
         """Return the section of a tube."""
@@ -367,11 +379,10 @@ class Stretch(SectionChange):
     @property
     def control_fields(self) -> tuple[Field, ...]:
         """One control, if the section is controlled; its limit leaves some stiffness."""
-        field, gain = Field("input", 1, "1", "control of the section"), self.stiffness_gain
-        # the gain of a batch, or of a traced robot, gives no limit
-        if not (isinstance(gain, jax.core.Tracer) or np.ndim(gain) or gain == 0.0):
+        field, gain = Field("input", 1, "1", "control of the section"), as_number(self.stiffness_gain)
+        if gain:
             # at the limit itself the stiffness is zero
-            limit = -1.0 / float(gain)
+            limit = -1.0 / gain
             if gain > 0.0:
                 field = field._replace(low=float(np.nextafter(limit, np.inf)))
             else:

@@ -132,7 +132,7 @@ class Tendons(NamedTuple):
     #: increase of T by the stretch; None: none
     stretching: Stretching | None = None
 
-    def beside(self, others: Tendons | None) -> Tendons:
+    def joined(self, others: Tendons | None) -> Tendons:
         """Return these and other tendons of the rod."""
         if others is None:
             return self

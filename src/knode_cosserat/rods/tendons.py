@@ -548,12 +548,12 @@ class RibSpacing(Part):
         Kbt, length = law.strains["u"].softened, point.rod.length
         mean, half = 0.5 * (Kbt[0, 0] + Kbt[1, 1]), 0.5 * (Kbt[0, 0] - Kbt[1, 1])
         # apart by more than rounding, for the derivative of equal ones
-        apart = jnp.sqrt(half**2 + Kbt[0, 1] ** 2 + (1e-8 * mean) ** 2)
-        principal = mean + apart * np.array([1.0, -1.0])
+        separation = jnp.sqrt(half**2 + Kbt[0, 1] ** 2 + (1e-8 * mean) ** 2)
+        principal = mean + separation * np.array([1.0, -1.0])
         softening = self.softening + self.softening_at(point.s / length) * length**2
         lost = principal * (1.0 - pressed(3.0 * softening * jnp.sum(tension(point)) / principal))
-        away = half * (ABOUT_X - ABOUT_Y) + Kbt[0, 1] * COUPLED
-        loss = 0.5 * jnp.sum(lost) * ACROSS + 0.5 * (lost[0] - lost[1]) / apart * away
+        deviator = half * (ABOUT_X - ABOUT_Y) + Kbt[0, 1] * COUPLED
+        loss = 0.5 * jnp.sum(lost) * ACROSS + 0.5 * (lost[0] - lost[1]) / separation * deviator
         return law.with_strain("u", law.strains["u"].soften(loss))
 
 

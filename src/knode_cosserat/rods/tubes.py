@@ -1,6 +1,6 @@
 """Robots of concentric tubes: precurved tubes in one another, which are turned and pushed at their bases.
 
-Tubes share their centreline and turn freely about it; clearance and friction are neglected (Dupont, Lock,
+Tubes share their centreline and turn about it; clearance and dry friction are neglected (Dupont, Lock,
 Itkowitz & Butler 2010; Rucker, Jones & Webster 2010). In a frame that does not twist (u_z = 0), tube i has
 the angle θᵢ and the curvature κᵢ at rest, in the direction of θᵢ. With its stiffnesses EIᵢ, GJᵢ and torsion
 τᵢ,
@@ -11,8 +11,8 @@ over the tubes that are present. τ₁ follows from Rᵀm. Each τᵢ is zero wh
 the tubes are straight over the length dᵢ, so that θᵢ = αᵢ + dᵢ τᵢ/GJᵢ at the plate, with the rotation αᵢ.
 Neighbours resist relative rotation by a viscous torque: a snap is then a fast motion.
 
-Insertion. A tube ends, and begins to be curved, at lengths βᵢ and βᵢ - cᵢ that the controls move. In order,
-these lengths are the bounds of 2n intervals, each of which takes 1/2n of the grid, whatever its length is.
+Insertion. A tube ends, and may begin to be curved, at lengths βᵢ and βᵢ - cᵢ that the controls move. In
+order, these lengths bound intervals, each of which takes an equal part of the grid, whatever its length is.
 The balance is multiplied by the rate of arclength along the grid. Inertia by the speed of insertion is
 neglected.
 """
@@ -28,10 +28,17 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, parameter, place, slot
+from knode_cosserat.rods.parameters import ParameterError, as_number, parameter, place, slot
 from knode_cosserat.rods.parts import Part, RodPoint
 from knode_cosserat.rods.rod import RodEnds, SlenderRod
-from knode_cosserat.rods.section import POISSON_RATIO, CrossSection, Material, Section
+from knode_cosserat.rods.section import (
+    CrossSection,
+    Material,
+    Section,
+    check_hollow,
+    round_section,
+    shear_modulus,
+)
 from knode_cosserat.rotation import dot, rotation_matrix
 
 
@@ -59,6 +66,15 @@ class Tube(Part):
     )
     end: float = place("where it ends without insertion", low=1e-3, default=1.0, kw_only=True)
 
+    def __check_init__(self) -> None:
+        super().__check_init__()
+        check_hollow(self)
+
+    @property
+    def G(self) -> Any:
+        """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
+        return shear_modulus(self)
+
 
 class _Tubes(CrossSection):
     """All tubes of a robot, as its cross-section and actuators."""
@@ -76,33 +92,20 @@ class _Tubes(CrossSection):
         return jnp.stack([jnp.asarray(getattr(tube, name), dtype=float) for tube in self.tubes])
 
     @property
-    def shear_moduli(self) -> Float[Any, " n"]:
-        """G of each tube (Pa)."""
-        return jnp.stack([
-            jnp.asarray(tube.youngs_modulus / (2.0 + 2.0 * POISSON_RATIO) if tube.shear_modulus is None
-                        else tube.shear_modulus)
-            for tube in self.tubes
-        ])  # fmt: skip
-
-    @property
-    def area(self) -> Float[Any, " n"]:
-        """Area of each tube (m²)."""
-        return np.pi * (self.values("radius") ** 2 - self.values("inner_radius") ** 2)
-
-    @property
-    def moment(self) -> Float[Any, " n"]:
-        """Second moment of area of each tube (m⁴)."""
-        return np.pi / 4.0 * (self.values("radius") ** 4 - self.values("inner_radius") ** 4)
+    def sections(self) -> Section:
+        """Sections of the tubes: each field has a number for each tube."""
+        sections = [round_section(tube, tube.radius, tube.inner_radius) for tube in self.tubes]
+        return jax.tree.map(lambda *numbers: jnp.stack(list(map(jnp.asarray, numbers))), *sections)
 
     @property
     def EI(self) -> Float[Any, " n"]:
         """Bending stiffness of each tube (N·m²)."""
-        return self.values("youngs_modulus") * self.moment
+        return self.sections.EI[0]
 
     @property
     def GJ(self) -> Float[Any, " n"]:
         """Torsional stiffness of each tube (N·m²)."""
-        return 2.0 * self.shear_moduli * self.moment
+        return self.sections.GJ
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
@@ -111,10 +114,9 @@ class _Tubes(CrossSection):
         for k, tube in enumerate(self.tubes, 1):
             fields.append(Field(f"rotation_{k}", 1, "rad", f"rotation of tube {k} at its base"))
             field = Field(f"insertion_{k}", 1, "m", f"displacement of tube {k} along the rod, at its base")
-            # limits of a batch, or of a traced robot, are not checked
-            ends = self.length, tube.transmission
-            if not any(isinstance(end, jax.core.Tracer) or np.ndim(end) for end in ends):
-                field = field._replace(low=-tube.end * float(self.length), high=float(tube.transmission))
+            length, transmission = as_number(self.length), as_number(tube.transmission)
+            if length is not None and transmission is not None:
+                field = field._replace(low=-tube.end * length, high=transmission)
             fields.append(field)
         return tuple(fields)
 
@@ -146,32 +148,25 @@ class _Tubes(CrossSection):
         widths = jnp.diff(jnp.stack(bounds), prepend=0.0)
         at = s / rod.length * len(bounds)
         first = np.arange(len(bounds))
-        inside = jnp.where((at >= first) & (at < first + 1), 1.0, 0.0)
         # the tip belongs to the last interval
-        inside = jnp.where((first == len(bounds) - 1) & (at >= len(bounds)), 1.0, inside)
-        passed = jnp.clip(at - first, 0.0, 1.0)
-        return jnp.sum(passed * widths), jnp.sum(inside * widths) * len(bounds) / rod.length
+        active = jnp.where((at >= first) & ((at < first + 1) | (first == len(bounds) - 1)), 1.0, 0.0)
+        progress = jnp.clip(at - first, 0.0, 1.0)
+        return jnp.sum(progress * widths), jnp.sum(active * widths) * len(bounds) / rod.length
 
     def present(self, rod: Any, s: Any, input: Any) -> tuple[Float[Any, " n"], Float[Any, " n"]]:
         """Return 1 for each tube that is present at s on the grid, and its curvature at rest (1/m)."""
         at, _ = self.arclength(rod, s, input)
         curved, ends = self.lengths(rod, input)
         # exact at the tip, where the longest tube ends
-        last = jnp.stack(ends)
-        there = jnp.where((at < last) | (last >= jnp.max(last)), 1.0, 0.0)
+        tips = jnp.stack(ends)
+        presence = jnp.where((at < tips) | (tips >= jnp.max(tips)), 1.0, 0.0)
         bent = [1.0 if begin is None else jnp.where(at >= begin, 1.0, 0.0) for begin in curved]
-        return there, there * self.values("curvature") * jnp.stack(bent)
+        return presence, presence * self.values("curvature") * jnp.stack(bent)
 
-    def section(self, rod: Any, part: Any, there: Any = 1.0) -> Section:
+    def section(self, rod: Any, part: Any, presence: Any = 1.0) -> Section:
         """Return the sum of the tubes that are present; all of them are at the base."""
-        bending, inertia = jnp.sum(there * self.EI), jnp.sum(there * self.values("density") * self.moment)
-        return Section(
-            jnp.sum(there * self.shear_moduli * self.area),
-            jnp.sum(there * self.values("youngs_modulus") * self.area),
-            (bending, bending, 0.0), jnp.sum(there * self.GJ),
-            jnp.sum(there * self.values("density") * self.area), (inertia, inertia, 0.0),
-            jnp.max(there * self.values("radius")),
-        )  # fmt: skip
+        total: Section = jax.tree.map(lambda numbers: jnp.sum(presence * numbers), self.sections)
+        return total._replace(radius=jnp.max(presence * self.sections.radius))
 
     # the equations
 
@@ -208,14 +203,14 @@ class _Tubes(CrossSection):
 
     def base_y(self, point: RodPoint) -> Fields:
         """Return the angles at the plate."""
-        behind = self.values("transmission") - point.input[1::2]
-        return {"angle": point.input[::2] + behind * self.torsions(point) / self.GJ}
+        straight = self.values("transmission") - point.input[1::2]
+        return {"angle": point.input[::2] + straight * self.torsions(point) / self.GJ}
 
     def rest_curvatures(self, point: RodPoint) -> tuple[Any, Any]:
         """Return 1 for each tube that is present, and κᵢ (n, 2) in the frame of the rod."""
-        there, curvature = self.present(point.rod, point.s, point.input)
+        presence, curvature = self.present(point.rod, point.s, point.input)
         angle = point.get("angle")
-        return there, jnp.stack([-curvature * jnp.sin(angle), curvature * jnp.cos(angle)], axis=1)
+        return presence, jnp.stack([-curvature * jnp.sin(angle), curvature * jnp.cos(angle)], axis=1)
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
         """Return the law with the moment of the tubes' curvatures, in a frame that does not twist."""
@@ -227,14 +222,14 @@ class _Tubes(CrossSection):
 
     def rates(self, point: RodPoint) -> Fields:
         """Return θᵢ_s and τᵢ_s."""
-        (there, curvatures), u = self.rest_curvatures(point), point.get("u")
-        turned = {"angle": there * self.torsions(point) / self.GJ}
+        (presence, curvatures), u = self.rest_curvatures(point), point.get("u")
+        turned = {"angle": presence * self.torsions(point) / self.GJ}
         if len(self.tubes) == 1:
             return turned
         torque = self.EI * (u[0] * curvatures[:, 1] - u[1] * curvatures[:, 0])
         spin = point.rod.y_layout.get(point.y_t, "angle")
         # between neighbours that are both present
-        sliding = self.friction * there[1:] * there[:-1] * (spin[1:] - spin[:-1])
+        sliding = self.friction * presence[1:] * presence[:-1] * (spin[1:] - spin[:-1])
         dragged = jnp.concatenate([sliding, jnp.zeros(1)]) - jnp.concatenate([jnp.zeros(1), sliding])
         return turned | {"torsion": (torque - dragged)[1:]}
 
@@ -264,14 +259,11 @@ class ConcentricTubeRobot(SlenderRod):
         if max(tube.end for tube in self.tubes) < 1.0:
             raise ParameterError("no tube ends at the tip; allowed is an end of 1 for the longest")
         for k, (inner, outer) in enumerate(zip(self.tubes, self.tubes[1:], strict=False), 1):
-            if any(
-                isinstance(one, jax.core.Tracer) or np.ndim(one) for one in (inner.radius, outer.inner_radius)
-            ):
-                continue
-            if inner.radius > outer.inner_radius:
+            radius, hole = as_number(inner.radius), as_number(outer.inner_radius)
+            if radius is not None and hole is not None and radius > hole:
                 raise ParameterError(
-                    f"tube {k} has a radius of {inner.radius:g} m, and tube {k + 1} an inner_radius of "
-                    f"{outer.inner_radius:g} m; allowed are tubes in one another, the innermost first"
+                    f"tube {k} has a radius of {radius:g} m, and tube {k + 1} an inner_radius of {hole:g} m; "
+                    "allowed are tubes in one another, the innermost first"
                 )
 
     #: all tubes
