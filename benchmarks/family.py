@@ -92,6 +92,34 @@ def reel() -> dict[str, Any]:
     }
 
 
+def others() -> dict[str, float]:
+    """A step of 20 ms of other robots, as a multiple of a step of the paper's: medians of ratios."""
+    import knode_cosserat as kc
+
+    t = 0.02 * np.arange(1, 201)[:, None]
+    motions = {
+        "delrin-tendon-robot": 5.0 + np.sin(2.0 * np.pi * t + np.arange(4) * np.pi / 2.0),
+        "three-chamber-arm": 2e4 * (1.0 + np.sin(np.pi * t + np.arange(3) * 2.1)),
+        "three-tube-robot": np.sin(np.pi / 2.0 * t) * np.array([1.0, -0.02, -0.5, 0.01, 0.5, -0.02]),
+        "magnetic-catheter": 5e-3 * np.sin(np.pi / 2.0 * t + np.array([0.0, np.pi / 2.0, 0.0])),
+    }
+    runs = {
+        name: functools.partial(kc.simulate, kc.load_robot(name), control, 0.02)
+        for name, control in motions.items()
+    }
+    for run in runs.values():
+        run()
+    times: dict[str, list[float]] = {name: [] for name in runs}
+    for _ in range(ROUNDS):
+        for name, run in runs.items():
+            times[name].append(seconds(run))
+    paper = times.pop("delrin-tendon-robot")
+    return {
+        name: statistics.median(one / other for one, other in zip(mine, paper, strict=True))
+        for name, mine in times.items()
+    }
+
+
 def parallel() -> dict[str, Any]:
     """A step of the six-legged robot, its actuators moving by 20 mm (ms)."""
     import knode_cosserat as kc
@@ -106,4 +134,4 @@ def parallel() -> dict[str, Any]:
 
 if __name__ == "__main__":
     one_core()
-    print(json.dumps({"tendons": tendons(), "reel": reel(), "parallel": parallel()}))
+    print(json.dumps({"tendons": tendons(), "reel": reel(), "others": others(), "parallel": parallel()}))
