@@ -6,6 +6,7 @@ material's law are in `law`.
 
 from knode_cosserat.rods import ends, law, loads, routing, section, surroundings, tendons
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
@@ -31,6 +32,7 @@ __all__ = [
     "RoutedTendonRobot",
     "Scales",
     "SlenderRod",
+    "SpinningFrame",
     "Stretch",
     "System",
     "TendonRobot",
