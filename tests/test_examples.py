@@ -253,3 +253,12 @@ def test_design_pareto(run):
     assert fine.all() and values[1] == pytest.approx(1e3 * 0.03 * 9.81 * 0.2**3 / (3 * EI), rel=5e-3)
     # a straight tendon bends the rod evenly: T r L² / 2EI
     assert values[0] == pytest.approx(1e3 * 15.0 * 0.01 * 0.2**2 / (2 * EI), rel=2e-2)
+
+
+@pytest.mark.slow
+def test_spinning_shaft(run):
+    found, exact = run("spinning_shaft", speeds=2)
+    np.testing.assert_allclose(found, exact, rtol=1e-4)
+    # spin parts the two ways of whirl
+    assert np.all(np.abs(exact[0, :, 0]) == pytest.approx(exact[0, :, 1]))
+    assert np.all(exact[1, :, 1] > 1.01 * np.abs(exact[1, :, 0]))

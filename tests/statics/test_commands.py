@@ -109,3 +109,15 @@ def test_workspace_writes_and_draws(tmp_path):
 def test_wrong_arguments_end_in_one_line(arguments, message):
     ran = run(*arguments)
     assert ran.exit_code == 2 and message in ran.stderr and ran.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_modes_are_printed_and_drawn(rod, tmp_path):
+    facts = told("modes", rod, "--control", "base_z=0", "--count", 3, "--picture", tmp_path / "modes.png")
+    found = kc.statics.modes(kc.equilibrium(kc.load_robot(rod), np.zeros(3), space="lobatto4"), count=3)
+    np.testing.assert_allclose(facts["frequency"], found.frequency)
+    np.testing.assert_allclose(facts["damping"], found.damping)
+    assert (tmp_path / "modes.png").stat().st_size > 10_000
+    text = run("modes", rod, "--control", "0,0,0", "--count", 3).stdout
+    assert "damping ratio" in text and len(text.splitlines()) == 4
+    assert "allowed is" in run("modes", rod, "--count", 0).stderr or run("modes", rod, "--count", 0).exit_code
