@@ -1,7 +1,7 @@
 """Whirl of a shaft over its speed (Campbell diagram), beside the closed form of a rotating beam.
 
-The shaft is seen from a frame that spins with it, in which it has an equilibrium. A mode of frequency ω in that
-frame whirls at Ω + ω or Ω - ω over the ground. Gyroscopic moments raise one and lower the other.
+The shaft is seen from a frame that spins with it, in which it has an equilibrium. A mode of frequency ω in
+that frame whirls at Ω + ω or Ω - ω over the ground. Gyroscopic moments raise one and lower the other.
 """
 
 import numpy as np
@@ -42,9 +42,7 @@ def main(out: str = "spinning_shaft.png", speeds: int = 7) -> tuple[np.ndarray, 
         for i, way in enumerate(("backward", "forward"))
     }
     speed = rates / (2.0 * np.pi)
-    figure = kc.figures.curves(
-        speed, lines, "speed of the shaft [1/s]", "whirl frequency [Hz]", columns=2
-    )
+    figure = kc.figures.curves(speed, lines, "speed of the shaft [1/s]", "whirl frequency [Hz]", columns=2)
     axes = figure.axes[0]
     axes.plot(speed, np.abs(found.reshape(speeds, -1)) / (2.0 * np.pi), "o", color="black", markersize=3)
     axes.plot(speed, speed, color="#999999", linewidth=0.8)

@@ -341,7 +341,7 @@ def curves(
 def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
     """Return a figure of the first modes of `kc.statics.modes`: both extremes about the equilibrium.
 
-    Displacements are drawn with a maximum of a quarter of the robot's extent. Titles have frequency and damping.
+    The largest displacement is drawn as a quarter of the robot's extent. Titles have frequency and damping.
     """
     if count < 1 or not len(modes.values):
         raise ValueError(f"count is {count} of {len(modes.values)} modes; allowed is 1 or more")
@@ -353,8 +353,9 @@ def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
     width = width_of(columns)
     with style():
         figure = new_figure(width, rows * (width / across + 0.2))
+        grid = figure.add_gridspec(rows, across)
         for k, shape in enumerate(shown):
-            seen = View(figure, (rows, across, k + 1), "xyz")
+            seen = View(figure, grid[divmod(k, across)], "xyz")
             ends = (still + size * shape, still - size * shape)
             for points, look in (
                 (still, {"color": "#999999", "linewidth": 1.0}),

@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,6 +19,7 @@ from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Motion, PointWrench
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rotation import quaternion_of, quaternion_product, rotation_matrix
+from knode_cosserat.statics.stability import checked_equilibrium
 
 NONE = np.zeros(0)
 
@@ -77,9 +79,7 @@ def test_a_blade_has_the_tension_of_its_closed_form():
     """EA p'' = -ρA Ω² p, of order 4 along the rod; to first order in strain n = ρA Ω² (L² - s²) / 2."""
     errors, rate = [], 60.0
     for nodes in (6, 11):
-        found = kc.equilibrium(
-            rod(SpinningFrame(rate, (1.0, 0.0, 0.0)), nodes=nodes), NONE, space="lobatto4"
-        )
+        found = kc.equilibrium(rod(SpinningFrame(rate, (1.0, 0.0, 0.0)), nodes=nodes), NONE, space="lobatto4")
         blade = found.system
         EA, a = float(blade.Kse[2, 2]), rate * np.sqrt(1000.0 / 1e7)
         s = np.linspace(0.0, 0.5, nodes)
@@ -92,14 +92,13 @@ def test_a_blade_has_the_tension_of_its_closed_form():
     assert errors[1] < 3e-9 and errors[0] / errors[1] > 14.0
 
 
-@pytest.mark.parametrize("gravity", [(0.0, 0.0, -9.81), (3.0, 0.0, 0.0)])
-def test_gravity_across_the_axis_leaves_no_equilibrium(gravity):
-    found = kc.equilibrium(rod(SpinningFrame(5.0), gravity=gravity, length=0.2), NONE)
-    if gravity[0] == 0.0:
-        assert kc.statics.stability(found).stable
-    else:
+def test_gravity_across_the_axis_leaves_no_equilibrium():
+    upright = rod(SpinningFrame(5.0), gravity=(0.0, 0.0, -9.81), length=0.2)
+    checked_equilibrium(kc.equilibrium(upright, NONE), -1)
+    found = kc.equilibrium(upright.replace(gravity=(3.0, 0.0, 0.0)), NONE)
+    for task in (kc.statics.stability, kc.statics.modes):
         with pytest.raises(ValueError, match="no equilibrium at later times: loads turn") as caught:
-            kc.statics.stability(found)
+            task(found)
         assert "\n" not in str(caught.value)
 
 
@@ -112,8 +111,8 @@ A, I = np.pi * RADIUS**2, np.pi * RADIUS**4 / 4.0
 def whirl(k, rate, GA):
     """Angular frequencies (rad/s), forward positive, of a simply supported shaft: a rotating Timoshenko beam.
 
-    With w = sin(ks) and the rotation cos(ks), times e^{iωt} in the global frame (Rao 2007, section 11.11). For
-    GA → ∞ it is Rayleigh's: (ρA + ρI k²) ω² - 2 ρI k² Ω ω = EI k⁴.
+    With w = sin(ks) and the rotation cos(ks), times e^{iωt} in the global frame. For GA → ∞ it is
+    Rayleigh's: (ρA + ρI k²) ω² - 2 ρI k² Ω ω = EI k⁴.
     """
     P = np.polynomial.Polynomial
     bent = P([E * I * k * k + GA, 2.0 * DENSITY * I * rate, -DENSITY * I])
@@ -204,7 +203,9 @@ LADEN = {
         DistributedWrench(force=[0.0, 0.03, 0.0], follows=True),
     ),
     "surroundings": (
-        Plane(point=[0, 0, -0.05], normal=[0.1, 0, 1.0], stiffness=200.0, friction=0.3, slip=0.05, damping=1.0),
+        Plane(
+            point=[0, 0, -0.05], normal=[0.1, 0, 1.0], stiffness=200.0, friction=0.3, slip=0.05, damping=1.0
+        ),
     ),
 }  # fmt: skip
 STEPS, TIME = 480, 0.3
@@ -245,33 +246,34 @@ def test_a_rod_in_the_frame_moves_as_one_with_a_turning_base():
     assert distances[1] < 4e-6 and distances[0] / distances[1] > 8.0
 
 
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:bending_damping is 0")
 def test_without_damping_energy_less_spin_times_angular_momentum_is_constant():
-    """Jacobi's integral, in any scheme's order in time."""
-    drift = []
-    spin = np.array([0.0, 0.0, 15.0])
-    robot = rod(
-        SpinningFrame(15.0), nodes=21, gravity=[0.0, 0.0, -9.81],
-        base_end=Clamped(orientation=[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]),
-    )  # fmt: skip
-    for steps in (100, 200):
-        found = kc.simulate(robot, np.zeros((steps, 0)), 0.1 / steps, space="lobatto4")
+    """Jacobi's integral, of order 4 along the rod; relative to the change of the elastic energy."""
+    drift, steps = [], 200
+    spin, J = np.array([0.0, 0.0, 15.0]), 1000.0 * np.asarray(rod().section.inertia)
+    for nodes in (21, 41):
+        robot = rod(
+            SpinningFrame(15.0), nodes=nodes,
+            base_end=Clamped(orientation=[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]),
+        )  # fmt: skip
+        # let go from its shape under a weight along the axis
+        bent = kc.equilibrium(robot.replace(gravity=[0.0, 0.0, -9.81]), NONE, space="lobatto4")
+        found = kc.simulate(robot, np.zeros((steps, 0)), 0.2 / steps, space="lobatto4", initial=bent)
         p, h, q, w, v, u = (np.asarray(found.part(name)) for name in "phqwvu")
-        turn, shape = Rotation.from_quat(h.reshape(-1, 4), scalar_first=True), p.shape
-        flat = p.reshape(-1, 3)
-        # moving over the ground, in the axes of the frame
+        turn, flat = Rotation.from_quat(h.reshape(-1, 4), scalar_first=True), p.reshape(-1, 3)
+        # over the ground, in the axes of the frame; w in those of the material
         q = turn.apply(q.reshape(-1, 3)) + np.cross(spin, flat)
         w = w.reshape(-1, 3) + turn.inv().apply(spin)
-        mass, J = float(robot.mass_per_length), 1000.0 * np.asarray(robot.section.inertia)
-        H = np.cross(flat, mass * q) + turn.apply(w @ J)
-        kinetic = 0.5 * mass * np.sum(q * q, axis=1) + 0.5 * np.sum((w @ J) * w, axis=1)
-        stretch = v - [0.0, 0.0, 1.0]
+        mass, stretch = float(robot.mass_per_length), v - [0.0, 0.0, 1.0]
+        momentum = np.cross(flat, mass * q) + turn.apply(w @ J)
+        kinetic = 0.5 * np.sum(mass * q * q + (w @ J) * w, axis=1)
         elastic = 0.5 * np.sum((stretch @ robot.Kse) * stretch + (u @ robot.Kbt) * u, axis=-1)
-        density = kinetic - H @ spin + mass * 9.81 * flat[:, 2]
-        simpson = np.array([1.0, *[4.0, 2.0] * 9, 4.0, 1.0]) / 60.0
-        total = (density.reshape(shape[:2]) + elastic) @ simpson * 0.5
-        drift.append(np.max(np.abs(total - total[0])) / np.ptp(elastic @ simpson * 0.5))
-        assert found.all_valid and np.ptp(found.tip_position, axis=0)[1] > 0.01
-    assert drift[1] < 0.02 and drift[0] / drift[1] > 3.0
+        simpson = np.array([1.0, *[4.0, 2.0] * (nodes // 2 - 1), 4.0, 1.0]) / (6.0 * (nodes - 1))
+        total = ((kinetic - momentum @ spin).reshape(p.shape[:2]) + elastic) @ simpson
+        drift.append(np.max(np.abs(total - total[0])) / np.ptp(elastic @ simpson))
+        assert np.ptp(found.tip_position, axis=0)[1] > 1e-3
+    assert drift[1] < 6e-5 and drift[0] / drift[1] > 12.0
 
 
 @pytest.mark.slow
@@ -289,10 +291,12 @@ def test_it_runs_in_batches_has_gradients_and_carries_a_model():
     slope = jax.grad(lambda rate: moved(rate).tip_position[-1, 0])(9.0)
     apart = moved(9.0 + step).tip_position[-1, 0] - moved(9.0 - step).tip_position[-1, 0]
     assert float(slope) == pytest.approx(float(apart) / (2.0 * step), rel=1e-4)
-    # the residual of an untrained network is zero
-    model = kc.KNODE(robots[1], network(robots[1], NetworkOptions(hidden=3), jax.random.PRNGKey(0)))
-    found = kc.simulate(model, np.zeros((20, 0)), 0.01)
-    assert found.all_valid and model.replace(**{"effects.0.rate": 3.0}).knowledge.effects[0].rate == 3.0
+    none = jax.tree.map(
+        lambda leaf: 0.0 * leaf if eqx.is_inexact_array(leaf) else leaf,
+        network(robots[1], NetworkOptions(hidden=3), jax.random.PRNGKey(0)),
+    )
+    found = kc.simulate(kc.KNODE(robots[0], none).replace(**{"effects.0.rate": 9.0}), np.zeros((20, 0)), 0.01)
+    np.testing.assert_allclose(found.tip_position, moved(9.0).tip_position, atol=1e-9)
 
 
 @pytest.mark.slow

@@ -80,7 +80,8 @@ def some(family):
 
 ROD = {
     "sections": some(SectionChange), "loads": some(Load), "surroundings": some(Obstacle),
-    "effects": st.tuples(parts(Effect)), "base_end": parts(End).filter(lambda end: end.anywhere), "tip_end": parts(End),
+    "effects": st.tuples(parts(Effect)),
+    "base_end": parts(End).filter(lambda end: end.anywhere), "tip_end": parts(End),
 }  # fmt: skip
 TENDONS = {"tendon_offset": st.just(0.01), "tendon_angles": st.just([0.0, 2.0])}
 ROUTED = {

@@ -9,7 +9,8 @@ from knode_cosserat.rods.ends import Clamped, Free, Pinned, Universal
 L, RADIUS, E, DENSITY = 1.0, 0.001, 1e9, 1e3
 EI, MASS = E * np.pi * RADIUS**4 / 4, DENSITY * np.pi * RADIUS**2
 TIME = L**2 * np.sqrt(MASS / EI)
-#: roots of the characteristic equations: clamped and free, pinned, clamped; None: two free ends; of Universal, the base is pinned
+#: roots of the characteristic equations: clamped and free, pinned, clamped; Universal: base and tip pinned;
+#: None: two free ends
 ROOTS = {
     Free: [1.87510407, 4.69409113, 7.85475744, 10.99554073, 14.13716839],
     Pinned: [3.92660231, 7.06858275, 10.21017612, 13.35176878, 16.49336143],
