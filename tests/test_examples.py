@@ -272,3 +272,11 @@ def test_syringe_or_regulator(run):
 def test_concentric_tubes(run):
     jumps = run("concentric_tubes", steps=120)
     assert jumps[0.7] < 30.0 < 90.0 < jumps[1.6]
+
+@pytest.mark.slow
+def test_spinning_shaft(run):
+    found, exact = run("spinning_shaft", speeds=2)
+    np.testing.assert_allclose(found, exact, rtol=1e-4)
+    # spin parts the two ways of whirl
+    assert np.all(np.abs(exact[0, :, 0]) == pytest.approx(exact[0, :, 1]))
+    assert np.all(exact[1, :, 1] > 1.01 * np.abs(exact[1, :, 0]))

@@ -56,16 +56,19 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from knode_cosserat.control import LoopLog
+    from knode_cosserat.statics.modes import Modes
     from knode_cosserat.statics.workspace import Workspace
 
 __all__ = [
     "animate", "closed_loop", "compare", "curves", "error", "overview", "path",
     "prediction_against_measurement", "require_matplotlib", "shape", "spread", "states", "tensions", "tips",
-    "workspace",
+    "vibration", "workspace",
 ]  # fmt: skip
 
 #: default fields of `states`, if the system has them
 FIELDS = ("q", "w", "n", "m", "v", "u")
+#: largest displacement of a drawn mode, as a part of the extent of the robot
+SWING = 0.25
 #: largest number of drawn points of a workspace: more only make the file larger
 MOST_POINTS = 100_000
 
@@ -332,6 +335,38 @@ def curves(
             axes.set_xticks([], minor=True)
         if any(lines):
             legend_above(axes)
+    return figure
+
+
+def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
+    """Return a figure of the first modes of `kc.statics.modes`: both extremes about the equilibrium.
+
+    The largest displacement is drawn as a quarter of the robot's extent. Titles have frequency and damping.
+    """
+    if count < 1 or not len(modes.values):
+        raise ValueError(f"count is {count} of {len(modes.values)} modes; allowed is 1 or more")
+    still = modes.position.reshape(len(modes.position), -1, 3)
+    size = SWING * float(np.max(np.ptp(still, axis=(0, 1))))
+    shown = modes.shapes[:count].reshape(-1, *still.shape)
+    across = min(len(shown), 3 if columns == 2 else 2)
+    rows = -(-len(shown) // across)
+    width = width_of(columns)
+    with style():
+        figure = new_figure(width, rows * (width / across + 0.2))
+        grid = figure.add_gridspec(rows, across)
+        for k, shape in enumerate(shown):
+            seen = View(figure, grid[divmod(k, across)], "xyz")
+            ends = (still + size * shape, still - size * shape)
+            for points, look in (
+                (still, {"color": "#999999", "linewidth": 1.0}),
+                (ends[0], {"color": PALETTE[0], "linewidth": 1.8}),
+                (ends[1], {"color": PALETTE[1], "linewidth": 1.2, "linestyle": "--"}),
+            ):
+                for curve in np.swapaxes(points, 0, 1):
+                    seen.axes.plot(*seen.of(curve), **look)
+            seen.frame(np.concatenate([*ends, still]).reshape(-1, 3), zoom=0.8)
+            title = f"{k + 1}: {modes.frequency[k]:.4g} Hz, damping {modes.damping[k]:.2g}"
+            seen.axes.set_title(title)
     return figure
 
 

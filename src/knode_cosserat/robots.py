@@ -18,6 +18,7 @@ from knode_cosserat.rods import (
     tubes,
 )
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
@@ -43,6 +44,7 @@ __all__ = [
     "RoutedTendonRobot",
     "Scales",
     "SlenderRod",
+    "SpinningFrame",
     "Stretch",
     "System",
     "TendonRobot",

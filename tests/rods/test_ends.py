@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from scipy.special import ellipk
 
 import knode_cosserat as kc
-from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding
+from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding, Universal
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.solvers.recovery import likely_cause
 from knode_cosserat.solvers.result import Result
@@ -295,3 +295,26 @@ def test_what_nothing_holds_is_said_to_have_no_equilibrium_under_its_weight(resu
     # it may lie on the plane
     assert "nothing holds" not in cause(LOOSE, None)
     assert "nothing holds" not in cause(kc.load_robot("six-legged-robot"), None)
+
+
+# a universal joint
+
+
+@pytest.mark.slow
+def test_a_universal_joint_carries_a_moment_across_both_hinges_only():
+    """At the tip of a bent and twisted rod; a constraint does no work, so the stiffness is symmetric."""
+    beam = kc.robots.SlenderRod(
+        length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, nodes=11, gravity=[2.0, 1.0, 0.0],
+        base_end=Clamped(orientation=quaternion(0.0, 0.0, 0.6)),
+        tip_end=Universal(position=[0.05, 0.02, 0.44], orientation=[1.0, 0.0, 0.0, 0.0]),
+    )  # fmt: skip
+    found = kc.equilibrium(beam, np.zeros(0), space="lobatto4")
+    d = rotations(found.part("h")[0, -1]).as_matrix()[0]
+    m = np.asarray(found.part("m"))[0, -1]
+    cross = np.cross([1.0, 0.0, 0.0], d[:, 1])
+    assert abs(d[0, 1]) < 1e-9 and abs(d[2, 2]) < 0.95
+    np.testing.assert_allclose(np.cross(m, cross), 0.0, atol=1e-9 * np.linalg.norm(m))
+    assert np.linalg.norm(m) > 1e-3 * float(beam.Kbt[0, 0]) / L
+    assert kc.statics.stability(found).asymmetry < 1e-6
+    with pytest.raises(ValueError, match="base_end is universal; that is allowed as tip_end only"):
+        beam.replace(base_end=Universal())

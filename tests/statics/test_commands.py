@@ -109,3 +109,17 @@ def test_workspace_writes_and_draws(tmp_path):
 def test_wrong_arguments_end_in_one_line(arguments, message):
     ran = run(*arguments)
     assert ran.exit_code == 2 and message in ran.stderr and ran.stderr.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_modes_are_printed_and_drawn(rod, tmp_path):
+    arguments = ("modes", rod, "--set", "gravity=0,0,9.81", "--count", 3)
+    facts = told(*arguments, "--control", "base_z=0", "--picture", tmp_path / "modes.png")
+    hanging = kc.load_robot(rod).replace(gravity=(0.0, 0.0, 9.81))
+    found = kc.statics.modes(kc.equilibrium(hanging, np.zeros(3), space="lobatto4"), count=3)
+    np.testing.assert_allclose(facts["frequency"], found.frequency)
+    np.testing.assert_allclose(facts["damping"], found.damping)
+    assert (tmp_path / "modes.png").stat().st_size > 10_000
+    text = run(*arguments, "--control", "0,0,0").stdout
+    assert "damping ratio" in text and len(text.splitlines()) == 4
+    assert "no control is given" in run(*arguments).stderr

@@ -4,16 +4,18 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.ends import Clamped, Free, Pinned
+from knode_cosserat.rods.ends import Clamped, Free, Pinned, Universal
 
 L, RADIUS, E, DENSITY = 1.0, 0.001, 1e9, 1e3
 EI, MASS = E * np.pi * RADIUS**4 / 4, DENSITY * np.pi * RADIUS**2
 TIME = L**2 * np.sqrt(MASS / EI)
-#: roots of the characteristic equations: clamped and free, pinned, clamped; None: two free ends
+#: roots of the characteristic equations: clamped and free, pinned, clamped; Universal: base and tip pinned;
+#: None: two free ends
 ROOTS = {
     Free: [1.87510407, 4.69409113, 7.85475744, 10.99554073, 14.13716839],
     Pinned: [3.92660231, 7.06858275, 10.21017612, 13.35176878, 16.49336143],
     Clamped: [4.73004074, 7.85320462, 10.99560784, 14.13716549, 17.27875966],
+    Universal: [np.pi * k for k in range(1, 6)],
     None: [4.73004074, 7.85320462, 10.99560784, 14.13716549, 17.27875966],
 }
 
@@ -21,7 +23,8 @@ ROOTS = {
 def beam(end, nodes=40, **changes):
     rod = kc.robots.SlenderRod(
         length=L, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=nodes,
-        tip_end=end(position=(0.0, 0.0, L)) if end in (Pinned, Clamped) else Free(), **changes,
+        tip_end=Free() if end in (Free, None) else end(position=(0.0, 0.0, L)),
+        base_end=Pinned() if end is Universal else Clamped(), **changes,
     )  # fmt: skip
     if end is None:
         return kc.simulate(rod.replace(base_end=Free(), bending_damping=1e-15), np.zeros((2, 0)), 0.01 * TIME)
@@ -58,3 +61,20 @@ def test_what_has_no_modes_says_so():
     moving = kc.simulate(kc.load_robot("delrin-tendon-robot"), np.full((3, 4), [5.0, 0.0, 0.0, 0.0]), 0.05)
     with pytest.raises(ValueError, match="no equilibrium"):
         kc.statics.modes(moving)
+
+
+@pytest.mark.slow
+def test_a_figure_shows_both_extremes_about_the_equilibrium():
+    bent = kc.equilibrium(beam(Free, nodes=11).system.replace(gravity=(0.5, 0.0, 0.0)), np.zeros(0))
+    found = kc.statics.modes(bent, count=4)
+    np.testing.assert_array_equal(found.position, bent.position[0])
+    figure = kc.figures.vibration(found, count=3)
+    assert len(figure.axes) == 3
+    for k, axes in enumerate(figure.axes):
+        still, *ends = (np.stack(line.get_data_3d(), axis=-1) for line in axes.lines)
+        np.testing.assert_allclose((ends[0] + ends[1]) / 2.0, still, atol=1e-12)
+        moved = np.linalg.norm(ends[0] - still, axis=1).max()
+        assert moved == pytest.approx(0.25 * np.ptp(still, axis=0).max(), rel=1e-6)
+        assert f"{found.frequency[k]:.4g} Hz" in axes.get_title()
+    with pytest.raises(ValueError, match="count is 0 of 4 modes"):
+        kc.figures.vibration(found, count=0)

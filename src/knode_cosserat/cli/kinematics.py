@@ -1,4 +1,4 @@
-"""Commands on inverse kinematics and the workspace: reach, workspace."""
+"""Commands on equilibria: reach, modes, workspace."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from knode_cosserat.cli.arguments import (
 )
 from knode_cosserat.cli.output import vector_text, write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.robots import Held
 from knode_cosserat.cli.summaries import stability_summary
 from knode_cosserat.rods.parameters import in_other_unit
 
@@ -161,6 +162,35 @@ def reach(
     if not found.from_rest and facts["position"]:
         lines.append(f"the robot has several equilibria under these {word}: start near this one to reach it")
     write_output(as_json, facts, lines)
+
+
+@app.command(
+    epilog=examples(
+        "modes delrin-routed-tendon-robot --tension 7,5,5,7",
+        "modes my-rod.yaml --control base_z=0.1 --count 4 --picture modes.png",
+    )
+)
+def modes(
+    model: Model,
+    held: Held,
+    number: Annotated[int, option("N", "Largest number of modes.", "--count", min=1)] = 10,
+    picture: Annotated[Path | None, Picture] = None,
+    as_json: Json = False,
+) -> None:
+    """Compute the modes of vibration about the equilibrium under a constant control."""
+    require_writable(picture)
+    drawing = figures() if picture else None
+    import knode_cosserat as kc
+
+    system = model.load()
+    found = kc.statics.modes(kc.equilibrium(system, held.of(system), space="lobatto4"), count=number)
+    if drawing:
+        drawing.vibration(found).savefig(picture)
+    facts = {
+        "robot": model.robot, "frequency": found.frequency.tolist(), "damping": found.damping.tolist(),
+        "growth_rate": found.values.real.tolist(), "error": found.error.tolist(),
+    }  # fmt: skip
+    write_output(as_json, facts, repr(found).splitlines(), picture=picture)
 
 
 class _Samples(NamedTuple):

@@ -144,7 +144,7 @@ def simulate(
     write_output(report.as_json, facts, lines, out=out, figure=figure)
 
 
-class _Held(NamedTuple):
+class Held(NamedTuple):
     """Constant control of an equilibrium: from tensions, from numbers in order, or by name."""
 
     tension: Annotated[str | None, option("N,N,…", "Tensions of all tendons (N), such as 7,5,5,7.")] = None
@@ -196,7 +196,7 @@ class _Held(NamedTuple):
 )
 def equilibrium(
     model: Model,
-    held: _Held,
+    held: Held,
     space: Space = "lobatto2",
     out: Annotated[Path | None, NetCDF] = None,
     as_json: Json = False,

@@ -104,6 +104,28 @@ class Pinned(End):
         return jnp.concatenate([y.p - held.p, -m])
 
 
+class Universal(Pinned):
+    """A pinned tip that cannot spin about the rod: a universal joint, whose cross lies along two hinges.
+
+    One hinge is e₁ of the held end, the other d₂ of the rod. The cross keeps them at right angles, e₁·d₂ = 0,
+    and transmits a moment about e₁ × d₂ only. Both are exact, and regular in every admissible pose.
+    """
+
+    kind: ClassVar[str] = "universal"
+    anywhere: ClassVar[bool] = False
+    conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (
+        _POSITION,
+        ("turn", 1, "rad", "rotation of the hinges out of their right angle"),
+        ("m", 2, "N m", "moment at the tip about the hinges"),
+    )
+
+    def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
+        """Return the position error, e₁·d₂, and the residual of zero moment about both."""
+        fixed, turning = rotation_matrix(held.h)[:, 0], rotation_matrix(y.h)[:, 1]
+        rows = [jnp.sum(fixed * turning), -jnp.sum(m * fixed), -jnp.sum(m * turning)]
+        return jnp.concatenate([y.p - held.p, jnp.stack(rows)])
+
+
 class Driven(Clamped):
     """A clamped end moved by the control: along global axes (m), and about them (rad)."""
 

@@ -72,6 +72,8 @@ class Contribution:
     held: ClassVar[bool] = False
     #: True if the part damps a motion; parts with internal variables need not state it
     damps: ClassVar[bool] = False
+    #: True if the part's loads on a robot at rest change with its velocity without damping it
+    gyroscopic: ClassVar[bool] = False
     #: place at which a point load acts (`PointLoad`); None for other parts
     applied_at: ClassVar[float | None] = None
 
@@ -147,6 +149,16 @@ class Contribution:
     def usual_control(self, rod: Any, field: Field) -> float | None:
         """Return a high value of a control, for sliders that begin at zero; None if the unit decides it."""
         return None
+
+    # the frame of the robot's states; that of its parts, loads and gravity is the global one
+
+    def absolute(self, t: Any, motion: Any) -> Any:
+        """Return the motion (`loads.Motion`) in the global frame at t (s); by default the states' motion."""
+        return motion
+
+    def seen(self, t: Any, vector: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Return a vector of the global frame at t (s) in the frame of the states."""
+        return vector
 
     # the tendons of its robot
 

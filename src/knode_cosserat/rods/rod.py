@@ -352,9 +352,21 @@ class SlenderRod(System):
         v = Viscoelastic(material.Kse, material.Bse, n + material.Kse @ self.v_star)
         return MaterialLaw({"v": v, "u": Viscoelastic(material.Kbt, material.Bbt, bent)})
 
+    def absolute(self, t: Any, motion: Motion) -> Motion:
+        """Return a motion of the states in the global frame, by the parts that are frames."""
+        for part in self.parts.values():
+            motion = part.absolute(t, motion)
+        return motion
+
+    def seen(self, t: Any, vector: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Return a vector of the global frame in the frame of the states."""
+        for part in reversed(self.parts.values()):
+            vector = part.seen(t, vector)
+        return vector
+
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u, linear but for the parts, and of internal variables."""
-        motion = Motion.of(self.y_layout, y, y_t)
+        motion = self.absolute(t, Motion.of(self.y_layout, y, y_t))
         parts = self.at_parts(RodPoint(self, s, t, y, y_t, control, motion, self.material(s, control)))
         evolutions = {name: law for part, point in parts for name, law in part.evolutions(point).items()}
 
@@ -369,8 +381,9 @@ class SlenderRod(System):
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s (paper eq. 10, spatial derivatives of the rod)."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
-        motion, material = Motion.of(self.y_layout, y, y_t), self.material(s, control)
-        _, R, q, w, q_t, w_t = motion
+        relative, material = Motion.of(self.y_layout, y, y_t), self.material(s, control)
+        R, motion = relative.R, self.absolute(t, relative)
+        _, _, q, w, q_t, w_t = motion
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         v_t, u_t = self.z_layout.get(z_t, "v"), self.z_layout.get(z_t, "u")
         rhoA, rhoJ = material.rhoA, material.rhoJ
@@ -380,15 +393,15 @@ class SlenderRod(System):
 
         p_s = dot(R, v)
         h_s = quaternion_rate(h, u)
-        n_s = dot(R, rhoA * (cross(w, q) + q_t) + dragged) - rhoA * self.gravity
+        n_s = dot(R, rhoA * (cross(w, q) + q_t) + dragged) - rhoA * self.seen(t, self.gravity)
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
-        q_s = v_t - cross(u, q) + cross(w, v)
-        w_s = u_t - cross(u, w)
+        q_s = v_t - cross(u, relative.q) + cross(relative.w, v)
+        w_s = u_t - cross(u, relative.w)
         rates: Fields = {}
         for part, point in self.at_parts(RodPoint(self, s, t, y, y_t, control, motion, material, z, z_t)):
             load = part.load(point)
             if load is not None:
-                n_s, m_s = n_s - load.force, m_s - load.moment
+                n_s, m_s = n_s - self.seen(t, load.force), m_s - self.seen(t, load.moment)
             rates |= part.rates(point)
         return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
 
@@ -409,19 +422,19 @@ class SlenderRod(System):
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
-        wrench = self._point_wrench(dict(zip(self._places, acting, strict=True)), y, y_t, control)
+        wrench = self._point_wrench(dict(zip(self._places, acting, strict=True)), t, y, y_t, control)
         change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
         return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
 
-    def _point_wrench(self, weights: Any, y: Any, y_t: Any, control: Any) -> Wrench:
+    def _point_wrench(self, weights: Any, t: Any, y: Any, y_t: Any, control: Any) -> Wrench:
         """Return the sum of the point loads, each times the weight of its place."""
-        motion = Motion.of(self.y_layout, y, y_t)
+        motion = self.absolute(t, Motion.of(self.y_layout, y, y_t))
         acting = [
             (part, weights[part.applied_at], input)
             for part, input in self.inputs(control)
             if part.applied_at in weights
         ]
-        return point_wrench(acting, motion, self.gravity)
+        return Wrench(*(self.seen(t, each) for each in point_wrench(acting, motion, self.gravity)))
 
     # the two ends, and rest
 
@@ -478,7 +491,7 @@ class SlenderRod(System):
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         if any(part.applied_at == 1.0 for part in self.parts.values()):
-            loaded = self._point_wrench({1.0: 1.0}, y, y_t, control)
+            loaded = self._point_wrench({1.0: 1.0}, t, y, y_t, control)
             n, m = n - loaded.force, m - loaded.moment
         if type(self.tip_end) is Free:
             rows = [-n, -m]
@@ -489,7 +502,8 @@ class SlenderRod(System):
         if "h" in self.base_unknowns:
             h = self.y_layout.get(y, "h")
             rows.append(jnp.sum(h * h)[None] - 1.0)
-        point = RodPoint(self, self.length, t, y, y_t, control, Motion.of(self.y_layout, y, y_t))
+        motion = self.absolute(t, Motion.of(self.y_layout, y, y_t))
+        point = RodPoint(self, self.length, t, y, y_t, control, motion)
         others = (part.tip_rows(at) for part, at in self.at_parts(point))
         return jnp.concatenate([*rows, *(row for row in others if row is not None)])
 

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalised
 from knode_cosserat.statics.stability import checked_equilibrium
 from knode_cosserat.trajectory import Trajectory
@@ -24,11 +25,13 @@ class Modes:
         error: part by which λ may be wrong (m,): the difference between grids of 21 and 41 nodes (or 11 and
             21), of which the scheme of order 4 leaves a fifteenth.
         shapes: displacements of the nodes in each mode (m, nodes, 3), or (m, nodes, rods, 3), with maximum 1.
+        position: positions of the nodes in the equilibrium (nodes, 3), or (nodes, rods, 3), in m.
     """
 
     values: Float[np.ndarray, " m"]
     error: Float[np.ndarray, " m"]
     shapes: Float[np.ndarray, "m nodes *rods 3"]
+    position: Float[np.ndarray, "nodes *rods 3"]
 
     @property
     def frequency(self) -> Float[np.ndarray, " m"]:
@@ -79,4 +82,5 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
             other = shapes[same].reshape(shape.shape)
             shape = shape - other * np.vdot(other, shape) / np.vdot(other, other)
         shapes.append(normalised(shape))
-    return Modes(values, error, np.stack(shapes))
+    p = in_strands(system, y)[..., strand_of(system).y_layout.slice("p")]
+    return Modes(values, error, np.stack(shapes), p[:, 0] if p.shape[1] == 1 else p)

@@ -8,7 +8,9 @@ of negative eigenvalues is constant. Buckling between two nodes is counted too.
 Loads that follow the rod may have no potential. The stiffness is then unsymmetric on any grid, and its
 eigenvalues decide nothing: Beck's column flutters at 20.05 EI/L² and has no other critical load. The
 eigenvalues of its linearised motion decide (`dynamics`), with the robot's own damping. They also decide for
-robots with further unknowns than forces and moments, such as tensions of reels, or torsions of tubes.
+robots with further unknowns than forces and moments, such as tensions of reels or torsions of tubes, and if
+the energy of a spinning robot has no minimum: gyroscopic forces may stabilise it, and damping of the material
+undoes that (Thomson and Tait).
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.replay import still_state
@@ -38,6 +41,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: largest residual of an equilibrium, in natural units
 BALANCED = 1e-6
+#: time (s) at which an equilibrium must still be one; no common rate of a frame makes whole turns in it
+LATER = 0.618
 #: singular value of an end's motion below which it counts as held, as a fraction of the largest
 HELD = 1e-9
 #: largest rate, in natural units, of a quantity that does not depend on poses and stresses
@@ -118,7 +123,8 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     fall. An equilibrium from another scheme along the rod is solved again by Lobatto4. Loads with a potential
     are decided by the energy; friction is then ignored, because it can only stabilise. Other loads, such as
     those that follow the rod, are decided by the eigenvalues of the linearised motion: it may grow without
-    oscillation (divergence) or with one (flutter). The robot's own damping enters, also if it is zero.
+    oscillation (divergence) or with one (flutter). So is a robot in a spinning frame whose energy has no
+    minimum, which its spin may stabilise. The robot's own damping enters, also if it is zero.
 
     Args:
         equilibrium: result of `kc.equilibrium` for one robot, or a trajectory that has come to rest.
@@ -186,6 +192,13 @@ def checked_equilibrium(equilibrium: Any, row: Any) -> tuple[System, np.ndarray,
         raise ValueError(
             f"row {row} is no equilibrium: {off:.2g} of natural size is left when every rate is zero; "
             f"allowed is {BALANCED:g}"
+        )
+    later = still_state(system, space, control, y, LATER)
+    off = float(np.max([later.error, np.max(np.abs(later.tip / scales.tip))]))
+    if not off <= BALANCED:
+        raise ValueError(
+            f"row {row} is no equilibrium at later times: loads turn in the robot's frame; allowed in a "
+            "spinning frame are gravity and dead loads along its axis"
         )
     return system, y, z, control
 
@@ -293,13 +306,16 @@ def _by_motion(system: System, y: np.ndarray, control: np.ndarray) -> Stability:
 def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:
     """Return the stability if two divisions in a row agree, or if the last ones are all unstable."""
     found: list[_Variation] = []
-    sure = False
+    sure, parts = False, getattr(strand_of(nominal_model(system)), "parts", {})
+    gyroscopic = any(part.gyroscopic for part in parts.values())
     for pieces in divided(system, y, control, by):
         _require_rest(system, pieces.ends.base, pieces.moved)
         found.append(_variation(system, pieces))
         asymmetry = [each.asymmetry for each in found[-2:]]
         least = max(UNSYMMETRIC, found[-1].rounding)
-        if len(found) > 1 and asymmetry[1] > max(least, FALLING * asymmetry[0]):
+        # an equilibrium without a minimum of the energy may be stable if it spins
+        spins = gyroscopic and found[-1].count > 0
+        if len(found) > 1 and (spins or asymmetry[1] > max(least, FALLING * asymmetry[0])):
             return found[-1].by_motion(system, y, control)
         # a piece that is unstable by itself may hide negative eigenvalues
         before, sure = sure, firm(pieces.stiffness)
