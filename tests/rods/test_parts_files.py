@@ -15,9 +15,9 @@ import knode_cosserat as kc
 from knode_cosserat.learning.config import NetworkOptions
 from knode_cosserat.learning.residual import network
 from knode_cosserat.rods.ends import Driven, End
+from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Load, PointWrench
 from knode_cosserat.rods.parameters import Choice, kinds_of, parameters_of, stated_of
-from knode_cosserat.rods.parts import Effect
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
 from knode_cosserat.rods.routing import FunctionRouting, Routing
 from knode_cosserat.rods.section import SectionChange
@@ -81,7 +81,7 @@ def some(family):
 
 ROD = {
     "sections": some(SectionChange), "loads": some(Load), "surroundings": some(Obstacle),
-    "effects": st.tuples(parts(Effect)),
+    "effects": st.tuples(parts(SpinningFrame)),
     "base_end": parts(End).filter(lambda end: end.anywhere), "tip_end": parts(End),
 }  # fmt: skip
 TENDONS = {"tendon_offset": st.just(0.01), "tendon_angles": st.just([0.0, 2.0])}
