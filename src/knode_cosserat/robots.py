@@ -19,6 +19,7 @@ from knode_cosserat.rods import (
 )
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.frame import SpinningFrame
+from knode_cosserat.rods.insertion import Insertion
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter
@@ -35,6 +36,7 @@ __all__ = [
     "Drawing",
     "Effect",
     "Ends",
+    "Insertion",
     "Layout",
     "Observed",
     "ParallelRobot",

@@ -17,6 +17,7 @@ from knode_cosserat.learning.residual import network
 from knode_cosserat.rods.ends import Clamped, Driven, Pinned, Pose, Universal, velocities
 from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Motion, PointWrench
+from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rotation import quaternion_of, quaternion_product, rotation_matrix
 from knode_cosserat.statics.stability import checked_equilibrium
@@ -64,7 +65,8 @@ def test_the_absolute_motion_is_that_of_the_turned_pose(seed, t):
         return Pose(p, h)
 
     robot = rod(*frames)
-    found, expected = robot.absolute(t, motion_of(seen, t)), motion_of(on_the_ground, t)
+    point = RodPoint(robot, 0.0, t, None, None)
+    found, expected = robot.absolute(point, motion_of(seen, t)).motion, motion_of(on_the_ground, t)
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9)
     # a vector of the ground, and back

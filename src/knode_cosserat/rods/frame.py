@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.loads import Motion
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.parts import Effect
+from knode_cosserat.rods.parts import Effect, RodPoint
 from knode_cosserat.rotation import cross, dot, quaternion_of, rotation_matrix
 
 
@@ -52,10 +52,10 @@ class SpinningFrame(Effect):
         """Return Q at time t (s)."""
         return rotation_matrix(quaternion_of(t * self.spin))
 
-    def absolute(self, t: Any, motion: Motion) -> Motion:
+    def absolute(self, point: RodPoint, motion: Motion) -> Motion:
         """Return the motion in the global frame."""
         p, R, q, w, q_t, w_t = motion
-        Q, r = self.turn(t), p - self.point
+        Q, r = self.turn(point.t), p - self.point
         carried, spin = dot(R.T, cross(self.spin, r)), dot(R.T, self.spin)
         return Motion(
             self.point + dot(Q, r), Q @ R, q + carried, w + spin,

@@ -40,8 +40,8 @@ class RodPoint(NamedTuple):
     t: Any
     y: Float[Any, " y"]
     y_t: Float[Any, " y"]
-    #: control of the robot
-    control: Any
+    #: control of the robot; None where rates of the base are asked for
+    control: Any = None
     #: pose and velocities (`loads.Motion`)
     motion: Any = None
     #: section and material (`section.Material`); None at the tip
@@ -87,6 +87,9 @@ class Contribution:
         """Places of discontinuity, as fractions of the length."""
         return ()
 
+    def check(self, rod: Any) -> None:
+        """Raise `ParameterError` if the part and others of its robot exclude each other."""
+
     def y_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
         """Return the part's fields of y."""
         return ()
@@ -101,6 +104,10 @@ class Contribution:
 
     def base_y(self, point: RodPoint) -> Fields:
         """Return the part's fields of y at the base that follow from the unknowns there, in `point.y`."""
+        return {}
+
+    def base_rates(self, point: RodPoint) -> Fields:
+        """Return the part's fields of y at the base that follow from the rates there, in `point.y_t`."""
         return {}
 
     def tip_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
@@ -138,6 +145,10 @@ class Contribution:
         """Return the rates along the rod of the part's fields of y."""
         return {}
 
+    def along_grid(self, point: RodPoint, y_s: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return the rates along the grid from those along the rod; by default they are the same."""
+        return y_s
+
     def tip_rows(self, point: RodPoint) -> Any:
         """Return the residuals of the part's conditions at the tip, one number a row; None without any."""
         return None
@@ -152,8 +163,8 @@ class Contribution:
 
     # the frame of the robot's states; that of its parts, loads and gravity is the global one
 
-    def absolute(self, t: Any, motion: Any) -> Any:
-        """Return the motion (`loads.Motion`) in the global frame at t (s); by default the states' motion."""
+    def absolute(self, point: RodPoint, motion: Any) -> Any:
+        """Return the material's motion (`loads.Motion`) in the global frame from the states' motion."""
         return motion
 
     def seen(self, t: Any, vector: Float[Any, "3"]) -> Float[Any, "3"]:

@@ -149,6 +149,8 @@ class SlenderRod(System):
                 f"tip_radius is given with a {form.kind} cross_section; allowed is a round or hollow one. "
                 "Use sections with a stretch, such as {kind: stretch, radius: [1, -0.5]}"
             )
+        for part in self.parts.values():
+            part.check(self)
 
     # parts
 
@@ -352,11 +354,11 @@ class SlenderRod(System):
         v = Viscoelastic(material.Kse, material.Bse, n + material.Kse @ self.v_star)
         return MaterialLaw({"v": v, "u": Viscoelastic(material.Kbt, material.Bbt, bent)})
 
-    def absolute(self, t: Any, motion: Motion) -> Motion:
-        """Return a motion of the states in the global frame, by the parts that are frames."""
+    def absolute(self, point: RodPoint, motion: Motion) -> RodPoint:
+        """Return a point with the material's motion in the global frame, by the parts and the states' motion."""
         for part in self.parts.values():
-            motion = part.absolute(t, motion)
-        return motion
+            motion = part.absolute(point, motion)
+        return point._replace(motion=motion)
 
     def seen(self, t: Any, vector: Float[Any, "3"]) -> Float[Any, "3"]:
         """Return a vector of the global frame in the frame of the states."""
@@ -366,8 +368,8 @@ class SlenderRod(System):
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the law of v and u, linear but for the parts, and of internal variables."""
-        motion = self.absolute(t, Motion.of(self.y_layout, y, y_t))
-        parts = self.at_parts(RodPoint(self, s, t, y, y_t, control, motion, self.material(s, control)))
+        point = RodPoint(self, s, t, y, y_t, control, material=self.material(s, control))
+        parts = self.at_parts(self.absolute(point, Motion.of(self.y_layout, y, y_t)))
         evolutions = {name: law for part, point in parts for name, law in part.evolutions(point).items()}
 
         def law(internal: Fields) -> MaterialLaw:
@@ -382,8 +384,9 @@ class SlenderRod(System):
         """Return y_s (paper eq. 10, spatial derivatives of the rod)."""
         h, n = self.y_layout.get(y, "h"), self.y_layout.get(y, "n")
         relative, material = Motion.of(self.y_layout, y, y_t), self.material(s, control)
-        R, motion = relative.R, self.absolute(t, relative)
-        _, _, q, w, q_t, w_t = motion
+        point = RodPoint(self, s, t, y, y_t, control, None, material, z, z_t)
+        point = self.absolute(point, relative)
+        R, (_, _, q, w, q_t, w_t) = relative.R, point.motion
         v, u = self.z_layout.get(z, "v"), self.z_layout.get(z, "u")
         v_t, u_t = self.z_layout.get(z_t, "v"), self.z_layout.get(z_t, "u")
         rhoA, rhoJ = material.rhoA, material.rhoJ
@@ -398,12 +401,16 @@ class SlenderRod(System):
         q_s = v_t - cross(u, relative.q) + cross(relative.w, v)
         w_s = u_t - cross(u, relative.w)
         rates: Fields = {}
-        for part, point in self.at_parts(RodPoint(self, s, t, y, y_t, control, motion, material, z, z_t)):
-            load = part.load(point)
+        parts = self.at_parts(point)
+        for part, at in parts:
+            load = part.load(at)
             if load is not None:
                 n_s, m_s = n_s - self.seen(t, load.force), m_s - self.seen(t, load.moment)
-            rates |= part.rates(point)
-        return jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
+            rates |= part.rates(at)
+        y_s = jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
+        for part, at in parts:
+            y_s = part.along_grid(at, y_s)
+        return y_s
 
     # discontinuities: places where something begins, ends or pulls
 
@@ -422,19 +429,20 @@ class SlenderRod(System):
         self, acting: Float[Any, " cuts"], t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], control: Any
     ) -> Float[Any, " y"]:
         """Return y on the far side of the acting cuts: n and m less the point loads there."""
-        wrench = self._point_wrench(dict(zip(self._places, acting, strict=True)), t, y, y_t, control)
+        point = RodPoint(self, None, t, y, y_t, control)
+        wrench = self._point_wrench(dict(zip(self._places, acting, strict=True)), point)
         change = jnp.concatenate([np.zeros(7), wrench.force, wrench.moment])
         return y - jnp.concatenate([change, np.zeros(self.y_layout.size - 13)])
 
-    def _point_wrench(self, weights: Any, t: Any, y: Any, y_t: Any, control: Any) -> Wrench:
+    def _point_wrench(self, weights: Any, point: RodPoint) -> Wrench:
         """Return the sum of the point loads, each times the weight of its place."""
-        motion = self.absolute(t, Motion.of(self.y_layout, y, y_t))
+        motion = self.absolute(point, Motion.of(self.y_layout, point.y, point.y_t)).motion
         acting = [
             (part, weights[part.applied_at], input)
-            for part, input in self.inputs(control)
+            for part, input in self.inputs(point.control)
             if part.applied_at in weights
         ]
-        return Wrench(*(self.seen(t, each) for each in point_wrench(acting, motion, self.gravity)))
+        return Wrench(*(self.seen(point.t, each) for each in point_wrench(acting, motion, self.gravity)))
 
     # the two ends, and rest
 
@@ -490,8 +498,9 @@ class SlenderRod(System):
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
+        point = RodPoint(self, self.length, t, y, y_t, control)
         if any(part.applied_at == 1.0 for part in self.parts.values()):
-            loaded = self._point_wrench({1.0: 1.0}, t, y, y_t, control)
+            loaded = self._point_wrench({1.0: 1.0}, point)
             n, m = n - loaded.force, m - loaded.moment
         if type(self.tip_end) is Free:
             rows = [-n, -m]
@@ -502,8 +511,7 @@ class SlenderRod(System):
         if "h" in self.base_unknowns:
             h = self.y_layout.get(y, "h")
             rows.append(jnp.sum(h * h)[None] - 1.0)
-        motion = self.absolute(t, Motion.of(self.y_layout, y, y_t))
-        point = RodPoint(self, self.length, t, y, y_t, control, motion)
+        point = self.absolute(point, Motion.of(self.y_layout, y, y_t))
         others = (part.tip_rows(at) for part, at in self.at_parts(point))
         return jnp.concatenate([*rows, *(row for row in others if row is not None)])
 
@@ -557,10 +565,14 @@ class RodEnds(Ends, of=SlenderRod):
     def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
         """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
         rod = self.system
-        if type(rod.base_end) is Clamped:
-            return y
-        q, w = velocities(rod.pose(y), rod.pose(y_t))
-        return jnp.concatenate([y[:13], q, w, y[19:]])
+        if type(rod.base_end) is not Clamped:
+            q, w = velocities(rod.pose(y), rod.pose(y_t))
+            y = jnp.concatenate([y[:13], q, w, y[19:]])
+        point = RodPoint(rod, 0.0, None, y, y_t)
+        for part in rod.parts.values():
+            for name, value in part.base_rates(point).items():
+                y = rod.y_layout.replaced(y, (name,), value)
+        return y
 
 
 class _RodObserved(Observed, of=SlenderRod):

@@ -206,6 +206,10 @@ class _Tubes(CrossSection):
         straight = self.values("transmission") - point.input[1::2]
         return {"angle": point.input[::2] + straight * self.torsions(point) / self.GJ}
 
+    def along_grid(self, point: RodPoint, y_s: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return the rates times that of arclength along the grid."""
+        return y_s * self.arclength(point.rod, point.s, point.input)[1]
+
     def rest_curvatures(self, point: RodPoint) -> tuple[Any, Any]:
         """Return 1 for each tube that is present, and κᵢ (n, 2) in the frame of the rod."""
         presence, curvature = self.present(point.rod, point.s, point.input)
@@ -271,23 +275,16 @@ class ConcentricTubeRobot(SlenderRod):
         lambda robot: _Tubes(robot.tubes, robot.tube_friction, robot.length)
     )
 
-    def _tubes(self, control: Any) -> tuple[_Tubes, Any]:
-        """Return the tubes and their control."""
-        return next((part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes))
-
     def material(self, s: Any, control: Any) -> Material:
         """Return the sum of the tubes that are present."""
-        tubes, input = self._tubes(control)
+        tubes, input = next(
+            (part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes)
+        )
         section = tubes.section(self, s, tubes.present(self, s, input)[0])
         return Material(
             section.Kse, self.shear_damping, section.Kbt, self.bending_damping, self.u_star,
             section.rhoA, section.rhoJ, section.radius,
         )  # fmt: skip
-
-    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
-        """Return y_s by the grid."""
-        tubes, input = self._tubes(control)
-        return super().balance(s, t, y, y_t, z, z_t, control) * tubes.arclength(self, s, input)[1]
 
 
 class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
