@@ -294,3 +294,44 @@ def test_a_control_leaves_some_stiffness(gain):
     stepper = kc.solvers.Stepper(rod, 0.02)
     with pytest.raises(ValueError, match="section0_input"):
         stepper.step(np.array([1.2 * limit]))
+
+
+def segment(**changes):
+    """A segment with three parameters: two curvatures and its extension."""
+    gains = [
+        {"curvature_gain": [1.0, 0.0, 0.0]},
+        {"curvature_gain": [0.0, 1.0, 0.0]},
+        {"extension_gain": 1.0},
+    ]
+    parts = tuple(kc.robots.Stretch(controlled=True, **gain) for gain in gains)
+    return CHANGED.replace(sections=parts, loads=(), nodes=11, **changes)
+
+
+def test_an_extended_segment_is_an_arc_of_its_own_length():
+    x, y, extension = 3.0, -4.0, 0.25
+    found = rest(segment(), (x, y, extension))
+    bent = np.hypot(x, y)
+    radius, angle = (1.0 + extension) / bent, bent * L
+    across = radius * (1.0 - np.cos(angle))
+    expected = [across * y / bent, -across * x / bent, radius * np.sin(angle)]
+    np.testing.assert_allclose(found.tip_position[0], expected, atol=1e-7)
+    np.testing.assert_allclose(found.part("n"), 0.0, atol=1e-7 * EI)
+    # made so: at rest without a control
+    made = segment().replace(**{
+        "sections.0.curvature": [x, 0.0, 0.0], "sections.1.curvature": [0.0, y, 0.0],
+        "sections.2.extension": extension,
+    })  # fmt: skip
+    still, strains = made.rest(L)
+    np.testing.assert_allclose(still[:3], expected, atol=1e-9)
+    np.testing.assert_allclose(strains, [0.0, 0.0, 1.0 + extension, x, y, 0.0], atol=1e-12)
+    assert made.control_layout.fields[2].low == pytest.approx(-1.25)
+
+
+def test_an_extended_cantilever_vibrates_at_its_lower_frequency():
+    """Mass ρA/(1+ε) and stiffness EI (1+ε) per present length: ω (1+ε) is constant."""
+    thin = segment(radius=1e-3, bending_damping=1e-7)
+    short, long = (
+        np.abs(kc.statics.modes(rest(thin, (0.0, 0.0, extension)), count=1).values[0])
+        for extension in (0.0, 0.3)
+    )
+    assert short / long == pytest.approx(1.3, rel=1e-4)

@@ -33,7 +33,6 @@ from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, as_number, choice, parameter
 from knode_cosserat.rods.parts import Effect, RodPoint, Stretched
 from knode_cosserat.rods.routing import OffsetPaths, path_lengths
-from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.tendon_law import Stretching, Tendons, stretches
 
 #: standard pressure of the atmosphere (Pa)
@@ -133,9 +132,8 @@ class Chambers(Stretched, Effect):
         """Return α and α/λ*."""
         if self.area_by_stretch is None:
             return 0.0, 0.0
-        rest = stretches(
-            jnp.asarray(ALONG), jnp.asarray(point.material.u_star), jnp.asarray(r), jnp.asarray(r_s)
-        )
+        strains = point.material.v_star, point.material.u_star
+        rest = stretches(*map(jnp.asarray, (*strains, r, r_s)))
         return self.area_by_stretch, self.area_by_stretch / rest
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
@@ -192,12 +190,8 @@ class Chambers(Stretched, Effect):
         return {} if self.drive == "pressure" else {self._name(rod, "volume"): self._rest_volume(rod, s)}
 
     def _rest_volume(self, rod: Any, s: Any) -> Float[Any, " c"]:
-        still = np.zeros(rod.control_layout.size)
-
         def path(at: Any) -> Float[Any, " c"]:
-            return path_lengths(
-                self.paths(rod).routings, at, rod.length, lambda at: rod.material(at, still).u_star
-            )
+            return path_lengths(self.paths(rod).routings, at, rod.length, rod.strains_at_rest)
 
         begin, end = self.begin * rod.length, self.end * rod.length
         return self.rest_area * (path(jnp.clip(s, begin, end)) - path(begin))

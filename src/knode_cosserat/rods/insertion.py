@@ -1,8 +1,8 @@
 """Insertion: a rod that is fed through a hole at its base, so that the length beyond the hole changes.
 
-The grid spans the exposed length ℓ. A place of the grid at s of the robot's length L is at the arclength s ℓ/L
-from the hole, and all rates along the grid are multiplied by ℓ/L. Material moves along the grid at the speed
-c = ℓ_t (1 - s/L): by ℓ_t at the hole, by zero at the tip. With the velocities q and ω of the grid's places,
+The grid spans the exposed length ℓ. A place of the grid at s of the robot's length L is at the arclength
+s ℓ/L from the hole, and all rates along the grid are multiplied by ℓ/L. Material moves along the grid at the
+speed c = ℓ_t (1 - s/L), which is ℓ_t at the hole and zero at the tip. With q and ω of the grid's places,
 
     q_a = q + c v,     ω_a = ω + c u                                      motion of the material
     q_s = v_t + γ v - u × q + ω × v,     ω_s = u_t + γ u - u × ω          compatibility, γ = ℓ_t/ℓ
@@ -13,9 +13,10 @@ the force and the moment of the rod less c R P and c R H, so that no strain is d
     n_s = R (P_t + ω × P + γ P) - f,     m_s = R (H_t + ω × H + γ H) - p_s × (n + c R P) - l
     (K - c² ρA) v + … = Rᵀn + K v* + c ρA q,     (Kbt - c² ρJ) u + … = Rᵀm + Kbt u* + c ρJ ω
 
-This is the balance of an axially moving beam (Stylianou & Tabarrok 1994) at large deflection. The accelerations
-of loads along the rod, such as the added mass of water, and the rates of strain in the material's damping are
-those of the grid's places. Their relative error is γ times the time in which they change, or the damping's own.
+This is the balance of an axially moving beam (Stylianou & Tabarrok 1994) at large deflection. The rates of
+strain in the material's damping, and accelerations in loads along the rod, such as the added mass of water,
+are those of the grid's places. Their relative error is γ times the time in which they change. A control
+that is linear from row to row has steps of its rate there; "bdf2" resolves the force of acceleration in a row.
 """
 
 from __future__ import annotations
@@ -46,8 +47,8 @@ class Insertion(Effect):
     actuates: ClassVar[bool] = True
 
     reserve: Any = parameter(
-        "m", "length behind the hole without insertion; the rod cannot be inserted by more", low=0.0, high=20.0,
-        default=0.0,
+        "m", "length behind the hole without insertion; the rod cannot be inserted by more", low=0.0,
+        high=20.0, default=0.0,
     )  # fmt: skip
     retraction: Any = parameter(
         "m", "largest length to draw back into the hole, less than the robot's length", low=0.0, high=20.0,

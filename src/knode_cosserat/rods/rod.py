@@ -304,12 +304,12 @@ class SlenderRod(System):
         )  # fmt: skip
         if not self.changes:
             return plain
-        radius, stiffness, curvature = self.differences(s, control)
+        radius, stiffness, curvature, extension = self.differences(s, control)
         area = radius * radius
         return Material(
             plain.Kse * (area * stiffness), plain.Bse * area, plain.Kbt * (area * area * stiffness),
             plain.Bbt * (area * area), curvature, plain.rhoA * area, plain.rhoJ * (area * area),
-            plain.radius * radius,
+            plain.radius * radius, plain.v_star * (1.0 + extension),
         )  # fmt: skip
 
     def differences(self, s: Any, control: Any) -> Differences:
@@ -351,11 +351,11 @@ class SlenderRod(System):
         material = self.material(s, control)
         n, m = self.stresses(y)
         bent = m if not self.sections else m + dot(material.Kbt, material.u_star)
-        v = Viscoelastic(material.Kse, material.Bse, n + material.Kse @ self.v_star)
+        v = Viscoelastic(material.Kse, material.Bse, n + material.Kse @ material.v_star)
         return MaterialLaw({"v": v, "u": Viscoelastic(material.Kbt, material.Bbt, bent)})
 
     def absolute(self, point: RodPoint, motion: Motion) -> RodPoint:
-        """Return a point with the material's motion in the global frame, by the parts and the states' motion."""
+        """Return a point with the material's motion in the global frame, from the states' motion."""
         for part in self.parts.values():
             motion = part.absolute(point, motion)
         return point._replace(motion=motion)
@@ -450,12 +450,12 @@ class SlenderRod(System):
         """Return y and z of the unloaded rod at rest: straight, or with the sections' curvature."""
         s = jnp.asarray(s, dtype=float)
         still, _ = self.end_controls(np.zeros(self.control_layout.size))
-        p, h, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, still), s)
+        (p, h), v, u = self._rest_shape(self.base_end.pose(AT_ORIGIN, still), s)
         more: Fields = {}
         for part in self.parts.values():
             more |= part.rest_y(self, s)
         y = jnp.concatenate([p, h, np.zeros(12), *_ordered(more, self.y_layout)])
-        return y, self.with_internal(jnp.concatenate([self.v_star, u]))
+        return y, self.with_internal(jnp.concatenate([v, u]))
 
     def with_internal(self, strains: Float[Any, "6"]) -> Float[Any, " z"]:
         """Return z with these strains without stress, and the internal variables of the parts at rest."""
@@ -467,19 +467,20 @@ class SlenderRod(System):
     def _rest_shape(self, base: Pose, s: Any) -> tuple[Any, Any, Any]:
         if not self.sections:
             along = dot(rotation_matrix(base.h), jnp.stack([jnp.zeros(()), jnp.zeros(()), s]))
-            return base.p + along, base.h, np.zeros(3)
-        still = np.zeros(self.control_layout.size)
-
-        def curvature(at: Any) -> Any:
-            return self.material(at, still).u_star
-
+            return Pose(base.p + along, base.h), self.v_star, self.u_star
         ends = {place for section in self.sections for place in (section.begin, section.end)}
         edges = np.array(sorted({0.0, *ends, 1.0}))
         # z at a node is the far-side value, and where two sections meet both curvatures act; the margin is
         # less than the distance that moves places away from that side
         margin = 0.2 * INWARD * self.length / (self.nodes - 1)
         beyond = jnp.minimum(s + margin, self.length - margin)
-        return *shape_at_rest(base, s, curvature, self.length, edges), curvature(beyond)
+        shape = shape_at_rest(base, s, self.strains_at_rest, self.length, edges)
+        return shape, *self.strains_at_rest(beyond)
+
+    def strains_at_rest(self, s: Any) -> tuple[Float[Any, "3"], Float[Any, "3"]]:
+        """Return v and u without stress at s (m), without control."""
+        material = self.material(s, np.zeros(self.control_layout.size))
+        return material.v_star, material.u_star
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
@@ -618,8 +619,8 @@ class _RodObserved(Observed, of=SlenderRod):
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
         """Return z of the unstressed rod at s: with the sections' curvature, intrinsic and controlled."""
         rod = self.system
-        u_star = rod.material(s, control).u_star if rod.sections else rod.u_star
-        return rod.with_internal(jnp.concatenate([rod.v_star, u_star]))
+        strains = rod.material(s, control) if rod.sections else rod
+        return rod.with_internal(jnp.concatenate([strains.v_star, strains.u_star]))
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return stiffness and damping relative to the base's; None for a uniform rod."""

@@ -19,7 +19,6 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.parameters import ParameterError, parameter, place
 from knode_cosserat.rods.parts import Part
-from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.tendon_law import stretches
 
 #: points of Gauss quadrature for the length of a tendon in the unloaded robot
@@ -234,11 +233,11 @@ def routes(
 
 
 def path_lengths(
-    routings: Sequence[Routing], s: Any, length: Any, curvature: Callable[[Any], Any]
+    routings: Sequence[Routing], s: Any, length: Any, strains: Callable[[Any], Any]
 ) -> Float[Any, " c"]:
-    """Return the tendons' lengths (m) in an unstretched rod from the base to s, by Gauss quadrature.
+    """Return the tendons' lengths (m) in an unstressed rod from the base to s, by Gauss quadrature.
 
-    `curvature` returns u (1/m) at an arclength (m).
+    `strains` returns v and u at an arclength (m).
     """
     nodes, weights = np.polynomial.legendre.leggauss(GAUSS)
     lengths = []
@@ -248,7 +247,7 @@ def path_lengths(
 
         def stretched(place: Any, routing: Routing = routing) -> Any:
             r, r_s = routes((routing,), place / length, length)
-            return stretches(*map(jnp.asarray, (ALONG, curvature(place), r, r_s)))[0]
+            return stretches(*map(jnp.asarray, (*strains(place), r, r_s)))[0]
 
         lengths.append(0.5 * last * jnp.sum(weights * jax.vmap(stretched)(at)))
     return jnp.stack(lengths)

@@ -312,14 +312,18 @@ class Material(NamedTuple):
     #: ρJ (kg·m)
     rhoJ: Float[Any, "3 3"]
     radius: Any
+    v_star: Float[Any, "3"] = ALONG
 
 
 class Differences(NamedTuple):
-    """Local changes of the rod: factors of radius and stiffness, and curvature (1/m) added at rest."""
+    """Local changes of the rod: factors of radius and stiffness, and strains at rest that are added."""
 
     radius: Any = 1.0
     stiffness: Any = 1.0
+    #: curvature (1/m) per reference length
     curvature: Any = 0.0
+    #: relative extension
+    extension: Any = 0.0
 
 
 class SectionChange(Stretched):
@@ -331,11 +335,14 @@ class SectionChange(Stretched):
 
 
 class Stretch(SectionChange):
-    """A section of the rod with another radius, stiffness or curvature at rest, along it and by control.
+    """A section of the rod with another radius, stiffness or shape at rest, along it and by control.
 
     With ξ from 0 to 1 along the section, the radius is multiplied by a + b ξ + c ξ² … with the given
     coefficients. The stiffness is multiplied by a polynomial in the same way. A control c, if there is one,
-    multiplies the stiffness by another 1 + gain·c and adds gain·c to the curvature.
+    multiplies the stiffness by another 1 + gain·c and adds gain·c to the curvature and to the extension.
+    Curvatures and extensions of sections at one place add up: three of them, with a control each for two
+    curvatures and the extension, are a segment with three parameters, an arc of the length (1 + ε) L.
+    Curvature, mass and stiffness are per reference length.
     """
 
     kind: ClassVar[str] = "stretch"
@@ -354,6 +361,7 @@ class Stretch(SectionChange):
         "1/m", "increase of that curvature from its beginning to its end", shape="vector", low=-1e4, high=1e4,
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
+    extension: Any = parameter("", "ε, relative extension at rest", low=-0.9, high=10.0, default=0.0)
     controlled: bool = choice("true if a control acts on it", (False, True), False)
     stiffness_gain: Any = parameter(
         "", "increase of the stiffness factor by a control of 1", low=-1e6, high=1e6, default=0.0
@@ -362,6 +370,9 @@ class Stretch(SectionChange):
         "1/m", "increase of the curvature at rest by a control of 1", shape="vector", low=-1e4, high=1e4,
         default=(0.0, 0.0, 0.0),
     )  # fmt: skip
+    extension_gain: Any = parameter(
+        "", "increase of the extension at rest by a control of 1", low=-10.0, high=10.0, default=0.0
+    )
 
     def __check_init__(self) -> None:
         super().__check_init__()
@@ -378,15 +389,16 @@ class Stretch(SectionChange):
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
-        """One control, if the section is controlled; its limit leaves some stiffness."""
-        field, gain = Field("input", 1, "1", "control of the section"), as_number(self.stiffness_gain)
-        if gain:
-            # at the limit itself the stiffness is zero
-            limit = -1.0 / gain
-            if gain > 0.0:
-                field = field._replace(low=float(np.nextafter(limit, np.inf)))
-            else:
-                field = field._replace(high=float(np.nextafter(limit, -np.inf)))
+        """One control, if the section is controlled; its limits leave some stiffness and some length."""
+        field = Field("input", 1, "1", "control of the section")
+        extension = as_number(self.extension)
+        for gain, least in ((self.stiffness_gain, -1.0), (self.extension_gain, -1.0 - (extension or 0.0))):
+            gain = as_number(gain)
+            # at the limit itself stiffness or length is zero
+            if gain and gain > 0.0:
+                field = field._replace(low=max(field.low, float(np.nextafter(least / gain, np.inf))))
+            elif gain:
+                field = field._replace(high=min(field.high, float(np.nextafter(least / gain, -np.inf))))
         return (field,) if self.controlled else ()
 
     def differences(self, part: Any, control: Any) -> Differences:
@@ -398,7 +410,8 @@ class Stretch(SectionChange):
             + jnp.asarray(self.curvature_slope) * part
             + jnp.asarray(self.curvature_gain) * input
         )
-        return Differences(_polynomial(self.radius, part), stiffness, curvature)
+        extension = self.extension + self.extension_gain * input
+        return Differences(_polynomial(self.radius, part), stiffness, curvature, extension)
 
 
 class Sleeve(SectionChange):
@@ -460,10 +473,10 @@ def _polynomial(coefficients: Any, at: Any) -> Any:
 
 
 def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list[Any]) -> Differences:
-    """Return the changes at a fraction of the rod's length: factors multiplied, curvatures added."""
+    """Return the changes at a fraction of the rod's length: factors multiplied, strains added."""
     total = Differences(1.0, 1.0, jnp.zeros(3))
     for change, control in zip(changes, controls, strict=True):
-        radius, stiffness, curvature = change.differences(
+        radius, stiffness, curvature, extension = change.differences(
             (part - change.begin) / (change.end - change.begin), control
         )
         within = (part >= change.begin) & (part <= change.end)
@@ -471,17 +484,18 @@ def differences_at(changes: tuple[SectionChange, ...], part: Any, controls: list
             total.radius * jnp.where(within, radius, 1.0),
             total.stiffness * jnp.where(within, stiffness, 1.0),
             total.curvature + jnp.where(within, curvature, 0.0),
+            total.extension + jnp.where(within, extension, 0.0),
         )
     return total
 
 
 def shape_at_rest(
-    base: Pose, s: Any, curvature: Callable[[Any], Any], length: Any, edges: Float[np.ndarray, " edges"]
+    base: Pose, s: Any, strains: Callable[[Any], Any], length: Any, edges: Float[np.ndarray, " edges"]
 ) -> Pose:
-    """Return the pose at s of a rod without strain, from its base's and its curvature.
+    """Return the pose at s of a rod without stress, from its base's and its strains v and u.
 
-    `edges` are parts of the length, from 0 to 1, with a smooth curvature (1/m) between them. The
-    integration is Magnus' series of order 4 on poses: a constant curvature gives an exact helix for any step.
+    `edges` are parts of the length, from 0 to 1, with smooth strains between them. The integration is
+    Magnus' series of order 4 on poses: constant strains give an exact helix for any step.
     """
     bounds = length * np.sort(np.concatenate([np.arange(1, REST_STEPS) / REST_STEPS, edges]))
     # all steps beyond s have zero length
@@ -490,16 +504,17 @@ def shape_at_rest(
     at = passed[:-1] + (0.5 + np.array([[-1.0], [1.0]]) / np.sqrt(12.0)) * ds
     margin = INWARD * jnp.diff(bounds)
     inside = jnp.clip(at, bounds[:-1] + margin, bounds[1:] - margin)
-    seen = jax.vmap(curvature)(inside.ravel())
+    v, u = (jnp.broadcast_to(each, (inside.size, 3)) for each in jax.vmap(strains)(inside.ravel()))
 
-    def step(ds: Any, u: Any, v: Any) -> tuple[Any, Any]:
+    def step(ds: Any, v: Any, u: Any) -> tuple[Any, Any]:
         more = ds * ds / np.sqrt(48.0)
-        turn = 0.5 * ds * (u + v) + more * cross(u, v)
-        along = ds * ALONG + more * cross(u - v, ALONG)
+        turn = 0.5 * ds * (u[0] + u[1]) + more * cross(u[0], u[1])
+        along = 0.5 * ds * (v[0] + v[1]) + more * (cross(u[0], v[1]) - cross(u[1], v[0]))
         return quaternion_of(turn), mean_turned(turn, along)
 
     def advance(pose: Pose, step: tuple[Any, Any]) -> tuple[Pose, None]:
         turn, way = step
         return Pose(pose.p + turned(pose.h, way), quaternion_product(pose.h, turn)), None
 
-    return jax.lax.scan(advance, base, jax.vmap(step)(ds, *seen.reshape(2, -1, 3)))[0]
+    pairs = (each.reshape(2, -1, 3).swapaxes(0, 1) for each in (v, u))
+    return jax.lax.scan(advance, base, jax.vmap(step)(ds, *pairs))[0]

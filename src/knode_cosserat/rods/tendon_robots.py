@@ -304,5 +304,5 @@ class VirtualRobot(TendonRod):
         inside = jnp.exp(-((s / self.sleeve_length) ** 2))
         Kbt = material.Kbt * (1.0 + (self.sleeve_factor - 1.0) * inside)
         bent = m if not self.sections else m + dot(Kbt, material.u_star)
-        v = Viscoelastic(material.Kse, material.Bse, pulled + material.Kse @ self.v_star)
+        v = Viscoelastic(material.Kse, material.Bse, pulled + material.Kse @ material.v_star)
         return MaterialLaw({"v": v, "u": Viscoelastic(Kbt, material.Bbt, bent, moment=moment)})

@@ -335,9 +335,7 @@ class ReeledTendons(RoutedTendons):
 
     def rest_y(self, rod: Any, s: Any) -> Fields:
         """Return the tendons' lengths in the unloaded robot from the base to s."""
-        still = np.zeros(rod.control_layout.size)
-        routings = rod.paths.routings
-        return {"path": path_lengths(routings, s, rod.length, lambda at: rod.material(at, still).u_star)}
+        return {"path": path_lengths(rod.paths.routings, s, rod.length, rod.strains_at_rest)}
 
     def rates(self, point: RodPoint) -> Fields:
         """Return the rate of the path length."""

@@ -277,9 +277,7 @@ class ConcentricTubeRobot(SlenderRod):
 
     def material(self, s: Any, control: Any) -> Material:
         """Return the sum of the tubes that are present."""
-        tubes, input = next(
-            (part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes)
-        )
+        tubes, input = next((part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes))
         section = tubes.section(self, s, tubes.present(self, s, input)[0])
         return Material(
             section.Kse, self.shear_damping, section.Kbt, self.bending_damping, self.u_star,

@@ -92,11 +92,12 @@ class RodEnergy:
 
         if not rod.is_uniform:
             own = materials(rod, middle * self.length / segments, np.asarray(control))
-            self.Kse, self.Kbt, self.u_star = (np.asarray(x) for x in (own.Kse, own.Kbt, own.u_star))
+            self.Kse, self.Kbt, v_star, u_star = map(np.asarray, (own.Kse, own.Kbt, own.v_star, own.u_star))
         else:
             spread = (self.count, 3, 3)
             self.Kse, self.Kbt = (np.broadcast_to(np.asarray(x), spread) for x in (rod.Kse, rod.Kbt))
-            self.u_star = np.zeros((self.count, 3))
+            v_star, u_star = rod.v_star, rod.u_star
+        self.v_star, self.u_star = (np.broadcast_to(star, (self.count, 3)) for star in (v_star, u_star))
         self.unit = float(np.asarray(rod.Kbt)[0, 0]) / self.length
         p, n, m, h = fields
         smooth_h = CubicSpline(known, h)
@@ -106,7 +107,7 @@ class RodEnergy:
         n, m = (
             np.stack([np.interp(middle, known, column) for column in values.T], axis=1) for values in (n, m)
         )
-        v = rod.v_star + np.linalg.solve(self.Kse, (n[:, None, :] @ R).swapaxes(1, 2))[..., 0]
+        v = self.v_star + np.linalg.solve(self.Kse, (n[:, None, :] @ R).swapaxes(1, 2))[..., 0]
         self.stress = _Stress((R @ v[..., None])[..., 0], n, m, R)
         # dead loads balance the forces of the equilibrium
         self.load = -np.diff(n, axis=0, prepend=0.0, append=0.0)
@@ -222,7 +223,7 @@ class RodEnergy:
         begin, change = shape.turned[:-1], (shape.turned[:-1].inv() * shape.turned[1:]).as_rotvec()
         R = (begin * Rotation.from_rotvec(change / 2.0)).as_matrix()
         p_s = np.diff(shape.p, axis=0) / self.ds
-        strains = (p_s[:, None, :] @ R)[:, 0] - self.rod.v_star, change / self.ds - self.u_star
+        strains = (p_s[:, None, :] @ R)[:, 0] - self.v_star, change / self.ds - self.u_star
         stresses = [(K @ z[..., None])[..., 0] for K, z in zip((self.Kse, self.Kbt), strains, strict=True)]
         energy = 0.5 * self.ds * sum(np.sum(z * f) for z, f in zip(strains, stresses, strict=True))
         n, m = ((R @ f[..., None])[..., 0] for f in stresses)
