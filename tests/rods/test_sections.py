@@ -304,7 +304,7 @@ def segment(**changes):
         {"extension_gain": 1.0},
     ]
     parts = tuple(kc.robots.Stretch(controlled=True, **gain) for gain in gains)
-    return CHANGED.replace(sections=parts, loads=(), nodes=11, **changes)
+    return CHANGED.replace(sections=parts, loads=(), nodes=21, **changes)
 
 
 def test_an_extended_segment_is_an_arc_of_its_own_length():

@@ -15,8 +15,8 @@ the force and the moment of the rod less c R P and c R H, so that no strain is d
 
 This is the balance of an axially moving beam (Stylianou & Tabarrok 1994) at large deflection. The rates of
 strain in the material's damping, and accelerations in loads along the rod, such as the added mass of water,
-are those of the grid's places. Their relative error is γ times the time in which they change. A control
-that is linear from row to row has steps of its rate there; "bdf2" resolves the force of acceleration in a row.
+are those of the grid's places. Their relative error is γ times the time in which they change. A control that
+is linear from row to row has steps of its rate there; "bdf2" resolves the force of acceleration in a row.
 """
 
 from __future__ import annotations
