@@ -1,0 +1,139 @@
+"""Rods fed through a hole: statics of the exposed rod, momentum, refused parts."""
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import knode_cosserat as kc
+from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.learning.residual import network
+from knode_cosserat.rods.ends import Driven, Pinned
+from knode_cosserat.rods.fluids import Fluid
+from knode_cosserat.rods.frame import SpinningFrame
+from knode_cosserat.rods.insertion import Insertion
+from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWrench
+from knode_cosserat.rods.magnets import Magnet, UniformField
+from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.relaxation import Relaxation
+
+L, RADIUS, DENSITY = 0.5, 0.005, 1000.0
+MASS = DENSITY * np.pi * RADIUS**2
+FED = (Insertion(reserve=0.5, retraction=0.3),)
+
+
+def rod(**changes):
+    given = {
+        "length": L, "radius": RADIUS, "density": DENSITY, "youngs_modulus": 1e7, "nodes": 11,
+        "gravity": (0.0, 0.0, 0.0), "bending_damping": 1e-4, "effects": FED,
+    }  # fmt: skip
+    return kc.robots.SlenderRod(**given | changes)
+
+
+def rest(robot, *control):
+    return kc.equilibrium(robot, list(control), space="lobatto4")
+
+
+# statics
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("insertion", [-0.2, 0.0, 0.3])
+def test_it_rests_and_vibrates_as_a_rod_of_the_exposed_length(insertion):
+    """With magnets, water and a body at the tip, also at the same modes and stability."""
+    laden = {
+        "gravity": (0.3, 0.0, 0.0),
+        "loads": (
+            Magnet(magnetisation=(0.0, 0.0, 5.0), field=UniformField(flux_density=(0.0, 2e-3, 0.0))),
+            Fluid(density=200.0), AttachedMass(mass=0.002), PointWrench(force=(0.0, 1e-3, 0.0)),
+        ),
+    }  # fmt: skip
+    fed = rest(rod(**laden), insertion)
+    cut = rest(rod(**laden, length=L + insertion, effects=()))
+    np.testing.assert_allclose(fed.tip_position, cut.tip_position, atol=1e-9)
+    assert np.abs(fed.tip_position[-1, :2]).min() > 1e-4
+    modes = [kc.statics.modes(found, count=3).values for found in (fed, cut)]
+    np.testing.assert_allclose(modes[0], modes[1], rtol=1e-5)
+    assert kc.statics.stability(fed).kind == kc.statics.stability(cut).kind == "stable"
+
+
+@pytest.mark.parametrize("insertion", [-0.2, 0.3])
+def test_a_hanging_rod_is_stretched_by_its_exposed_weight(insertion):
+    down = rest(rod(gravity=(0.0, 0.0, 9.81), youngs_modulus=1e6), insertion)
+    exposed = L + insertion
+    expected = exposed + DENSITY * 9.81 * exposed**2 / (2.0 * 1e6)
+    assert down.tip_position[-1, 2] == pytest.approx(expected, abs=1e-10)
+
+
+# motions
+
+
+def test_a_straight_rod_takes_its_momentum_from_the_hole():
+    """The force at s is -ρA (ℓ - s) ℓ_tt, and n there less the momentum ρA c ℓ_t that enters with the rod."""
+    steps, rate = 250, 0.4
+    t = np.linspace(0.0, 0.5, steps + 1)
+    inserted = rate * t**2 / 2.0
+    stiff = rod(youngs_modulus=1e9)
+    found = kc.simulate(
+        stiff, inserted[1:, None], t[1], space="lobatto4", time="bdf2", initial=rest(stiff, 0.0)
+    )
+    speed, exposed = rate * t[-1], L + inserted[-1]
+    ahead = 1.0 - np.linspace(0.0, 1.0, 11)
+    n, q = found.part("n")[-1, :, 2], found.part("q")[-1, :, 2]
+    np.testing.assert_allclose(q, speed * (1.0 - ahead), atol=1e-6 * speed)
+    expected = -MASS * (exposed * ahead * rate + ahead * speed**2)
+    np.testing.assert_allclose(n, expected, atol=1e-6 * np.abs(expected).max())
+    assert found.tip_position[-1, 2] == pytest.approx(exposed, rel=1e-6)
+
+
+# what it excludes
+
+
+@pytest.mark.parametrize(
+    ("changes", "match"),
+    [
+        ({"base_end": Pinned()}, "clamped or driven base_end"),
+        ({"loads": (AttachedMass(mass=0.1, at=0.5),)}, "loads at the tip or all along"),
+        ({"loads": (DistributedWrench(begin=0.5),)}, "loads at the tip or all along"),
+        ({"tip_radius": 0.004}, "one section all along"),
+        ({"effects": (*FED, Relaxation(stiffness=0.5, time=1.0))}, "parts without states"),
+        ({"effects": (*FED, SpinningFrame(1.0))}, "a spinning-frame before it"),
+        ({"effects": (Insertion(retraction=0.5),)}, "less than the robot's length"),
+    ],
+)
+def test_parts_at_places_of_the_material_are_refused_in_one_line(changes, match):
+    with pytest.raises(ParameterError, match=match) as caught:
+        rod(**changes)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_control_has_the_limits_of_the_hole():
+    field = rod().control_layout.fields[0]
+    assert (field.name, field.low, field.high) == ("insertion", -0.3, 0.5)
+    with pytest.raises(ValueError, match=r"insertion"):
+        rest(rod(), 0.6)
+
+
+@pytest.mark.slow
+def test_it_runs_in_batches_has_gradients_carries_a_model_and_is_identified():
+    control = np.linspace(0.0, 0.2, 21)[1:, None]
+
+    def moved(modulus, **options):
+        robot = rod(youngs_modulus=modulus, gravity=(1.0, 0.0, 0.0), nodes=6, base_end=Driven(axes=("x",)))
+        return kc.simulate(robot, np.hstack([0.1 * control, control]), 0.01, **options)
+
+    robots = [moved(modulus).system for modulus in (1e7, 3e7)]
+    both = kc.simulate(robots, np.tile(np.hstack([0.1 * control, control]), (2, 1, 1)), 0.01)
+    np.testing.assert_allclose(both[1].tip_position, moved(3e7).tip_position, rtol=0.0, atol=1e-12)
+    slope = jax.grad(lambda modulus: moved(modulus).tip_position[-1, 0])(3e7)
+    apart = moved(3.003e7).tip_position[-1, 0] - moved(2.997e7).tip_position[-1, 0]
+    assert float(slope) == pytest.approx(float(apart) / 6e4, rel=1e-3)
+    none = jax.tree.map(
+        lambda leaf: 0.0 * leaf if eqx.is_inexact_array(leaf) else leaf,
+        network(robots[0], NetworkOptions(hidden=3), jax.random.PRNGKey(0)),
+    )
+    model = kc.KNODE(robots[0], none).replace(youngs_modulus=3e7)
+    found = kc.simulate(model, np.hstack([0.1 * control, control]), 0.01)
+    np.testing.assert_allclose(found.tip_position, moved(3e7).tip_position, atol=1e-9)
+    fit = kc.identify(robots[0], [moved(3e7)], parameters=["youngs_modulus"])
+    assert fit.robot.youngs_modulus == pytest.approx(3e7, rel=1e-5)
