@@ -563,7 +563,7 @@ class RodEnds(Ends, of=SlenderRod):
         return jnp.concatenate([y[:13], q, w, y[19:]])
 
 
-class _RodObserved(Observed, of=SlenderRod):
+class RodObserved(Observed, of=SlenderRod):
     """Motion and bending of a rod, in the material frame, and the controls of its parts."""
 
     system: SlenderRod
