@@ -273,6 +273,7 @@ def test_concentric_tubes(run):
     jumps = run("concentric_tubes", steps=120)
     assert jumps[0.7] < 30.0 < 90.0 < jumps[1.6]
 
+
 @pytest.mark.slow
 def test_spinning_shaft(run):
     found, exact = run("spinning_shaft", speeds=2)

@@ -33,6 +33,7 @@ from knode_cosserat.rods.parameters import ParameterError, as_number, parameter,
 from knode_cosserat.rods.parts import Part, RodPoint
 from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
+    ALONG,
     CrossSection,
     Material,
     Section,
@@ -174,7 +175,9 @@ class _Tubes(CrossSection):
     def y_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
         """Return θ, and τ of all tubes but the first."""
         n = len(self.tubes)
-        torsion = (("torsion", n - 1, "N m", "torsion of the tubes from the second on", "", "N"),) if n > 1 else ()
+        torsion = (
+            (("torsion", n - 1, "N m", "torsion of the tubes from the second on", "", "N"),) if n > 1 else ()
+        )
         return (("angle", n, "rad", "angle of each tube about the rod", "", "rad/m"), *torsion)
 
     def base_fields(self, rod: Any) -> tuple[str, ...]:
@@ -329,30 +332,34 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
 
     @property
     def ambient_layout(self) -> Layout:
-        """Layout of `ambient`."""
-        n = len(self.system.tubes)
-        return super().ambient_layout + Layout(("presence", n, "1", "1 for each tube that is present"))
+        """Layout of `ambient`: the innermost tube, which is always present, adds nothing to a constant."""
+        meaning = "1 for each tube but the first that is present"
+        return super().ambient_layout + Layout(("presence", len(self.system.tubes) - 1, "1", meaning))
 
     def ambient(self, s: Any, control: Float[Any, " c"]) -> Float[Any, " a"]:
-        """Return the control, and 1 for each tube that is present."""
+        """Return the control, and 1 for each tube but the first that is present."""
         tubes, input = self.system._tubes(control)
         presence, _ = tubes.present(self.system, s, input)
-        return jnp.concatenate([super().ambient(s, control), presence])
+        return jnp.concatenate([super().ambient(s, control), presence[1:]])
 
     @property
     def law_layout(self) -> Layout:
         """Layout of `law_inputs`."""
-        bent = ("bent", 2 * len(self.system.tubes), "1/m", "bending of each tube, x and y")
-        return super().law_layout + Layout(bent)
+        n = len(self.system.tubes)
+        return super().law_layout + Layout(
+            ("stretched", 3 * n, "1", "shear and extension of each tube"),
+            ("bent", 2 * n, "1/m", "bending of each tube, x and y"),
+        )  # fmt: skip
 
     def law_inputs(self, s: Any, y: Float[Any, " y"], control: Any) -> Callable[[Any, Any], Any]:
-        """Return the function of z and z_t: those of a rod, and the bending of each tube."""
+        """Return the function of z and z_t: those of a rod, and the strains of each tube."""
         inputs, (tubes, at) = super().law_inputs(s, y, control), self._point(s, y, control)
         presence, curvatures = tubes.rest_curvatures(at)
 
         def strains(z: Any, z_t: Any) -> Any:
-            bent = presence[:, None] * self.system.z_layout.get(z, "u")[:2] - curvatures
-            return jnp.concatenate([inputs(z, z_t), bent.reshape(-1)])
+            v, u = self.system.z_layout.split(z)
+            stretched, bent = presence[:, None] * (v - ALONG), presence[:, None] * u[:2] - curvatures
+            return jnp.concatenate([inputs(z, z_t), stretched.reshape(-1), bent.reshape(-1)])
 
         return strains
 

@@ -54,7 +54,9 @@ def structured(knowledge=ROBOT, seed=0):
         return dataclasses.replace(found, weights=1e-4 * rng.normal(size=found.weights.shape))
 
     balanced = loaded(knowledge).size
-    load = Load(law(Observed.of(knowledge).layout, balanced), law(Observed.of(knowledge).ambient_layout, balanced))
+    load = Load(
+        law(Observed.of(knowledge).layout, balanced), law(Observed.of(knowledge).ambient_layout, balanced)
+    )
     tip = Load(None, law(Observed.of(knowledge).ambient_layout, unknown_count(knowledge)))
     assert y.size > balanced
     return Structured(np.asarray(0.01 * seed), law(z + rates, z.size, u=CURVED), load, tip)
