@@ -38,8 +38,8 @@ class ExplainedTerm(NamedTuple):
 def explain(model: KNODE) -> list[ExplainedTerm]:
     """Return the terms that the residual adds to the nominal model, the largest first within each part.
 
-    The parts are length, stress, base, load and tip. A star marks terms in the global frame; all others are in the
-    material frame.
+    The parts are length, stress, base, load and tip. A star marks terms in the global frame; all others are
+    in the material frame.
 
     A coefficient multiplies the function in SI units, of the unscaled vector; for a saturating function it is
     the initial slope. Stress is the missing term of the constitutive law, C z + D z_t + stress = f2. Loads

@@ -145,6 +145,7 @@ class _Regressions:
         #: True if y at the end of a segment is linear in the rates at its ends
         self.linear = not data.space.formula.stages
         self._along: tuple[_Views, Any, _Sides] | None = None
+        self._laws: dict[float, tuple[list[_Offer], list[_Target]]] = {}
 
     def residual(self, seed: int) -> Structured:
         """Return the residual of one seed."""
@@ -186,9 +187,13 @@ class _Regressions:
         stress, _ = _best(offers, np.ones((len(counting.shares), 1)), targets, counting)
         return dataclasses.replace(residual, stress=stress)
 
-    @functools.lru_cache(maxsize=2)
     def _law(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
-        """Return features and targets of the constitutive law; seeds share them."""
+        """Return features and targets of the constitutive law; seeds with the same length share them."""
+        if stretch not in self._laws:
+            self._laws = {stretch: self._law_by_length(stretch)}
+        return self._laws[stretch]
+
+    def _law_by_length(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
         strand = with_length_factor(self.strand, 1.0 + stretch)
         values, size, inputs = map(np.asarray, _law_residual(strand, self.data.segments))
         layout, both = strand.z_layout, Observed.of(strand).law_layout
@@ -409,7 +414,7 @@ def _by_length(knowledge: System, points: Any, z: Any, factor: Any) -> tuple[Any
 
 
 def _longer(knowledge: System, missing: Any, slopes: Any, shares: Any) -> float:
-    """Return the change of a length factor that explains the missing geometric rates; 0 within their noise."""
+    """Return the change of a length factor that explains missing geometric rates; 0 within their noise."""
     changes, precisions = [], []
     for name in knowledge.y_layout.names:
         if name in loaded(knowledge).names:
