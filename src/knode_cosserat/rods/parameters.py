@@ -36,6 +36,8 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
 #: fraction of the rod's length: a place nearer to an end than this is at the end
 AT_END = 1e-9
+#: pattern of a name
+NAME = "[A-Za-z][A-Za-z0-9_-]*"
 #: largest number of elements of a list in an error message
 MOST_SHOWN = 12
 #: by unit: the typical range
@@ -272,6 +274,35 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
+class Text:
+    """Statement of a field that holds a name: letters, digits, - and _; or nothing, if it is optional."""
+
+    meaning: str
+    optional: bool
+
+    def check(self, name: str, value: Any, text: str | None = None) -> None:
+        """Raise `ParameterError` unless a value is a name."""
+        if not isinstance(value, str) or not re.fullmatch(NAME if value or not self.optional else "", value):
+            raise ParameterError(
+                f"{name} is {text or shown(value)}; allowed is a name of letters, digits, - and _"
+            )
+
+    def read(self, name: str, value: Any) -> Any:
+        """Return a value of a file. Raises `ParameterError`."""
+        self.check(name, value, shown(value))
+        return value
+
+    def written(self, value: Any) -> str:
+        """Return the text of a value in a file."""
+        return flow(value)
+
+    def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
+        """Return the JSON Schema of the values."""
+        stated = {"type": "string", "pattern": f"^({NAME})?$" if self.optional else f"^{NAME}$"}
+        return {**stated, "description": self.meaning} | ({"default": default} if self.optional else {})
+
+
+@dataclasses.dataclass(frozen=True)
 class _Slot:
     """Statement of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
 
@@ -390,6 +421,11 @@ def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
     return _field(stated, default, _as_tuple if stated.many else None, static=True)
 
 
+def text(meaning: str, default: Any = dataclasses.MISSING) -> Any:
+    """Return a dataclass field for a name; a default makes it optional."""
+    return _field(Text(meaning, default is not dataclasses.MISSING), default, static=True)
+
+
 def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
     """Return a dataclass field for a part, or parts (see `parts.Part`); default None makes it optional."""
 
@@ -469,7 +505,7 @@ def kinds_of(family: Any) -> dict[str, Any]:
 
 def in_order(cls: type) -> dict[str, Any]:
     """Return the statements of a class by name: parameters, then choices, then parts."""
-    return parameters_of(cls) | stated_of(cls, Choice) | slots_of(cls)
+    return parameters_of(cls) | stated_of(cls, Choice) | stated_of(cls, Text) | slots_of(cls)
 
 
 class Parametrised(eqx.Module):

@@ -1,0 +1,293 @@
+"""Assemblies: rods of any kind that rigid bodies join, in a tree or with closed loops.
+
+All rods run side by side over one grid of s/length. A body is a rigid frame with the unknown pose (p, h), whose
+fields of y are constant along the grid. Both ends of every rod therefore meet the body where the conditions
+stand, at the tip. With the wrench n, m of each rod on its support (at its base; at its tip it is -n, -m), and r
+from the body's centre of mass to the joint, in the global frame,
+
+    M p_tt = M g + f + Σ n,      d(R J ω)/dt = l + Σ (m + r × n).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.ends import AT_ORIGIN, Pose, velocities
+from knode_cosserat.rods.law import JointLaw
+from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.loads import Body, Motion
+from knode_cosserat.rods.parameters import ParameterError, parameter, slot, text
+from knode_cosserat.rods.parts import Part, RodPoint, Wrench
+from knode_cosserat.rods.rod import Y_LAYOUT, SlenderRod
+from knode_cosserat.rods.system import Discontinuities, Scales, System
+from knode_cosserat.rotation import cross, dot, quaternion_of, quaternion_product, rotation_matrix
+
+
+def _changed(part: Any, **fields: Any) -> Any:
+    """Return a copy with other fields, unchecked: parameters may be any numbers, or none, where code is made."""
+    copy = object.__new__(type(part))
+    for field in dataclasses.fields(part):
+        object.__setattr__(copy, field.name, fields.get(field.name, getattr(part, field.name)))
+    return copy
+
+
+class RigidBody(Part):
+    """A rigid body that holds ends of rods. The origin of its frame is its centre of mass."""
+
+    kind: ClassVar[str] = "body"
+
+    name: str = text("name, by which ends refer to it")
+    mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
+    inertia: Any = parameter(
+        "kg m2", "inertia about its centre of mass, in its frame", shape="matrix", low=0.0, high=1e6,
+        default=0.0,
+    )  # fmt: skip
+    force: Any = parameter(
+        "N", "load on its centre of mass, global frame", shape="vector", low=-1e6, high=1e6,
+        default=(0.0, 0.0, 0.0),
+    )  # fmt: skip
+    moment: Any = parameter(
+        "N m", "moment on it, global frame", shape="vector", low=-1e6, high=1e6, default=(0.0, 0.0, 0.0)
+    )
+
+
+class Assembly(System):
+    """Rods that are joined by rigid bodies.
+
+    The ends of each rod are on the ground or, where they name a body, on that body, in whose frame their pose
+    is then stated. Fields of y and z, controls and conditions have the name of their rod or body in front.
+    Rods have the gravity of the assembly.
+    """
+
+    mixed: ClassVar[bool] = False
+
+    rods: tuple[SlenderRod, ...] = slot("rods, each with its name", SlenderRod, many=True, default=())
+    bodies: tuple[RigidBody, ...] = slot("bodies that join the rods", RigidBody, many=True, default=())
+    gravity: Any = parameter(
+        "m/s2", "gravitational acceleration, global frame", shape="vector", low=-100.0, high=100.0,
+        default=(0.0, 0.0, -9.81),
+    )  # fmt: skip
+
+    @functools.cached_property
+    def members(self) -> tuple[SlenderRod, ...]:
+        """Rods with the grid and the gravity of the assembly."""
+        return tuple(_changed(rod, nodes=self.nodes, gravity=self.gravity) for rod in self.rods)
+
+    @property
+    def length(self) -> Any:  # type: ignore[override]
+        """Length of the first rod (m), in which s is stated."""
+        return self.rods[0].length
+
+    # layouts
+
+    def joined(self, layouts: Any, bodies: Layout | None = None) -> Layout:
+        """Return the layouts of all rods, and that of every body, with the names in front."""
+        every = [*zip(self.rods, layouts, strict=True), *((body, bodies) for body in self.bodies if bodies)]
+        return Layout(
+            *(
+                field._replace(
+                    name=f"{part.name}_{field.name}", meaning=f"{field.meaning}, {part.name}",
+                    frame=field.frame and f"{part.name}_{field.frame}",
+                )
+                for part, layout in every
+                for field in layout.fields
+            )
+        )  # fmt: skip
+
+    @functools.cached_property
+    def y_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of y: that of each rod, then of each body, whose n and m are the wrench of bases on it."""
+        return self.joined((rod.y_layout for rod in self.members), Y_LAYOUT)
+
+    @functools.cached_property
+    def z_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of z: that of each rod."""
+        return self.joined(rod.z_layout for rod in self.members)
+
+    @functools.cached_property
+    def control_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of the controls of all rods."""
+        return self.joined(rod.control_layout for rod in self.members)
+
+    @functools.cached_property
+    def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Unknown fields at the bases of the rods, and the poses of the bodies."""
+        rods = (f"{rod.name}_{name}" for rod in self.members for name in rod.base_unknowns)
+        return (*rods, *(f"{body.name}_{name}" for body in self.bodies for name in ("p", "h")))
+
+    def split(self, packed: Any, sizes: Any) -> list[Any]:
+        """Return a packed vector split by these sizes."""
+        return jnp.split(jnp.asarray(packed), np.cumsum(sizes)[:-1], axis=-1)
+
+    def states(self, y: Any) -> tuple[list[Any], list[Any]]:
+        """Return y of each rod, and of each body."""
+        sizes = [rod.y_layout.size for rod in self.members] + [Y_LAYOUT.size] * len(self.bodies)
+        parts = self.split(y, sizes)
+        return parts[: len(self.rods)], parts[len(self.rods) :]
+
+    def controls(self, control: Any) -> list[Any]:
+        """Return the control of each rod."""
+        return self.split(control, [rod.control_layout.size for rod in self.members])
+
+    def strains(self, z: Any) -> list[Any]:
+        """Return z of each rod."""
+        return self.split(z, [rod.z_layout.size for rod in self.members])
+
+    def placed(self, poses: Any) -> list[SlenderRod]:
+        """Return the rods whose ends know the poses of their bodies, by name."""
+        return [
+            _changed(
+                rod,
+                **{
+                    name: _changed(end, frame=poses[end.body])
+                    for name in ("base_end", "tip_end")
+                    if (end := getattr(rod, name)).body in poses
+                },
+            )
+            for rod in self.members
+        ]
+
+    def poses(self, bodies: list[Any]) -> dict[str, Pose]:
+        """Return the poses of the bodies by name."""
+        return {body.name: Pose(y[:3], y[3:7]) for body, y in zip(self.bodies, bodies, strict=True)}
+
+    # equations along the rods
+
+    def _ratios(self) -> list[Any]:
+        return [rod.length / self.length for rod in self.members]
+
+    def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
+        """Return the laws of the rods."""
+        terms = zip(
+            self.members, self._ratios(), *(self.states(part)[0] for part in (y, y_t)),
+            self.controls(control), strict=True,
+        )  # fmt: skip
+        return JointLaw(
+            tuple(
+                (rod.constitutive(s * ratio, t, *rest), rod.z_layout, rod.length)
+                for rod, ratio, *rest in terms
+            )
+        )
+
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """Return y_s of the rods, each at its part of its length; the fields of bodies are constant."""
+        terms = zip(
+            self.members, self._ratios(), *(self.states(part)[0] for part in (y, y_t)),
+            *(self.strains(part) for part in (z, z_t)), self.controls(control), strict=True,
+        )  # fmt: skip
+        rates = [ratio * rod.balance(s * ratio, t, *rest) for rod, ratio, *rest in terms]
+        return jnp.concatenate([*rates, np.zeros(Y_LAYOUT.size * len(self.bodies))])
+
+    @property
+    def discontinuities(self) -> Discontinuities:  # type: ignore[override]
+        """Places of all rods, with the jumps of each."""
+        own = [rod.discontinuities for rod in self.members]
+        places = tuple(sorted({place for each in own for place in each.places}))
+
+        def jump(acting: Any, t: Any, y: Any, y_t: Any, control: Any) -> Any:
+            states, bodies = self.states(y)
+            rates, _ = self.states(y_t)
+            far = [
+                each.jump(acting[np.array([places.index(place) for place in each.places])], t, *rest)
+                if each.jump
+                else rest[0]
+                for each, *rest in zip(own, states, rates, self.controls(control), strict=True)
+            ]
+            return jnp.concatenate([*far, *bodies])
+
+        return Discontinuities(places, jump if any(each.jump for each in own) else None)
+
+    # the two ends, and rest
+
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return y at s = 0: of the rods at their supports, and of the bodies with the wrench of the bases."""
+        sizes = [len(rod.y_layout.indices(rod.base_unknowns)) for rod in self.members]
+        *own, poses = self.split(unknowns, [*sizes, 7 * len(self.bodies)])
+        frames = self.poses(self.split(poses, [7] * len(self.bodies)) if self.bodies else [])
+        rods = self.placed(frames)
+        states = [rod.base(t, c, u) for rod, c, u in zip(rods, self.controls(control), own, strict=True)]
+        wrenches = dict.fromkeys(frames, Wrench(jnp.zeros(3), jnp.zeros(3)))
+        for rod, y in zip(rods, states, strict=True):
+            if body := rod.base_end.body:
+                p, _, n, m, *_ = rod.y_layout.split(y)
+                wrenches[body] += Wrench(n, m + cross(p - frames[body].p, n))
+        bodies = [jnp.concatenate([*frames[name], *wrenches[name], np.zeros(6)]) for name in frames]
+        return jnp.concatenate([*states, *bodies])
+
+    def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
+        """Return the residuals of the conditions at the rods' tips, and of the motion of each body."""
+        (states, bodies), (rates, body_rates) = self.states(y), self.states(y_t)
+        frames = self.poses(bodies)
+        rows, tips = [], {name: Wrench(jnp.zeros(3), jnp.zeros(3)) for name in frames}
+        for rod, u, *both in zip(self.placed(frames), self.controls(control), states, rates, strict=True):
+            rows.append(rod.tip(t, u, *both))
+            if body := rod.tip_end.body:
+                n, m = rod.tip_wrench(u, *both)
+                tips[body] += Wrench(-n, -m - cross(rod.pose(both[0]).p - frames[body].p, n))
+        for body, own, own_t in zip(self.bodies, bodies, body_rates, strict=True):
+            _, h, n, m, *_ = Y_LAYOUT.split(own)
+            moving = Body(body.mass, None, body.inertia).wrench(Motion.of(Y_LAYOUT, own, own_t), self.gravity)
+            total = moving + tips[body.name] + Wrench(n, m) + Wrench(*map(jnp.asarray, (body.force, body.moment)))
+            rows += [*total, jnp.sum(h * h)[None] - 1.0]
+        return jnp.concatenate(rows)
+
+    def scales(self) -> Scales:
+        """Return the scales of the rods; a body has those of the first rod on it."""
+        own = [rod.scales() for rod in self.members]
+        y, tip = [each.y for each in own], [each.tip for each in own]
+        for body in self.bodies:
+            first = next(
+                k for k, rod in enumerate(self.rods) if body.name in (rod.base_end.body, rod.tip_end.body)
+            )
+            scale = own[first].y[: Y_LAYOUT.size]
+            y.append(scale)
+            tip.append(jnp.append(scale[7:13], 1.0))
+        return Scales(jnp.concatenate(y), jnp.concatenate(tip))
+
+    def rest(self, s: Any) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
+        """Return the unloaded rods; rods that close a loop are bent to meet their tips' supports."""
+        rods, frames = self._at_rest
+        states, strains = [], []
+        for rod, ratio in zip(rods, self._ratios(), strict=True):
+            y, z = rod.rest(s * ratio)
+            end = rod.pose(rod.rest(rod.length)[0])
+            if rod.tip_end.held:
+                still = rod.end_controls(np.zeros(rod.control_layout.size))[1]
+                held, part = rod.tip_end.pose(end, still), s / self.length
+                blend = part * part * (3.0 - 2.0 * part)
+                y = y.at[:3].add(blend * (held.p - end.p))
+                turn = end._replace(p=np.zeros(3)).inverse().then(held).h
+                turn = turn * jnp.where(turn[0] < 0.0, -1.0, 1.0)
+                y = y.at[3:7].set(quaternion_product(y[3:7], quaternion_of(2.0 * blend * turn[1:])))
+            states.append(y)
+            strains.append(z)
+        bodies = [jnp.concatenate([*frames[body.name], np.zeros(12)]) for body in self.bodies]
+        return jnp.concatenate([*states, *bodies]), jnp.concatenate(strains)
+
+    @property
+    def _at_rest(self) -> tuple[list[SlenderRod], dict[str, Pose]]:
+        """Rods and bodies, each placed by the first rod that reaches it from the ground."""
+        frames: dict[str, Pose] = {}
+        todo = list(range(len(self.rods)))
+        while todo:
+            rods = self.placed(frames)
+            k = next(k for k in todo if rods[k].base_end.body in ("", *frames) or rods[k].tip_end.body in ("", *frames))
+            todo.remove(k)
+            rod = rods[k]
+            begin, end = rod.end_controls(np.zeros(rod.control_layout.size))
+            if rod.base_end.body in ("", *frames):
+                if (body := rod.tip_end.body) and body not in frames:
+                    tip = rod.pose(rod.rest(rod.length)[0])
+                    frames[body] = tip.then(rod.tip_end.place(AT_ORIGIN, end).inverse())
+            else:
+                fixed = _changed(rod, base_end=_changed(rod.base_end, frame=AT_ORIGIN))
+                tip = fixed.pose(fixed.rest(fixed.length)[0])
+                frames[rod.base_end.body] = rod.tip_end.pose(tip, end).then(tip.inverse())
+        return self.placed(frames), frames
