@@ -17,6 +17,7 @@ from knode_cosserat.rods import (
     tendons,
     tubes,
 )
+from knode_cosserat.rods.assembly import Assembly, RigidBody
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
@@ -30,6 +31,7 @@ from knode_cosserat.rods.system import Discontinuities, Scales, System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot
 
 __all__ = [
+    "Assembly",
     "Discontinuities",
     "Drawing",
     "Effect",
@@ -39,6 +41,7 @@ __all__ = [
     "ParallelRobot",
     "ParameterError",
     "Relaxation",
+    "RigidBody",
     "RobotFileError",
     "RoutedTendonRobot",
     "Scales",

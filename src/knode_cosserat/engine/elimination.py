@@ -57,6 +57,11 @@ class EliminationCode(RodCode):
         )
         if any(i // ny != c // self.own for i, c, _ in self.base_slopes):
             raise EngineError("engine: the base of a strand depends on the unknowns of another")
+        #: structural nonzeros of X, of a change of the unknowns, and of M
+        self.nonzero_X, self.nonzero_T = self._filled()
+        self.nonzero_M = np.zeros((k, ny), dtype=bool)
+        for i, c, _ in self.tip_slopes:
+            self.nonzero_M[i, c % ny] = True
         self.factor = a(len(self.elimination.factors), self.pieces)
         #: entries of A
         if robots or self.has_entries:
@@ -90,6 +95,20 @@ class EliminationCode(RodCode):
         self.alpha = by_rows(self.own, 1, self.strands)
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
+
+    def _filled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the structural nonzeros of X and of T anywhere along the rod."""
+        ny, X, T = self.equations.ny, np.zeros((self.equations.ny, self.own), dtype=bool), np.eye(self.own) > 0
+        for i, c, _ in self.base_slopes:
+            X[i % ny, c % self.own] = True
+        for _ in range(self.own + ny):
+            T = T @ T | X[self.pivots]
+            X = X | self.elimination.nonzero @ X | X @ T
+        return X, T
+
+    def _used(self, nonzero: np.ndarray) -> list[bool]:
+        """Return true for the blocks of a column that are not zero."""
+        return [bool(nonzero[row : row + self._rows_at_once].any()) for row in self._blocks(len(nonzero))]
 
     def _write_solved(self, name: str = "solved", columns: int = 1) -> Function:
         """A piece's B⁻¹ r, of one column or of several one after the other."""
@@ -191,14 +210,14 @@ class EliminationCode(RodCode):
         eye = [self._unit_column(c, k) for c in range(k)]
         for r, pivot in enumerate(self.pivots):
             scale = 1.0 / self._entry(columns[r], pivot)
-            factors = [self._entry(column, pivot) * scale for column in columns]
-            for matrix in (columns, eye):
-                pivotal = matrix[r]
-                for c in range(k):
-                    if c != r:
-                        pairs = zip(matrix[c], pivotal, strict=True)
-                        matrix[c] = [a - factors[c] * b for a, b in pairs]
-                matrix[r] = [scale * b for b in pivotal]
+            others = [c for c in range(k) if c != r and self.nonzero_X[pivot, c]]
+            factors = {c: self._entry(columns[c], pivot) * scale for c in others}
+            for matrix, nonzero in ((columns, self.nonzero_X), (eye, self.nonzero_T)):
+                pivotal, used = matrix[r], self._used(nonzero[:, r])
+                for c in others:
+                    blocks = zip(matrix[c], pivotal, used, strict=True)
+                    matrix[c] = [a - factors[c] * b if some else a for a, b, some in blocks]
+                matrix[r] = [scale * b if some else b for b, some in zip(pivotal, used, strict=True)]
         return eye
 
     def _unit_column(self, c: int, rows: int) -> list[Value]:
@@ -241,7 +260,11 @@ class EliminationCode(RodCode):
             component, lanes = self.X.component, self.P
             for c in range(own):
                 x = f.pointer(*self._at(self.X, c * self._padded(ny), tip))
-                product = self._product(M, [f.load(x, i * component, lanes) for i in range(ny)])
+                rows = [i for i in range(ny) if self.nonzero_X[i, c]]
+                product = self._product(
+                    [M[i] for i in rows], [f.load(x, i * component, lanes) for i in rows],
+                    self.nonzero_M[:, rows],
+                )  # fmt: skip
                 column = f.pointer(memory, (strand.value * own + c) * (self._padded(k) * component))
                 for row, value in zip(self._blocks(k), product, strict=True):
                     f.store(value, column, self.at_tip.at(row, 0), self.L)
@@ -297,12 +320,19 @@ class EliminationCode(RodCode):
             for each, at in zip(found, rows, strict=True):
                 f.store(each.get() * unit, column(inverse, c), at)
 
-    def _product(self, columns: list[list[Value]], x: list[Value]) -> list[Value]:
-        """Return a matrix times a vector."""
-        found = [x[0] * part for part in columns[0]]
-        for column, number in zip(columns[1:], x[1:], strict=True):
-            found = [a + number * part for a, part in zip(found, column, strict=True)]
-        return found
+    def _product(
+        self, columns: list[list[Value]], x: list[Value], nonzero: np.ndarray | None = None
+    ) -> list[Value]:
+        """Return a matrix times a vector; `nonzero` are the matrix's structural nonzeros."""
+        found: list[Any] = [None] * len(columns[0])
+        for c, (column, number) in enumerate(zip(columns, x, strict=True)):
+            used = [True] * len(column) if nonzero is None else self._used(nonzero[:, c])
+            for block, part in enumerate(column):
+                if used[block]:
+                    product = number * part
+                    found[block] = product if found[block] is None else found[block] + product
+        zero = self._now.splat(self._now.value(0.0), self.L)
+        return [zero if each is None else each for each in found]
 
     def _write_linearise(self) -> None:
         """Rates, slopes and factors at y."""
@@ -377,7 +407,9 @@ class EliminationCode(RodCode):
                     piece(j)
                 w = self._column(self.w, ny, 0, last)
                 columns = [self._column(self.X, ny, c, last) for c in range(own)]
-                moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
+                moved = self._product(
+                    columns, [self._entry(w, pivot) for pivot in self.pivots], self.nonzero_X
+                )
                 self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
                 group = f.index(strand.value * count + g.value)
                 self._set_column(self._gathered(w, self.pivots), self.beta, own, 0, group)
@@ -386,7 +418,7 @@ class EliminationCode(RodCode):
                 piece(j)
             w = self._column(self.w, ny, 0, tip)
             M = [self._column(self.M, k, i, strand) for i in range(ny)]
-            products = self._product(M, [self._entry(w, i) for i in range(ny)])
+            products = self._product(M, [self._entry(w, i) for i in range(ny)], self.nonzero_M)
             for variable, value in zip(tips, products, strict=True):
                 variable.set(variable.get() + value)
         inverse = [self._column(self.inverse, k, c) for c in range(k)]
@@ -401,7 +433,7 @@ class EliminationCode(RodCode):
             numbers = [self._entry([each.get() for each in alpha], c) for c in range(own)]
             with f.loop(stop, start) as j:
                 columns = [self._column(self.X, ny, c, j) for c in range(own)]
-                moved = self._product(columns, numbers)
+                moved = self._product(columns, numbers, self.nonzero_X)
                 w = self._column(self.w, ny, 0, j)
                 self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.column_dy, ny, 0, j)
 
@@ -416,7 +448,7 @@ class EliminationCode(RodCode):
                 beta = self._column(self.beta, own, 0, group)
                 change = [a.get() - b for a, b in zip(alpha, beta, strict=True)]
                 T = [self._column(self.T, own, c, group) for c in range(own)]
-                moved = self._product(T, [self._entry(change, c) for c in range(own)])
+                moved = self._product(T, [self._entry(change, c) for c in range(own)], self.nonzero_T)
                 for variable, value in zip(alpha, moved, strict=True):
                     variable.set(value)
                 correct(base + (g.value * size + 1), end)

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.ends import AT_ORIGIN, Pose, velocities
 from knode_cosserat.rods.law import JointLaw
@@ -36,6 +37,10 @@ def _changed(part: Any, **fields: Any) -> Any:
     for field in dataclasses.fields(part):
         object.__setattr__(copy, field.name, fields.get(field.name, getattr(part, field.name)))
     return copy
+
+
+#: gravity of rods that state none
+GRAVITY = next(field.default for field in dataclasses.fields(SlenderRod) if field.name == "gravity")
 
 
 class RigidBody(Part):
@@ -66,6 +71,7 @@ class Assembly(System):
     Rods have the gravity of the assembly.
     """
 
+    kind: ClassVar[str] = "assembly"
     mixed: ClassVar[bool] = False
 
     rods: tuple[SlenderRod, ...] = slot("rods, each with its name", SlenderRod, many=True, default=())
@@ -84,6 +90,49 @@ class Assembly(System):
     def length(self) -> Any:  # type: ignore[override]
         """Length of the first rod (m), in which s is stated."""
         return self.rods[0].length
+
+    def __check_init__(self) -> None:
+        names = [part.name for part in (*self.rods, *self.bodies)]
+        bodies = names[len(self.rods) :]
+        if not self.rods:
+            raise ParameterError("rods is []; allowed is one or more")
+        for name in names:
+            if not name or names.count(name) > 1:
+                raise ParameterError(
+                    f"{names.count(name)} of the rods and bodies have the name {name!r}; "
+                    "allowed is another name for each"
+                )
+        for rod in self.rods:
+            for end, where in (rod.base_end, f"{rod.name}.base_end"), (rod.tip_end, f"{rod.name}.tip_end"):
+                if end.body and end.body not in bodies:
+                    raise ParameterError(
+                        f"{where}.body is {end.body!r}; allowed is {', '.join(bodies) or 'none, as there are none'}"
+                        f"{did_you_mean(end.body, bodies)}"
+                    )
+                if not end.held and (end.body or end is rod.base_end):
+                    raise ParameterError(f"{where} is free; allowed is an end that is held, or a free tip")
+            if not any(np.array_equal(rod.gravity, known) for known in (GRAVITY, self.gravity)):
+                raise ParameterError(f"{rod.name} has a gravity of its own; allowed is that of the assembly")
+        for name in bodies:
+            if not any(name in (rod.base_end.body, rod.tip_end.body) for rod in self.rods):
+                raise ParameterError(f"the body {name!r} holds no rod; allowed is a body that joins rods")
+        if left := [rod.name for rod in self.rods if rod.name not in self.reached]:
+            raise ParameterError(
+                f"no rod joins {', '.join(left)} to the ground; allowed is an assembly with an end on the ground"
+            )
+
+    @property
+    def reached(self) -> dict[str, str]:
+        """Return the rods that lead from the ground, in order, and the body that each of them places, or ''."""
+        order, known, count = {}, {""}, -1
+        while len(order) > count:
+            count = len(order)
+            for rod in self.rods:
+                ends = [end.body for end in (rod.base_end, rod.tip_end) if end.held]
+                if rod.name not in order and known & {*ends}:
+                    order[rod.name] = next((body for body in ends if body not in known), "")
+                    known |= {*ends}
+        return order
 
     # layouts
 
@@ -160,13 +209,15 @@ class Assembly(System):
 
     # equations along the rods
 
-    def _ratios(self) -> list[Any]:
+    @property
+    def ratios(self) -> list[Any]:
+        """Length of each rod as a part of the first one's."""
         return [rod.length / self.length for rod in self.members]
 
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the laws of the rods."""
         terms = zip(
-            self.members, self._ratios(), *(self.states(part)[0] for part in (y, y_t)),
+            self.members, self.ratios, *(self.states(part)[0] for part in (y, y_t)),
             self.controls(control), strict=True,
         )  # fmt: skip
         return JointLaw(
@@ -179,7 +230,7 @@ class Assembly(System):
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of the rods, each at its part of its length; the fields of bodies are constant."""
         terms = zip(
-            self.members, self._ratios(), *(self.states(part)[0] for part in (y, y_t)),
+            self.members, self.ratios, *(self.states(part)[0] for part in (y, y_t)),
             *(self.strains(part) for part in (z, z_t)), self.controls(control), strict=True,
         )  # fmt: skip
         rates = [ratio * rod.balance(s * ratio, t, *rest) for rod, ratio, *rest in terms]
@@ -255,7 +306,7 @@ class Assembly(System):
         """Return the unloaded rods; rods that close a loop are bent to meet their tips' supports."""
         rods, frames = self._at_rest
         states, strains = [], []
-        for rod, ratio in zip(rods, self._ratios(), strict=True):
+        for rod, ratio in zip(rods, self.ratios, strict=True):
             y, z = rod.rest(s * ratio)
             end = rod.pose(rod.rest(rod.length)[0])
             if rod.tip_end.held:
@@ -273,21 +324,144 @@ class Assembly(System):
 
     @property
     def _at_rest(self) -> tuple[list[SlenderRod], dict[str, Pose]]:
-        """Rods and bodies, each placed by the first rod that reaches it from the ground."""
+        """Rods, and bodies as the first rod places each that leads to it from the ground."""
         frames: dict[str, Pose] = {}
-        todo = list(range(len(self.rods)))
-        while todo:
-            rods = self.placed(frames)
-            k = next(k for k in todo if rods[k].base_end.body in ("", *frames) or rods[k].tip_end.body in ("", *frames))
-            todo.remove(k)
-            rod = rods[k]
-            begin, end = rod.end_controls(np.zeros(rod.control_layout.size))
-            if rod.base_end.body in ("", *frames):
-                if (body := rod.tip_end.body) and body not in frames:
-                    tip = rod.pose(rod.rest(rod.length)[0])
-                    frames[body] = tip.then(rod.tip_end.place(AT_ORIGIN, end).inverse())
-            else:
-                fixed = _changed(rod, base_end=_changed(rod.base_end, frame=AT_ORIGIN))
-                tip = fixed.pose(fixed.rest(fixed.length)[0])
-                frames[rod.base_end.body] = rod.tip_end.pose(tip, end).then(tip.inverse())
+        for name, body in self.reached.items():
+            if not body:
+                continue
+            rod = next(rod for rod in self.placed(frames | {body: AT_ORIGIN}) if rod.name == name)
+            tip = rod.pose(rod.rest(rod.length)[0])
+            held = rod.tip_end.pose(tip, rod.end_controls(np.zeros(rod.control_layout.size))[1])
+            frames[body] = (tip if rod.tip_end.body == body else held).then(
+                (held if rod.tip_end.body == body else tip).inverse()
+            )
         return self.placed(frames), frames
+
+
+class _AssemblyEnds(Ends, of=Assembly):
+    """Ends of all rods, and the motion of the bodies."""
+
+    system: Assembly
+
+    @property
+    def rest_is_guess(self) -> bool:
+        """True if there is a closed loop, which the unloaded rods need not close."""
+        return sum(rod.tip_end.held for rod in self.system.rods) > len(self.system.bodies)
+
+    @property
+    def layout(self) -> Layout:
+        """Conditions at the rods' tips, and the balance of each body."""
+        balance = Layout(
+            ("force", 3, "N", "force on the body, global frame", "h", "N"),
+            ("moment", 3, "N m", "moment on the body, global frame", "h", "N m"),
+            ("norm", 1, "1", "square of the length of the quaternion, less one"),
+        )
+        return self.system.joined((Ends.of(rod).layout for rod in self.system.members), balance)
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of bases and bodies."""
+        (states, bodies), (rates, body_rates) = self.system.states(y), self.system.states(y_t)
+        moving = [
+            Ends.of(rod).moving_base(*both)
+            for rod, *both in zip(self.system.members, states, rates, strict=True)
+        ]
+        for own, own_t in zip(bodies, body_rates, strict=True):
+            q, w = velocities(Pose(own[:3], own[3:7]), Pose(own_t[:3], own_t[3:7]))
+            moving.append(jnp.concatenate([own[:13], q, w]))
+        return jnp.concatenate(moving)
+
+
+class _AssemblyDrawing(Drawing, of=Assembly):
+    """The first rod, and lines of all rods and bodies."""
+
+    system: Assembly
+
+    @property
+    def outlines(self) -> int:
+        """Number of bodies."""
+        return len(self.system.bodies)
+
+    def positions(self, y: Any) -> Any:
+        """Return the positions (…, 3) in m of the first rod."""
+        return y[..., :3]
+
+    def quaternions(self, y: Any) -> Any:
+        """Return the orientations (…, 4) of the first rod."""
+        return y[..., 3:7]
+
+    def curves(self, y: Any) -> list[Any]:
+        """Return every rod's curve, and a star from the centre of each body to the ends on it."""
+        y, layout, curves = np.asarray(y), self.system.y_layout, []
+        places = {rod.name: layout.get(y, f"{rod.name}_p") for rod in self.system.rods}
+        for body in self.system.bodies:
+            centre = layout.get(y, f"{body.name}_p")[..., 0, :]
+            star = [centre]
+            for rod in self.system.rods:
+                for node, end in ((0, rod.base_end), (-1, rod.tip_end)):
+                    if end.body == body.name:
+                        star += [places[rod.name][..., node, :], centre]
+            curves.append(np.stack(star, axis=-2))
+        return [*places.values(), *curves]
+
+
+class _AssemblyObserved(Observed, of=Assembly):
+    """Observables of all rods."""
+
+    system: Assembly
+
+    @property
+    def _rods(self) -> list[Any]:
+        return [Observed.of(rod) for rod in self.system.members]
+
+    @property
+    def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
+        """Velocities of all rods."""
+        rods = zip(self.system.rods, self._rods, strict=True)
+        return tuple(f"{rod.name}_{name}" for rod, own in rods for name in own.velocities)
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of `observables`."""
+        return self.system.joined(own.layout for own in self._rods)
+
+    def observables(self, point: RodPoint) -> Float[Any, " o"]:
+        """Return the observables of all rods."""
+        system = self.system
+        terms = zip(
+            system.members, self._rods, system.ratios, *(system.states(part)[0] for part in (point.y, point.y_t)),
+            system.controls(point.control), *(system.strains(part) for part in (point.z, point.z_t)), strict=True,
+        )  # fmt: skip
+        return jnp.concatenate(
+            [
+                own.observables(
+                    RodPoint(rod, point.s * ratio, point.t, y, y_t, control, z=z, z_t=z_t)
+                )
+                for rod, own, ratio, y, y_t, control, z, z_t in terms
+            ]
+        )
+
+    def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the actuation of all rods."""
+        parts = zip(self._rods, self.system.controls(control), strict=True)
+        return jnp.concatenate([own.actuation(part) for own, part in parts])
+
+    @property
+    def has_actuation(self) -> bool:
+        """True if a rod has another form of its control."""
+        return any(own.has_actuation for own in self._rods)
+
+    def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
+        """Return z of the unstressed rods."""
+        parts = zip(self._rods, self.system.ratios, self.system.controls(control), strict=True)
+        return jnp.concatenate([own.unstressed(s * ratio, part) for own, ratio, part in parts])
+
+    def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
+        """Return the factors of all rods; None if all are uniform."""
+        parts = zip(self.system.members, self._rods, self.system.ratios, self.system.controls(control), strict=True)
+        factors = [
+            own.law_factors(s * ratio, part) or (np.ones(rod.z_layout.size),) * 2
+            for rod, own, ratio, part in parts
+        ]
+        if all(rod.is_uniform for rod in self.system.members):
+            return None
+        return tuple(jnp.concatenate(each) for each in zip(*factors, strict=True))  # type: ignore[return-value]

@@ -66,7 +66,7 @@ class End(Part):
     orientation: Any = parameter(
         "1", "orientation of the held end, a quaternion", shape="quaternion", low=-1e3, high=1e3, default=None
     )
-    body: str = text("body of an assembly that holds the end, in whose frame it is then stated", "")
+    body: str = text("body of an assembly that holds the end, in whose frame it is then stated")
     #: pose of the body; the assembly states it
     frame: Pose | None = None
 

@@ -66,6 +66,7 @@ class ParallelRobot(Bundle):
     the theory of slender beams. A simulation therefore starts at the equilibrium under zero control.
     """
 
+    kind: ClassVar[str] = "parallel-robot"
     strand_class: ClassVar[type[System]] = _Leg
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = _Leg.alternatives
     length: Any = _of_rod("length")

@@ -36,8 +36,8 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
 #: fraction of the rod's length: a place nearer to an end than this is at the end
 AT_END = 1e-9
-#: pattern of a name
-NAME = "[A-Za-z][A-Za-z0-9_-]*"
+#: pattern of a name, or none
+NAME = "([A-Za-z][A-Za-z0-9_-]*)?"
 #: largest number of elements of a list in an error message
 MOST_SHOWN = 12
 #: by unit: the typical range
@@ -275,14 +275,15 @@ class Choice:
 
 @dataclasses.dataclass(frozen=True)
 class Text:
-    """Statement of a field that holds a name: letters, digits, - and _; or nothing, if it is optional."""
+    """Statement of a field that holds a name, or nothing."""
 
     meaning: str
-    optional: bool
+
+    optional: ClassVar[bool] = False
 
     def check(self, name: str, value: Any, text: str | None = None) -> None:
         """Raise `ParameterError` unless a value is a name."""
-        if not isinstance(value, str) or not re.fullmatch(NAME if value or not self.optional else "", value):
+        if not isinstance(value, str) or not re.fullmatch(NAME, value):
             raise ParameterError(
                 f"{name} is {text or shown(value)}; allowed is a name of letters, digits, - and _"
             )
@@ -298,8 +299,7 @@ class Text:
 
     def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
         """Return the JSON Schema of the values."""
-        stated = {"type": "string", "pattern": f"^({NAME})?$" if self.optional else f"^{NAME}$"}
-        return {**stated, "description": self.meaning} | ({"default": default} if self.optional else {})
+        return {"type": "string", "pattern": f"^{NAME}$", "description": self.meaning, "default": default}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -341,6 +341,10 @@ class _Slot:
             hint = did_you_mean(kind, known)
             raise ParameterError(f"{name}.kind is {shown(kind)}; allowed is {names}{hint}")
         return read_object(known[kind], {key: value[key] for key in value if key != "kind"}, name)
+
+    def flowed(self, value: Any) -> str:
+        """Return the text of a part, or of several, on one line."""
+        return f"[{', '.join(map(_part_text, value))}]" if self.many else _part_text(value)
 
     def written(self, value: Any) -> str:
         """Return the text of a part in a file, or lines of several."""
@@ -421,9 +425,9 @@ def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
     return _field(stated, default, _as_tuple if stated.many else None, static=True)
 
 
-def text(meaning: str, default: Any = dataclasses.MISSING) -> Any:
-    """Return a dataclass field for a name; a default makes it optional."""
-    return _field(Text(meaning, default is not dataclasses.MISSING), default, static=True)
+def text(meaning: str) -> Any:
+    """Return a dataclass field for a name; by default it is empty."""
+    return _field(Text(meaning), "", static=True)
 
 
 def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
@@ -497,7 +501,8 @@ def slots_of(cls: type) -> dict[str, _Slot]:
 
 def kinds_of(family: Any) -> dict[str, Any]:
     """Return the classes of a family that robot files can name: the family and its subclasses."""
-    kinds = {} if inspect.isabstract(family) or not family.kind else {family.kind: family}
+    kind = vars(family).get("kind")  # a class without its own kind is not in files
+    kinds = {} if inspect.isabstract(family) or not kind else {kind: family}
     for member in family.__subclasses__():
         kinds |= kinds_of(member)
     return dict(sorted(kinds.items()))
@@ -602,8 +607,9 @@ def _part_text(part: Any) -> str:
     entries = [f"kind: {part.kind}"]
     for name, stated in in_order(type(part)).items():
         value = getattr(part, name)
-        if value is not None and not np.array_equal(value, defaults[name]):
-            entries.append(f"{name}: {stated.written(value)}")
+        if value is not None and eqx.tree_equal(value, defaults[name]) is not True:
+            text_of = stated.flowed if isinstance(stated, _Slot) else stated.written
+            entries.append(f"{name}: {text_of(value)}")
     return "{" + ", ".join(entries) + "}"
 
 

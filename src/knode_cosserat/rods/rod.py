@@ -75,6 +75,7 @@ class SlenderRod(System):
     as actuators.
     """
 
+    kind: ClassVar[str] = "slender-rod"
     mixed: ClassVar[bool] = False
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = (
         ("radius", "density", "youngs_modulus"), ("cross_section",)
@@ -125,7 +126,7 @@ class SlenderRod(System):
     effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
     base_end: End = slot("end at s = 0", End, default=Clamped())
     tip_end: End = slot("end at s = length", End, default=Free())
-    name: str = text("name in an assembly", "")
+    name: str = text("name in an assembly")
 
     def __check_init__(self) -> None:
         if not self.base_end.anywhere:

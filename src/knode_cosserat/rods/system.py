@@ -62,6 +62,8 @@ class System(Parametrised):
     and derivatives.
     """
 
+    #: name in robot files; empty if no file describes the system
+    kind: ClassVar[str] = ""
     y_layout: ClassVar[Layout]
     z_layout: ClassVar[Layout]
     control_layout: ClassVar[Layout]
