@@ -12,7 +12,9 @@ the method of particular solutions (Ascher, Mattheij & Russell 1995, ch. 4).
 from __future__ import annotations
 
 import functools
+import itertools
 import operator
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -71,7 +73,7 @@ class EliminationCode(RodCode):
             self.added = self.r
         else:
             #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
-            self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
+            self.wide_matrix, self.wide_added = a(ny * (ny + 1), self.pieces), a(ny, self.pieces)
             self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
         #: columns of the unknowns along the rod
         self.X = by_rows(ny, self.own, self.points)
@@ -110,30 +112,49 @@ class EliminationCode(RodCode):
         """Return true for the blocks of a column that are not zero."""
         return [bool(nonzero[row : row + self._rows_at_once].any()) for row in self._blocks(len(nonzero))]
 
-    def _write_solved(self, name: str = "solved", columns: int = 1) -> Function:
-        """A piece's B⁻¹ r, of one column or of several one after the other."""
+    def _write_solved(self, name: str = "solved", columns: int = 1, rows: Sequence[int] = ()) -> Function:
+        """A piece's B⁻¹ r, of one column or of several one after the other, which may be zero in other rows."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
         j, component = f.index(piece), self.r.component
-        known = {int(node): self._get(self.factor, k, j, self.L) for k, node in enumerate(el.stored)}
         n = len(el.r)
+        rows = rows or range(n)
+        used = set(el.program.needed([el.solved[i] for i in rows]))
+        known = {
+            int(node): self._get(self.factor, k, j, self.L) for k, node in enumerate(el.stored) if node in used
+        }
         every = []
         for c in range(columns):
-            r = {int(node): f.load(source, (c * n + i) * component, self.L) for i, node in enumerate(el.r)}
+            r = {int(el.r[i]): f.load(source, (c * n + i) * component, self.L) for i in rows}
             every.append(known | r)
         # one operation of each column in turn
-        for node in el.program.needed(el.solved, frozenset(every[0])):
+        for node in el.program.needed([el.solved[i] for i in rows], frozenset(every[0])):
             for values in every:
                 values |= f.evaluate(el.program, [node], values, self.L)
         for c, values in enumerate(every):
-            for i, node in enumerate(el.solved):
-                f.store(values[node], target, (c * n + i) * component, self.L)
+            for i in rows:
+                f.store(values[el.solved[i]], target, (c * n + i) * component, self.L)
         return f
+
+    def _blocks_of_rows(self) -> list[range]:
+        """Return the ranges of rows of B⁻¹ A that are not coupled, such as those of the rods of an assembly."""
+        nonzero, ends = self.elimination.nonzero, [0]
+        for i in range(len(nonzero)):
+            if not (nonzero[: i + 1, i + 1 :].any() or nonzero[i + 1 :, : i + 1].any()):
+                ends.append(i + 1)
+        return [range(*bounds) for bounds in itertools.pairwise(ends)]
 
     def _write_factor(self) -> None:
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
         if not self.batch:
-            solved_columns = self._write_solved("solved_columns", COLUMNS)
+            el = self.elimination
+            # but for those of a constant field
+            blocks = [
+                rows for rows in self._blocks_of_rows() if any(el.solved[i] != int(el.r[i]) for i in rows)
+            ]
+            solved_columns = [
+                self._write_solved(f"solved_columns{k}", COLUMNS, rows) for k, rows in enumerate(blocks)
+            ]
         f, el, n = self._function("factored"), self.elimination, self.equations.ny
         self.factored = f
         memory = f.arguments[0]
@@ -156,12 +177,11 @@ class EliminationCode(RodCode):
             return
         with self._places(self.pieces) as j:
             first = self._pointer(self.wide_matrix, j)
-            with f.loop(n // COLUMNS * COLUMNS, 0, COLUMNS) as c:
-                column = f.pointer(first, c.value * (n * self.wide_matrix.component))
-                f.call(solved_columns, memory, column, column, j.value)
-            with f.loop(n, n // COLUMNS * COLUMNS) as c:
-                column = f.pointer(first, c.value * (n * self.wide_matrix.component))
-                f.call(self.solved, memory, column, column, j.value)
+            for rows, function in zip(blocks, solved_columns, strict=True):
+                # the last column may be another block's, zero in these rows
+                with f.loop(rows.stop, rows.start, COLUMNS) as c:
+                    column = f.pointer(first, c.value * (n * self.wide_matrix.component))
+                    f.call(function, memory, column, column, j.value)
         with f.loop(n) as c:
             source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
             target = c.value * self._padded(n) + self.matrix.offset
