@@ -146,33 +146,19 @@ class EliminationCode(RodCode):
 
     def _write_factor(self) -> None:
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
+        el, n, blocks = self.elimination, self.equations.ny, self._blocks_of_rows()
+        # a function for each block: LLVM's time grows faster than the size of a function
+        functions = [self._write_factor_of(f"factored{k}", rows) for k, rows in enumerate(blocks)]
+        # nothing is to be solved for a constant field
+        blocks = [rows for rows in blocks if any(el.solved[i] != int(el.r[i]) for i in rows)]
         if not self.batch:
-            el = self.elimination
-            # but for those of a constant field
-            blocks = [
-                rows for rows in self._blocks_of_rows() if any(el.solved[i] != int(el.r[i]) for i in rows)
-            ]
             solved_columns = [
                 self._write_solved(f"solved_columns{k}", COLUMNS, rows) for k, rows in enumerate(blocks)
             ]
-        f, el, n = self._function("factored"), self.elimination, self.equations.ny
-        self.factored = f
+        self.factored = f = self._function("factored")
         memory = f.arguments[0]
-        with self._places(self.pieces) as j:
-            known = {el.h: self._wide(self.h, 0, j)}
-            slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
-            for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
-                known |= {int(node): self._wide(array, k, at) for k, node in enumerate(nodes)}
-            outputs = [*el.factors, *map(int, el.matrix.reshape(-1))]
-            values = f.evaluate(el.program, outputs, known, self.L)
-            for k, node in enumerate(el.factors):
-                self._write_wide(values[node], self.factor, k, j)
-            if self.batch or self.has_entries:
-                for k, entry in enumerate(el.entries):
-                    self._write_wide(values[int(el.matrix[entry])], self.entries, k, j)
-            if not self.batch:
-                for i, c in np.ndindex(n, n):
-                    self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+        for function in functions:
+            f.call(function, memory)
         if self.batch:
             return
         with self._places(self.pieces) as j:
@@ -190,6 +176,29 @@ class EliminationCode(RodCode):
                     n, (f.pointer(memory, source + j.value), self.wide_matrix.component),
                     (f.pointer(memory, target + j.value * self.matrix.place), 1),
                 )  # fmt: skip
+
+    def _write_factor_of(self, name: str, block: range) -> Function:
+        """Factors and A of all pieces, in a block of rows and columns."""
+        f, el, n = self._function(name), self.elimination, self.equations.ny
+        factors = [k for k, (i, _) in enumerate(el.places) if i in block]
+        entries = [k for k, (i, _) in enumerate(el.entries) if i in block]
+        outputs = [el.factors[k] for k in factors] + [int(node) for node in el.matrix[block][:, block].flat]
+        used = set(el.program.needed(outputs))
+        with self._places(self.pieces) as j:
+            known = {el.h: self._wide(self.h, 0, j)}
+            slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
+            for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
+                known |= {int(node): self._wide(array, k, at) for k, node in enumerate(nodes) if node in used}
+            values = f.evaluate(el.program, outputs, known, self.L)
+            for k in factors:
+                self._write_wide(values[el.factors[k]], self.factor, k, j)
+            if self.batch or self.has_entries:
+                for k in entries:
+                    self._write_wide(values[int(el.matrix[el.entries[k]])], self.entries, k, j)
+            if not self.batch:
+                for i, c in itertools.product(block, block):
+                    self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+        return f
 
     def _copy(self, count: int, source: tuple[Value, int], target: tuple[Value, int]) -> None:
         """Write numbers from an address to another, each with the distance between numbers."""

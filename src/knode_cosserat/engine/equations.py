@@ -421,11 +421,11 @@ class Elimination:
                 for j in order[at + 1 :]:
                     product = apply("mul", int(B[i, p]), int(B[p, j]))
                     B[i, j] = apply("sub", int(B[i, j]), product)
-        #: factors that are not constant
-        places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
-        self.factors = [int(B[i, j]) for i, j in places]
-        self.stored = program.inputs("factor", (len(places),), 1)
-        for node, (i, j) in zip(self.stored, places, strict=True):
+        #: factors that are not constant, and their rows and columns
+        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
+        self.factors = [int(B[i, j]) for i, j in self.places]
+        self.stored = program.inputs("factor", (len(self.places),), 1)
+        for node, (i, j) in zip(self.stored, self.places, strict=True):
             B[i, j] = node
         #: nonzeros of B⁻¹ A
         self.nonzero = np.not_equal(A, zero)
