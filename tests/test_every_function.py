@@ -91,11 +91,12 @@ ROBOTS = {
     "model of own": with_network(CANE, 2),
     "arm": kc.load_robot("three-chamber-arm").replace(nodes=5),
     "tubes": kc.load_robot("three-tube-robot").replace(nodes=13),
+    "gripper": kc.load_robot("three-finger-gripper").replace(nodes=5),
 }  # fmt: skip
 #: means of the controls of robots whose controls are not the paper's four tensions
 MEANS = {
     "own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4],
-    "tubes": [1.0, 0.02, -0.5, 0.01, 0.3, 0.02],
+    "tubes": [1.0, 0.02, -0.5, 0.01, 0.3, 0.02], "gripper": [1.0, 1.5, 2.0, 0.8, 0.9, 1.0],
 }  # fmt: skip
 
 
@@ -123,6 +124,8 @@ def made(kind: str) -> Made:
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
+    if robot is ROBOTS["gripper"]:
+        return "rods.thumb.youngs_modulus"
     return {2: "bending", 3: "effects.0.offset", 6: "tubes.1.curvature"}.get(
         robot.control_layout.size, "youngs_modulus"
     )

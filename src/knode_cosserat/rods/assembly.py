@@ -377,7 +377,7 @@ class _AssemblyDrawing(Drawing, of=Assembly):
     system: Assembly
 
     @property
-    def outlines(self) -> int:
+    def outlines(self) -> int:  # type: ignore[override]
         """Number of bodies."""
         return len(self.system.bodies)
 

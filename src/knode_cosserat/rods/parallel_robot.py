@@ -275,6 +275,7 @@ class _PlatformDrawing(Drawing, of=ParallelRobot):
     """Axis of the robot, and lines of its legs and platform."""
 
     system: ParallelRobot
+    outlines = 1
 
     def curves(self, y: Any) -> list[Any]:
         """Return every leg's curve, and the polygon of the platform's joints."""

@@ -607,9 +607,10 @@ def _part_text(part: Any) -> str:
     entries = [f"kind: {part.kind}"]
     for name, stated in in_order(type(part)).items():
         value = getattr(part, name)
-        if value is not None and eqx.tree_equal(value, defaults[name]) is not True:
-            text_of = stated.flowed if isinstance(stated, _Slot) else stated.written
-            entries.append(f"{name}: {text_of(value)}")
+        is_part = isinstance(stated, _Slot)
+        equal: Any = eqx.tree_equal if is_part else np.array_equal
+        if value is not None and equal(value, defaults[name]) is not True:
+            entries.append(f"{name}: {stated.flowed(value) if is_part else stated.written(value)}")
     return "{" + ", ".join(entries) + "}"
 
 
@@ -630,7 +631,7 @@ def object_schema(cls: type[Parametrised], families: dict[str, Any], **more: Any
     }
 
 
-# names with dots, such as `loads.0.mass`
+# names with dots, such as `loads.0.mass` or `rods.thumb.length`
 
 
 def value_at(owner: Any, path: str) -> Any:
@@ -672,18 +673,24 @@ def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
     inner = _entry(owner, first, name)
     changed = with_value(inner, rest, value, name) if rest else value
     if isinstance(owner, tuple):
-        return tuple(changed if k == int(first) else part for k, part in enumerate(owner))
+        known = zip(names_of(owner), owner, strict=True)
+        return tuple(changed if own == first else part for own, part in known)
     return dataclasses.replace(owner, **{first: changed})
+
+
+def names_of(parts: tuple[Any, ...]) -> list[str]:
+    """Return the names of parts in a path: their own names, or else their numbers."""
+    return [getattr(part, "name", "") or str(k) for k, part in enumerate(parts)]
 
 
 def _entry(owner: Any, part: str, name: str) -> Any:
     """Return a field of a robot or part, or an entry of a tuple of parts. Raises `ParameterError`."""
     if isinstance(owner, tuple):
-        known = [str(k) for k in range(len(owner))]
+        known = names_of(owner)
     else:
         known = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
     if part not in known:
         raise ParameterError(
             f"there is no parameter {name!r}: no {part!r} among {', '.join(known) or 'nothing'}"
         )
-    return owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
+    return owner[known.index(part)] if isinstance(owner, tuple) else getattr(owner, part)
