@@ -388,16 +388,13 @@ class Core(EliminationCode):
                 found.set(f.apply("max", found.get(), value))
                 total.set(total.get() + value)
 
-            names = layout.names
-            if "p" in names:
-                span = layout.slice("p")
+            for span in layout.slices("p"):
                 largest(offs, _sum(d * d for d in map(change, range(span.start, span.stop))))
-            else:
+            if not layout.slices("p"):
                 for i in range(self.equations.ny):
                     size = change(i) * self._unit(i, j) * self._wide(self.length, 0)
                     largest(offs, size * size)
-            if "h" in names:
-                span = layout.slice("h")
+            for span in layout.slices("h"):
                 rows = range(span.start, span.stop)
                 h, d = [self._wide(self.y, i, j) for i in rows], [change(i) for i in rows]
                 square = _sum(a * a for a in h)

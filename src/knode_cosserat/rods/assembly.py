@@ -6,13 +6,15 @@ stand, at the tip. With the wrench n, m of each rod on its support (at its base;
 from the body's centre of mass to the joint, in the global frame,
 
     M p_tt = M g + f + Σ n,      d(R J ω)/dt = l + Σ (m + r × n).
+
+Neighbours in contact push each other with the law of `surroundings`, where s/length is equal.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +29,8 @@ from knode_cosserat.rods.loads import Body, Motion
 from knode_cosserat.rods.parameters import ParameterError, parameter, slot, text
 from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rods.rod import Y_LAYOUT, SlenderRod
-from knode_cosserat.rods.system import Discontinuities, Scales, System
+from knode_cosserat.rods.surroundings import ContactLaw, velocity_at
+from knode_cosserat.rods.system import Discontinuities, Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, quaternion_of, quaternion_product, rotation_matrix
 
 
@@ -63,6 +66,30 @@ class RigidBody(Part):
     )
 
 
+class NeighbourContact(ContactLaw):
+    """Contact of two rods side by side: at equal places of the grid, with equal and opposite forces.
+
+    The normal is across the mean of their axes, along which they may slide by much less than their length.
+    """
+
+    kind: ClassVar[str] = "neighbours"
+
+    first: str = text("name of a rod")
+    second: str = text("name of the other rod")
+
+    def wrenches(self, motions: list[Motion], radii: list[Any]) -> list[Wrench]:
+        """Return the loads on the rods, per length of the first (N/m, N), global frame."""
+        axis = motions[0].R[:, 2] + motions[1].R[:, 2]
+        away = motions[0].p - motions[1].p
+        away = away - axis * (jnp.sum(away * axis) / jnp.sum(axis * axis))
+        distance = jnp.sqrt(jnp.sum(away * away) + 1e-24)
+        normal = away / distance
+        arms = [-radii[0] * normal, radii[1] * normal]
+        one, other = (velocity_at(motion, arm) for motion, arm in zip(motions, arms, strict=True))
+        force = self.force(distance - radii[0] - radii[1], normal, one - other)
+        return [Wrench(each, cross(arm, each)) for arm, each in zip(arms, (force, -force), strict=True)]
+
+
 class Assembly(System):
     """Rods that are joined by rigid bodies.
 
@@ -76,6 +103,9 @@ class Assembly(System):
 
     rods: tuple[SlenderRod, ...] = slot("rods, each with its name", SlenderRod, many=True, default=())
     bodies: tuple[RigidBody, ...] = slot("bodies that join the rods", RigidBody, many=True, default=())
+    contacts: tuple[NeighbourContact, ...] = slot(
+        "contacts of neighbouring rods", NeighbourContact, many=True, default=()
+    )
     gravity: Any = parameter(
         "m/s2", "gravitational acceleration, global frame", shape="vector", low=-100.0, high=100.0,
         default=(0.0, 0.0, -9.81),
@@ -90,6 +120,13 @@ class Assembly(System):
     def length(self) -> Any:  # type: ignore[override]
         """Length of the first rod (m), in which s is stated."""
         return self.rods[0].length
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other parameters, by name; another `length` changes all rods in proportion."""
+        if "length" in changes:
+            factor = changes.pop("length") / self.length
+            changes = {f"rods.{rod.name}.length": rod.length * factor for rod in self.rods} | changes
+        return super().replace(**changes)
 
     def __check_init__(self) -> None:
         names = [part.name for part in (*self.rods, *self.bodies)]
@@ -111,8 +148,16 @@ class Assembly(System):
                     )
                 if not end.held and (end.body or end is rod.base_end):
                     raise ParameterError(f"{where} is free; allowed is an end that is held, or a free tip")
-            if not any(np.array_equal(rod.gravity, known) for known in (GRAVITY, self.gravity)):
+            known = GRAVITY, self.gravity
+            if not is_traced((rod, self.gravity)) and not any(np.array_equal(rod.gravity, g) for g in known):
                 raise ParameterError(f"{rod.name} has a gravity of its own; allowed is that of the assembly")
+        for contact in self.contacts:
+            for name in (contact.first, contact.second):
+                if name not in names[: len(self.rods)] or contact.first == contact.second:
+                    raise ParameterError(
+                        f"a contact is of {contact.first!r} and {contact.second!r}; "
+                        f"allowed is two of {', '.join(names[: len(self.rods)])}"
+                    )
         for name in bodies:
             if not any(name in (rod.base_end.body, rod.tip_end.body) for rod in self.rods):
                 raise ParameterError(f"the body {name!r} holds no rod; allowed is a body that joins rods")
@@ -229,11 +274,23 @@ class Assembly(System):
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of the rods, each at its part of its length; the fields of bodies are constant."""
-        terms = zip(
-            self.members, self.ratios, *(self.states(part)[0] for part in (y, y_t)),
-            *(self.strains(part) for part in (z, z_t)), self.controls(control), strict=True,
+        terms = list(
+            zip(
+                self.members, self.ratios, *(self.states(part)[0] for part in (y, y_t)),
+                *(self.strains(part) for part in (z, z_t)), self.controls(control), strict=True,
+            )
         )  # fmt: skip
         rates = [ratio * rod.balance(s * ratio, t, *rest) for rod, ratio, *rest in terms]
+        for contact in self.contacts:
+            pair = [[rod.name for rod in self.rods].index(name) for name in (contact.first, contact.second)]
+            at = [terms[k] for k in pair]
+            loads = contact.wrenches(
+                [Motion.of(rod.y_layout, own, own_t) for rod, _, own, own_t, *_ in at],
+                [rod.material(s * ratio, u).radius for rod, ratio, *_, u in at],
+            )
+            for k, load in zip(pair, loads, strict=True):
+                change = terms[pair[0]][1] * jnp.concatenate([np.zeros(7), *load])
+                rates[k] = rates[k] - jnp.concatenate([change, np.zeros(len(rates[k]) - 13)])
         return jnp.concatenate([*rates, np.zeros(Y_LAYOUT.size * len(self.bodies))])
 
     @property

@@ -164,6 +164,10 @@ class Sliding(Driven):
 
     along: str = choice("the global axis that it slides along", AXES[:3], "z")
 
+    def __check_init__(self) -> None:
+        if self.body:
+            raise ParameterError("an end on a body cannot slide; allowed is the ground, as it slides along a global axis")
+
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the clamped residual, with zero force along the axis instead of the position along it."""
         rows, k = super().residual(held, y, n, m), AXES.index(self.along)
