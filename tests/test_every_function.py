@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, Residual, network
@@ -226,7 +227,7 @@ OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configu
 LACKING = {
     **{
         ("fit, passive", kind): (kc.learning.FitError, "without bending_stiffness")
-        for kind in ("own", "model of own", "tubes")
+        for kind in ("own", "model of own", "tubes", "gripper")
     },
     **{
         (name, "tubes"): (
@@ -235,6 +236,13 @@ LACKING = {
         )
         for name in ("estimate_states", "estimate_states, paper")
     },
+    **{
+        (name, "gripper"): (kc.recordings.RecordingError, "estimation is for rods with p, h, q, w, n, m")
+        for name in ("estimate_states", "estimate_states, paper")
+    },
+    ("stability", "gripper"): (ValueError, "allowed are rods with p, h, n and m"),
+    ("compliance", "gripper"): (ValueError, "the robot's tip has no force n or moment m"),
+    ("fit, network", "gripper"): (EngineError, "more than 180000 operations; use smaller laws"),
 }
 
 

@@ -17,8 +17,8 @@ from knode_cosserat.rods import (
     tendons,
     tubes,
 )
-from knode_cosserat.rods.assembly import Assembly, RigidBody
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.assembly import Assembly, RigidBody
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import ParameterError, parameter

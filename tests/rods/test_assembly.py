@@ -1,4 +1,4 @@
-"""Assemblies: frames in closed form, joints, loops, motion of bodies, neighbours in contact, and bad input."""
+"""Assemblies: frames in closed form, joints, loops, motion of bodies, neighbours in contact, bad input."""
 
 import jax
 import jax.numpy as jnp
@@ -69,7 +69,7 @@ def four_bar(nodes, **options):
     return moved(assembly(*rods, bodies=bodies, nodes=nodes), "a", **options)[0]
 
 
-#: a frame of two beams, whose column bends with the moment F L; a portal frame of equal rods, (2 + 3) / (1 + 6)
+#: a frame of two beams, whose column has the moment F L; a portal frame of equal rods, (2 + 3) / (1 + 6)
 FRAMES = {angle_frame: FORCE * L**3 / EI * (1 / 3 + 1), four_bar: FORCE * L**3 / (12 * EI) * 5 / 7}
 
 
@@ -110,13 +110,13 @@ def swinging(heavy, **more):
 
 @pytest.mark.slow
 def test_a_body_at_the_tip_moves_as_a_mass_on_the_rod():
-    """Released from upright under gravity aslant, and turned at its base."""
+    """Its base is pushed and turned. The rates of the body are those of its pose, not the rod's."""
     t = 0.01 * np.arange(1, 61)[:, None]
     turning = {"base_end": Driven(axes=("x", "ry"))}
-    control = np.concatenate([0.02 * np.sin(5.0 * t), 0.3 * np.sin(7.0 * t)], axis=1)
+    control = np.concatenate([0.02 * (1.0 - np.cos(5.0 * t)), 0.15 * (1.0 - np.cos(7.0 * t))], axis=1)
     tips = [kc.simulate(swinging(heavy, **turning), control, 0.01).tip_position for heavy in (True, False)]
     assert np.ptp(tips[0][:, 0]) > 0.1
-    np.testing.assert_allclose(tips[1], tips[0], atol=2e-5)
+    np.testing.assert_allclose(tips[1], tips[0], atol=1e-5)
 
 
 @pytest.mark.slow
@@ -125,9 +125,9 @@ def test_a_divided_rod_bends_as_a_whole_one():
     whole = rod("whole", length=2.0 * L, nodes=11)
     halves = Assembly(
         rods=(rod("lower", tip_end=on("joint")), rod("upper", base_end=on("joint"))),
-        bodies=(RigidBody(name="joint"),), gravity=(4.0, 1.0, -9.0), nodes=6,
+        bodies=(RigidBody(name="joint"),), gravity=(40.0, 10.0, -90.0), nodes=6,
     )  # fmt: skip
-    one = kc.equilibrium(whole.replace(gravity=(4.0, 1.0, -9.0)), [], newton=NEWTON).part("p")[0]
+    one = kc.equilibrium(whole.replace(gravity=(40.0, 10.0, -90.0)), [], newton=NEWTON).part("p")[0]
     two = kc.equilibrium(halves, [], newton=NEWTON)
     assert one[-1, 0] > 0.05
     np.testing.assert_allclose(two.part("lower_p")[0], one[:6], atol=1e-10)
@@ -140,7 +140,9 @@ def test_legs_and_a_platform_are_the_parallel_robot(legs):
     robot = kc.load_robot("six-legged-robot")
     base, platform = (np.asarray(angles)[:legs] for angles in (robot.base_angles, robot.platform_angles))
     robot = robot.replace(base_angles=base, platform_angles=platform)
-    circle = 0.087 * np.stack([np.cos([base, platform]), np.sin([base, platform]), np.zeros((2, legs))], axis=-1)
+    circle = 0.087 * np.stack(
+        [np.cos([base, platform]), np.sin([base, platform]), np.zeros((2, legs))], axis=-1
+    )
     section = {
         name: getattr(robot, name)
         for name in ("length", "radius", "density", "youngs_modulus", "bending_damping", "drag")
@@ -214,8 +216,12 @@ def test_gradients_and_batches_are_those_of_single_assemblies():
 
     slope, step = jax.grad(tip)(E), 1e-4 * E
     assert slope == pytest.approx((tip(E + step) - tip(E - step)) / (2.0 * step), rel=1e-5)
-    robots = [swinging(False).replace(gravity=(x, 0.0, -9.0), **{"rods.arm.length": L * x}) for x in (1.0, 1.1)]
-    several = kc.simulate(jax.tree.map(lambda *leaves: jnp.stack(leaves), *robots), control, 0.02)
+    robots = [
+        swinging(False).replace(gravity=(x, 0.0, -9.0), **{"rods.arm.length": L * x}) for x in (1.0, 1.1)
+    ]
+    several = kc.simulate(
+        jax.tree.map(lambda *leaves: jnp.stack(leaves), *robots), np.stack([control] * 2), 0.02
+    )
     for row, robot in zip(several.tip_position, robots, strict=True):
         np.testing.assert_allclose(row, kc.simulate(robot, control, 0.02).tip_position, atol=1e-9)
 

@@ -100,7 +100,11 @@ class EliminationCode(RodCode):
 
     def _filled(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the structural nonzeros of X and of T anywhere along the rod."""
-        ny, X, T = self.equations.ny, np.zeros((self.equations.ny, self.own), dtype=bool), np.eye(self.own) > 0
+        ny, X, T = (
+            self.equations.ny,
+            np.zeros((self.equations.ny, self.own), dtype=bool),
+            np.eye(self.own) > 0,
+        )
         for i, c, _ in self.base_slopes:
             X[i % ny, c % self.own] = True
         for _ in range(self.own + ny):
@@ -113,7 +117,7 @@ class EliminationCode(RodCode):
         return [bool(nonzero[row : row + self._rows_at_once].any()) for row in self._blocks(len(nonzero))]
 
     def _write_solved(self, name: str = "solved", columns: int = 1, rows: Sequence[int] = ()) -> Function:
-        """A piece's B⁻¹ r, of one column or of several one after the other, which may be zero in other rows."""
+        """A piece's B⁻¹ r, of one column or of several one after the other, which are zero in other rows."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
         j, component = f.index(piece), self.r.component
@@ -121,7 +125,9 @@ class EliminationCode(RodCode):
         rows = rows or range(n)
         used = set(el.program.needed([el.solved[i] for i in rows]))
         known = {
-            int(node): self._get(self.factor, k, j, self.L) for k, node in enumerate(el.stored) if node in used
+            int(node): self._get(self.factor, k, j, self.L)
+            for k, node in enumerate(el.stored)
+            if node in used
         }
         every = []
         for c in range(columns):
@@ -137,12 +143,10 @@ class EliminationCode(RodCode):
         return f
 
     def _blocks_of_rows(self) -> list[range]:
-        """Return the ranges of rows of B⁻¹ A that are not coupled, such as those of the rods of an assembly."""
-        nonzero, ends = self.elimination.nonzero, [0]
-        for i in range(len(nonzero)):
-            if not (nonzero[: i + 1, i + 1 :].any() or nonzero[i + 1 :, : i + 1].any()):
-                ends.append(i + 1)
-        return [range(*bounds) for bounds in itertools.pairwise(ends)]
+        """Return the ranges of rows of B⁻¹ A that are not coupled, such as the rods of an assembly."""
+        nonzero = self.elimination.nonzero | self.elimination.nonzero.T
+        ends = (i for i in range(1, len(nonzero) + 1) if not nonzero[:i, i:].any())
+        return [range(*bounds) for bounds in itertools.pairwise([0, *ends])]
 
     def _write_factor(self) -> None:
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""

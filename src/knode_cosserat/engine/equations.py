@@ -28,7 +28,7 @@ MOST_OPERATIONS = 60_000
 
 
 def most_operations(ny: int) -> int:
-    """Return the largest number of operations of a system with a y of this size: an assembly has several rods'."""
+    """Return the largest number of operations of a system by the size of y: an assembly has several rods."""
     return MOST_OPERATIONS * (1 + ny // 40)
 
 

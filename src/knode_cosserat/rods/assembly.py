@@ -1,9 +1,9 @@
 """Assemblies: rods of any kind that rigid bodies join, in a tree or with closed loops.
 
-All rods run side by side over one grid of s/length. A body is a rigid frame with the unknown pose (p, h), whose
-fields of y are constant along the grid. Both ends of every rod therefore meet the body where the conditions
-stand, at the tip. With the wrench n, m of each rod on its support (at its base; at its tip it is -n, -m), and r
-from the body's centre of mass to the joint, in the global frame,
+All rods run side by side over one grid of s/length. A body has an unknown pose (p, h), and its fields of y
+are constant along the grid. Both ends of a rod therefore meet the body at the tip, where the conditions stand.
+With the wrench n, m of each rod on the body (at its base; at its tip it is -n, -m), and r from the body's
+centre of mass to the joint, in the global frame,
 
     M p_tt = M g + f + Σ n,      d(R J ω)/dt = l + Σ (m + r × n).
 
@@ -31,11 +31,11 @@ from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rods.rod import Y_LAYOUT, SlenderRod
 from knode_cosserat.rods.surroundings import ContactLaw, velocity_at
 from knode_cosserat.rods.system import Discontinuities, Scales, System, is_traced
-from knode_cosserat.rotation import cross, dot, quaternion_of, quaternion_product, rotation_matrix
+from knode_cosserat.rotation import cross, quaternion_of, quaternion_product
 
 
 def _changed(part: Any, **fields: Any) -> Any:
-    """Return a copy with other fields, unchecked: parameters may be any numbers, or none, where code is made."""
+    """Return a copy with other fields, unchecked: where code is made, parameters are any numbers or none."""
     copy = object.__new__(type(part))
     for field in dataclasses.fields(part):
         object.__setattr__(copy, field.name, fields.get(field.name, getattr(part, field.name)))
@@ -43,7 +43,7 @@ def _changed(part: Any, **fields: Any) -> Any:
 
 
 #: gravity of rods that state none
-GRAVITY = next(field.default for field in dataclasses.fields(SlenderRod) if field.name == "gravity")
+GRAVITY: Any = SlenderRod.__dataclass_fields__["gravity"].default
 
 
 class RigidBody(Part):
@@ -116,8 +116,8 @@ class Assembly(System):
         """Rods with the grid and the gravity of the assembly."""
         return tuple(_changed(rod, nodes=self.nodes, gravity=self.gravity) for rod in self.rods)
 
-    @property
-    def length(self) -> Any:  # type: ignore[override]
+    @property  # type: ignore[misc]
+    def length(self) -> Any:
         """Length of the first rod (m), in which s is stated."""
         return self.rods[0].length
 
@@ -129,8 +129,8 @@ class Assembly(System):
         return super().replace(**changes)
 
     def __check_init__(self) -> None:
-        names = [part.name for part in (*self.rods, *self.bodies)]
-        bodies = names[len(self.rods) :]
+        rods, bodies = [rod.name for rod in self.rods], [body.name for body in self.bodies]
+        names = rods + bodies
         if not self.rods:
             raise ParameterError("rods is []; allowed is one or more")
         for name in names:
@@ -143,7 +143,7 @@ class Assembly(System):
             for end, where in (rod.base_end, f"{rod.name}.base_end"), (rod.tip_end, f"{rod.name}.tip_end"):
                 if end.body and end.body not in bodies:
                     raise ParameterError(
-                        f"{where}.body is {end.body!r}; allowed is {', '.join(bodies) or 'none, as there are none'}"
+                        f"{where}.body is {end.body!r}; allowed is {', '.join(bodies) or 'none'}"
                         f"{did_you_mean(end.body, bodies)}"
                     )
                 if not end.held and (end.body or end is rod.base_end):
@@ -153,23 +153,24 @@ class Assembly(System):
                 raise ParameterError(f"{rod.name} has a gravity of its own; allowed is that of the assembly")
         for contact in self.contacts:
             for name in (contact.first, contact.second):
-                if name not in names[: len(self.rods)] or contact.first == contact.second:
+                if name not in rods or contact.first == contact.second:
                     raise ParameterError(
                         f"a contact is of {contact.first!r} and {contact.second!r}; "
-                        f"allowed is two of {', '.join(names[: len(self.rods)])}"
+                        f"allowed is two of {', '.join(rods)}"
                     )
         for name in bodies:
             if not any(name in (rod.base_end.body, rod.tip_end.body) for rod in self.rods):
                 raise ParameterError(f"the body {name!r} holds no rod; allowed is a body that joins rods")
         if left := [rod.name for rod in self.rods if rod.name not in self.reached]:
             raise ParameterError(
-                f"no rod joins {', '.join(left)} to the ground; allowed is an assembly with an end on the ground"
+                f"no rod joins {', '.join(left)} to the ground; allowed is an assembly on the ground"
             )
 
     @property
     def reached(self) -> dict[str, str]:
-        """Return the rods that lead from the ground, in order, and the body that each of them places, or ''."""
-        order, known, count = {}, {""}, -1
+        """Rods that lead from the ground, in order, each with the body that it places, if any."""
+        order: dict[str, str] = {}
+        known, count = {""}, -1
         while len(order) > count:
             count = len(order)
             for rod in self.rods:
@@ -183,7 +184,8 @@ class Assembly(System):
 
     def joined(self, layouts: Any, bodies: Layout | None = None) -> Layout:
         """Return the layouts of all rods, and that of every body, with the names in front."""
-        every = [*zip(self.rods, layouts, strict=True), *((body, bodies) for body in self.bodies if bodies)]
+        every: list[Any] = list(zip(self.rods, layouts, strict=True))
+        every += [(body, bodies) for body in self.bodies if bodies]
         return Layout(
             *(
                 field._replace(
@@ -315,7 +317,7 @@ class Assembly(System):
     # the two ends, and rest
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
-        """Return y at s = 0: of the rods at their supports, and of the bodies with the wrench of the bases."""
+        """Return y at s = 0: of the rods at their supports, and of the bodies with the bases' wrench."""
         sizes = [len(rod.y_layout.indices(rod.base_unknowns)) for rod in self.members]
         *own, poses = self.split(unknowns, [*sizes, 7 * len(self.bodies)])
         frames = self.poses(self.split(poses, [7] * len(self.bodies)) if self.bodies else [])
@@ -336,13 +338,15 @@ class Assembly(System):
         rows, tips = [], {name: Wrench(jnp.zeros(3), jnp.zeros(3)) for name in frames}
         for rod, u, *both in zip(self.placed(frames), self.controls(control), states, rates, strict=True):
             rows.append(rod.tip(t, u, *both))
-            if body := rod.tip_end.body:
+            if name := rod.tip_end.body:
                 n, m = rod.tip_wrench(u, *both)
-                tips[body] += Wrench(-n, -m - cross(rod.pose(both[0]).p - frames[body].p, n))
+                tips[name] += Wrench(-n, -m - cross(rod.pose(both[0]).p - frames[name].p, n))
         for body, own, own_t in zip(self.bodies, bodies, body_rates, strict=True):
             _, h, n, m, *_ = Y_LAYOUT.split(own)
             moving = Body(body.mass, None, body.inertia).wrench(Motion.of(Y_LAYOUT, own, own_t), self.gravity)
-            total = moving + tips[body.name] + Wrench(n, m) + Wrench(*map(jnp.asarray, (body.force, body.moment)))
+            total = (
+                moving + tips[body.name] + Wrench(n, m) + Wrench(*map(jnp.asarray, (body.force, body.moment)))
+            )
             rows += [*total, jnp.sum(h * h)[None] - 1.0]
         return jnp.concatenate(rows)
 
@@ -485,14 +489,13 @@ class _AssemblyObserved(Observed, of=Assembly):
         """Return the observables of all rods."""
         system = self.system
         terms = zip(
-            system.members, self._rods, system.ratios, *(system.states(part)[0] for part in (point.y, point.y_t)),
-            system.controls(point.control), *(system.strains(part) for part in (point.z, point.z_t)), strict=True,
+            system.members, self._rods, system.ratios,
+            *(system.states(part)[0] for part in (point.y, point.y_t)), system.controls(point.control),
+            *(system.strains(part) for part in (point.z, point.z_t)), strict=True,
         )  # fmt: skip
         return jnp.concatenate(
             [
-                own.observables(
-                    RodPoint(rod, point.s * ratio, point.t, y, y_t, control, z=z, z_t=z_t)
-                )
+                own.observables(RodPoint(rod, point.s * ratio, point.t, y, y_t, control, z=z, z_t=z_t))
                 for rod, own, ratio, y, y_t, control, z, z_t in terms
             ]
         )
@@ -514,7 +517,9 @@ class _AssemblyObserved(Observed, of=Assembly):
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return the factors of all rods; None if all are uniform."""
-        parts = zip(self.system.members, self._rods, self.system.ratios, self.system.controls(control), strict=True)
+        parts = zip(
+            self.system.members, self._rods, self.system.ratios, self.system.controls(control), strict=True
+        )
         factors = [
             own.law_factors(s * ratio, part) or (np.ones(rod.z_layout.size),) * 2
             for rod, own, ratio, part in parts

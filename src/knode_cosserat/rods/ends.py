@@ -166,7 +166,9 @@ class Sliding(Driven):
 
     def __check_init__(self) -> None:
         if self.body:
-            raise ParameterError("an end on a body cannot slide; allowed is the ground, as it slides along a global axis")
+            raise ParameterError(
+                "an end on a body cannot slide; allowed is the ground, as it slides along a global axis"
+            )
 
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the clamped residual, with zero force along the axis instead of the position along it."""
