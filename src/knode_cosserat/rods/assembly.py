@@ -1,7 +1,7 @@
 """Assemblies: rods of any kind that rigid bodies join, in a tree or with closed loops.
 
 All rods run side by side over one grid of s/length. A body has an unknown pose (p, h), and its fields of y
-are constant along the grid. Both ends of a rod therefore meet the body at the tip, where the conditions stand.
+are constant along the grid. Both ends of a rod therefore meet the body at the tip, where the conditions are.
 With the wrench n, m of each rod on the body (at its base; at its tip it is -n, -m), and r from the body's
 centre of mass to the joint, in the global frame,
 
