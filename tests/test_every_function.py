@@ -240,7 +240,7 @@ LACKING = {
         (name, "gripper"): (kc.recordings.RecordingError, "estimation is for rods with p, h, q, w, n, m")
         for name in ("estimate_states", "estimate_states, paper")
     },
-    ("stability", "gripper"): (ValueError, "allowed are rods with p, h, n and m"),
+    ("stability", "gripper"): (ValueError, "its motions have more than 4000 history terms"),
     ("compliance", "gripper"): (ValueError, "the robot's tip has no force n or moment m"),
     ("fit, network", "gripper"): (EngineError, "more than 180000 operations; use smaller laws"),
 }

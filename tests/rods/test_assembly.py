@@ -97,6 +97,18 @@ def test_a_ball_joint_passes_forces_on_but_no_moments():
     assert sway == pytest.approx(FORCE * L**3 / (6 * EI), rel=1e-6)
 
 
+@pytest.mark.slow
+def test_a_driven_joint_turns_a_rod_on_a_body():
+    lower, upper = (
+        rod("lower", tip_end=on("elbow")),
+        rod("upper", base_end=on("elbow", Driven, axes=("rx", "z"))),
+    )
+    robot = assembly(lower, upper, bodies=[RigidBody(name="elbow")])
+    assert kc.controls.labels(robot.control_layout) == ["upper_base_rx", "upper_base_z"]
+    tip = kc.equilibrium(robot, [0.5, 0.02]).part("upper_p")[0, -1]
+    np.testing.assert_allclose(tip, [0.0, -L * np.sin(0.5), L + 0.02 + L * np.cos(0.5)], atol=1e-12)
+
+
 def swinging(heavy, **more):
     """Return a rod with a body at its tip: a load of the rod, or a body of an assembly."""
     more = {"bending_damping": 1e-3, **more}
@@ -117,6 +129,19 @@ def test_a_body_at_the_tip_moves_as_a_mass_on_the_rod():
     tips = [kc.simulate(swinging(heavy, **turning), control, 0.01).tip_position for heavy in (True, False)]
     assert np.ptp(tips[0][:, 0]) > 0.1
     np.testing.assert_allclose(tips[1], tips[0], atol=1e-5)
+
+
+@pytest.mark.slow
+def test_a_body_at_the_tip_vibrates_as_a_mass_on_the_rod():
+    modes = []
+    for heavy in (True, False):
+        found = kc.equilibrium(swinging(heavy, bending_damping=1e-4).replace(nodes=11), [], space="lobatto4")
+        modes.append(kc.statics.modes(found, count=6))
+    np.testing.assert_allclose(modes[1].values, modes[0].values, rtol=1e-6)
+    # the arm, then the body; torsion, the third, moves no line
+    bending = [0, 1, 3, 4]
+    shapes = [np.abs(shape) for shape in (modes[1].shapes[bending, :, 0], modes[0].shapes[bending])]
+    np.testing.assert_allclose(*shapes, atol=1e-5)
 
 
 @pytest.mark.slow
@@ -269,7 +294,7 @@ WRONG = {
         rods=(ARM,), contacts=(NeighbourContact(first="arm", second="leg"),)
     ),
     "an end on a body cannot slide": lambda: on("hand", Sliding),
-    "an end is held by the body 'hand'": lambda: ARM.replace(tip_end=on("hand")).rest(0.0),
+    "an end is held by the body 'hand'": lambda: ARM.replace(base_end=on("hand")).rest(0.0),
     "name is 'a b'; allowed is a name of letters": lambda: rod("a b"),
 }  # fmt: skip
 

@@ -81,6 +81,8 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     Raises `ValueError`, with a reason, if they cannot be computed.
     """
     grids = next((pair for pair in GRIDS if system.nodes <= pair[1]), GRIDS[-1])
+    if used_places(system.replace(nodes=grids[1]), Lobatto4()) * _history_size(system) > MOST_TERMS:
+        raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
     layout, scale = strand_of(system).y_layout, np.asarray(strand_of(system).scales().y)
     if not layout.ranges("q"):
         raise ValueError(f"a {type(system).__name__} has no velocity q in y")
@@ -95,8 +97,6 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     found, c0 = [], RATE / time
     for nodes in grids:
         own = system.replace(nodes=nodes)
-        if used_places(own, Lobatto4()) * _history_size(own) > MOST_TERMS:
-            raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
         at = np.linspace(0.0, 1.0, nodes)
         guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), each) for each in y.T], axis=1)
         solved, error, step, unit = _step(own, guess, control, c0)

@@ -174,9 +174,8 @@ def checked_equilibrium(equilibrium: Any, row: Any) -> tuple[System, np.ndarray,
     system = equilibrium.system
     layout = strand_of(system).y_layout
     if not all(map(layout.ranges, NEEDED)):
-        raise ValueError(
-            f"a {type(system).__name__} has y = {', '.join(layout.names)}; allowed are rods with p, h, n and m"
-        )
+        names = ", ".join(layout.names)
+        raise ValueError(f"a {type(system).__name__} has y = {names}; allowed are rods with p, h, n and m")
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
     space = (equilibrium.settings or Settings()).space
     found, scales = still_state(system, space, control, y), system.scales()
