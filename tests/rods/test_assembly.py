@@ -11,6 +11,7 @@ from knode_cosserat.robots import Assembly, ParameterError, RigidBody, SlenderRo
 from knode_cosserat.rods.assembly import NeighbourContact
 from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench
+from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.robot_file import format_robot, parse_robot
 
 L, RADIUS, E, DENSITY = 0.3, 4e-3, 2e9, 1000.0
@@ -214,6 +215,15 @@ def test_neighbours_share_a_load():
         tol=1e-10,
     ).sol(np.linspace(0.0, L, 21))[0]  # fmt: skip
     np.testing.assert_allclose(x[0] - x[1], exact, atol=1e-6 * load * L**4 / EI)
+
+
+def test_recovery_smooths_contacts_of_the_assembly_and_of_its_rods():
+    ball = kc.robots.surroundings.Sphere(smoothing=1e-5)
+    robot = side_by_side(1e4).replace(**{"rods.right.surroundings": (ball,)})
+    easier = eased(robot, 0.1)
+    assert easier.contacts[0].smoothing == pytest.approx(1e-5)
+    assert easier.rods[1].surroundings[0].smoothing == pytest.approx(1e-4)
+    assert easier.rods[0] is robot.rods[0]
 
 
 @pytest.mark.slow

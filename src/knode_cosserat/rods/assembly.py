@@ -77,6 +77,11 @@ class NeighbourContact(ContactLaw):
     first: str = text("name of a rod")
     second: str = text("name of the other rod")
 
+    @property
+    def names(self) -> tuple[str, str]:
+        """Names of both rods."""
+        return self.first, self.second
+
     def wrenches(self, motions: list[Motion], radii: list[Any]) -> list[Wrench]:
         """Return the loads on the rods, per length of the first (N/m, N), global frame."""
         axis = motions[0].R[:, 2] + motions[1].R[:, 2]
@@ -152,12 +157,11 @@ class Assembly(System):
             if not is_traced((rod, self.gravity)) and not any(np.array_equal(rod.gravity, g) for g in known):
                 raise ParameterError(f"{rod.name} has a gravity of its own; allowed is that of the assembly")
         for contact in self.contacts:
-            for name in (contact.first, contact.second):
-                if name not in rods or contact.first == contact.second:
-                    raise ParameterError(
-                        f"a contact is of {contact.first!r} and {contact.second!r}; "
-                        f"allowed is two of {', '.join(rods)}"
-                    )
+            if not {*contact.names} <= {*rods} or contact.first == contact.second:
+                raise ParameterError(
+                    f"a contact is of {contact.first!r} and {contact.second!r}; "
+                    f"allowed is two of {', '.join(rods)}"
+                )
         for name in bodies:
             if not any(name in (rod.base_end.body, rod.tip_end.body) for rod in self.rods):
                 raise ParameterError(f"the body {name!r} holds no rod; allowed is a body that joins rods")
@@ -232,9 +236,16 @@ class Assembly(System):
         """Return the control of each rod."""
         return self.split(control, [rod.control_layout.size for rod in self.members])
 
-    def strains(self, z: Any) -> list[Any]:
-        """Return z of each rod."""
-        return self.split(z, [rod.z_layout.size for rod in self.members])
+    def points(self, point: RodPoint) -> list[RodPoint]:
+        """Return a place of the grid as a point of each rod, at its part of the rod's length."""
+        sizes, none = [rod.z_layout.size for rod in self.members], [None] * len(self.rods)
+        y, y_t = (none if part is None else self.states(part)[0] for part in (point.y, point.y_t))
+        z, z_t = (none if part is None else self.split(part, sizes) for part in (point.z, point.z_t))
+        terms = zip(self.members, y, y_t, self.controls(point.control), z, z_t, strict=True)
+        return [
+            RodPoint(rod, point.s * (rod.length / self.length), point.t, y, y_t, control, z=z, z_t=z_t)
+            for rod, y, y_t, control, z, z_t in terms
+        ]
 
     def placed(self, poses: Any) -> list[SlenderRod]:
         """Return the rods whose ends know the poses of their bodies, by name."""
@@ -256,44 +267,33 @@ class Assembly(System):
 
     # equations along the rods
 
-    @property
-    def ratios(self) -> list[Any]:
-        """Length of each rod as a part of the first one's."""
-        return [rod.length / self.length for rod in self.members]
-
     def constitutive(self, s, t, y, y_t, control):  # type: ignore[no-untyped-def]
         """Return the laws of the rods."""
-        terms = zip(
-            self.members, self.ratios, *(self.states(part)[0] for part in (y, y_t)),
-            self.controls(control), strict=True,
-        )  # fmt: skip
         return JointLaw(
             tuple(
-                (rod.constitutive(s * ratio, t, *rest), rod.z_layout, rod.length)
-                for rod, ratio, *rest in terms
+                (at.rod.constitutive(at.s, t, at.y, at.y_t, at.control), at.rod.z_layout, at.rod.length)
+                for at in self.points(RodPoint(self, s, t, y, y_t, control))
             )
         )
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return y_s of the rods, each at its part of its length; the fields of bodies are constant."""
-        terms = list(
-            zip(
-                self.members, self.ratios, *(self.states(part)[0] for part in (y, y_t)),
-                *(self.strains(part) for part in (z, z_t)), self.controls(control), strict=True,
-            )
-        )  # fmt: skip
-        rates = [ratio * rod.balance(s * ratio, t, *rest) for rod, ratio, *rest in terms]
+        points = self.points(RodPoint(self, s, t, y, y_t, control, z=z, z_t=z_t))
+        rates = {
+            at.rod.name: (at.rod.length / self.length)
+            * at.rod.balance(at.s, t, at.y, at.y_t, at.z, at.z_t, at.control)
+            for at in points
+        }
         for contact in self.contacts:
-            pair = [[rod.name for rod in self.rods].index(name) for name in (contact.first, contact.second)]
-            at = [terms[k] for k in pair]
+            pair = [next(at for at in points if at.rod.name == name) for name in contact.names]
             loads = contact.wrenches(
-                [Motion.of(rod.y_layout, own, own_t) for rod, _, own, own_t, *_ in at],
-                [rod.material(s * ratio, u).radius for rod, ratio, *_, u in at],
+                [Motion.of(at.rod.y_layout, at.y, at.y_t) for at in pair],
+                [at.rod.material(at.s, at.control).radius for at in pair],
             )
-            for k, load in zip(pair, loads, strict=True):
-                change = terms[pair[0]][1] * jnp.concatenate([np.zeros(7), *load])
-                rates[k] = rates[k] - jnp.concatenate([change, np.zeros(len(rates[k]) - 13)])
-        return jnp.concatenate([*rates, np.zeros(Y_LAYOUT.size * len(self.bodies))])
+            for at, load in zip(pair, loads, strict=True):
+                change = pair[0].rod.length / self.length * jnp.concatenate([np.zeros(7), *load])
+                rates[at.rod.name] -= jnp.concatenate([change, np.zeros(at.rod.y_layout.size - 13)])
+        return jnp.concatenate([*rates.values(), np.zeros(Y_LAYOUT.size * len(self.bodies))])
 
     @property
     def discontinuities(self) -> Discontinuities:  # type: ignore[override]
@@ -367,8 +367,8 @@ class Assembly(System):
         """Return the unloaded rods; rods that close a loop are bent to meet their tips' supports."""
         rods, frames = self._at_rest
         states, strains = [], []
-        for rod, ratio in zip(rods, self.ratios, strict=True):
-            y, z = rod.rest(s * ratio)
+        for rod in rods:
+            y, z = rod.rest(s * (rod.length / self.length))
             end = rod.pose(rod.rest(rod.length)[0])
             if rod.tip_end.held:
                 still = rod.end_controls(np.zeros(rod.control_layout.size))[1]
@@ -487,18 +487,8 @@ class _AssemblyObserved(Observed, of=Assembly):
 
     def observables(self, point: RodPoint) -> Float[Any, " o"]:
         """Return the observables of all rods."""
-        system = self.system
-        terms = zip(
-            system.members, self._rods, system.ratios,
-            *(system.states(part)[0] for part in (point.y, point.y_t)), system.controls(point.control),
-            *(system.strains(part) for part in (point.z, point.z_t)), strict=True,
-        )  # fmt: skip
-        return jnp.concatenate(
-            [
-                own.observables(RodPoint(rod, point.s * ratio, point.t, y, y_t, control, z=z, z_t=z_t))
-                for rod, own, ratio, y, y_t, control, z, z_t in terms
-            ]
-        )
+        points = zip(self._rods, self.system.points(point), strict=True)
+        return jnp.concatenate([own.observables(at) for own, at in points])
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return the actuation of all rods."""
@@ -512,17 +502,18 @@ class _AssemblyObserved(Observed, of=Assembly):
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
         """Return z of the unstressed rods."""
-        parts = zip(self._rods, self.system.ratios, self.system.controls(control), strict=True)
-        return jnp.concatenate([own.unstressed(s * ratio, part) for own, ratio, part in parts])
+        parts = zip(
+            self._rods, self.system.points(RodPoint(self.system, s, None, None, None, control)), strict=True
+        )
+        return jnp.concatenate([own.unstressed(at.s, at.control) for own, at in parts])
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return the factors of all rods; None if all are uniform."""
         parts = zip(
-            self.system.members, self._rods, self.system.ratios, self.system.controls(control), strict=True
+            self._rods, self.system.points(RodPoint(self.system, s, None, None, None, control)), strict=True
         )
         factors = [
-            own.law_factors(s * ratio, part) or (np.ones(rod.z_layout.size),) * 2
-            for rod, own, ratio, part in parts
+            own.law_factors(at.s, at.control) or (np.ones(at.rod.z_layout.size),) * 2 for own, at in parts
         ]
         if all(rod.is_uniform for rod in self.system.members):
             return None

@@ -274,7 +274,7 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
-class Text:
+class _Text:
     """Statement of a field that holds a name, or nothing."""
 
     meaning: str
@@ -427,7 +427,7 @@ def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
 
 def text(meaning: str) -> Any:
     """Return a dataclass field for a name; by default it is empty."""
-    return _field(Text(meaning), "", static=True)
+    return _field(_Text(meaning), "", static=True)
 
 
 def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
@@ -510,12 +510,14 @@ def kinds_of(family: Any) -> dict[str, Any]:
 
 def in_order(cls: type) -> dict[str, Any]:
     """Return the statements of a class by name: parameters, then choices, then parts."""
-    return parameters_of(cls) | stated_of(cls, Choice) | stated_of(cls, Text) | slots_of(cls)
+    return parameters_of(cls) | stated_of(cls, Choice) | stated_of(cls, _Text) | slots_of(cls)
 
 
 class Parametrised(eqx.Module):
     """Base of systems and their parts: parameters, stated in the class and passed by name."""
 
+    #: name in robot files; empty if none can describe it
+    kind: ClassVar[str] = ""
     #: for the schema: sets of optional entries, of which one is required
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = ()
 

@@ -62,8 +62,6 @@ class System(Parametrised):
     and derivatives.
     """
 
-    #: name in robot files; empty if no file describes the system
-    kind: ClassVar[str] = ""
     y_layout: ClassVar[Layout]
     z_layout: ClassVar[Layout]
     control_layout: ClassVar[Layout]
