@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, Residual, network
@@ -92,16 +93,18 @@ ROBOTS = {
     "arm": kc.load_robot("three-chamber-arm").replace(nodes=5),
     "tubes": kc.load_robot("three-tube-robot").replace(nodes=13),
     "catheter": kc.load_robot("magnetic-catheter").replace(nodes=5),
+    "gripper": kc.load_robot("three-finger-gripper").replace(nodes=5),
 }  # fmt: skip
 #: means of the controls of robots whose controls are not the paper's four tensions
 MEANS = {
     "own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4],
     "tubes": [1.0, 0.02, -0.5, 0.01, 0.3, 0.02],
-    "catheter": [2e-3, 1e-3, 3e-3],
+    "gripper": [1.0, 1.5, 2.0, 0.8, 0.9, 1.0], "catheter": [2e-3, 1e-3, 3e-3],
 }  # fmt: skip
 #: identified parameters of robots of which it is not Young's modulus
 PARAMETERS = {
     "own": "bending", "model of own": "bending", "arm": "effects.0.offset", "tubes": "tubes.1.curvature",
+    "gripper": "rods.thumb.youngs_modulus",
 }  # fmt: skip
 
 
@@ -245,7 +248,7 @@ OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configu
 LACKING = {
     **{
         ("fit, passive", kind): (kc.learning.FitError, "without bending_stiffness")
-        for kind in ("own", "model of own", "tubes")
+        for kind in ("own", "model of own", "tubes", "gripper")
     },
     **{
         (name, "tubes"): (
@@ -254,6 +257,13 @@ LACKING = {
         )
         for name in ("estimate_states", "estimate_states, paper")
     },
+    **{
+        (name, "gripper"): (kc.recordings.RecordingError, "estimation is for rods with p, h, q, w, n, m")
+        for name in ("estimate_states", "estimate_states, paper")
+    },
+    ("stability", "gripper"): (ValueError, "its motions have more than 4000 history terms"),
+    ("compliance", "gripper"): (ValueError, "the robot's tip has no force n or moment m"),
+    ("fit, network", "gripper"): (EngineError, "more than 180000 operations; use smaller laws"),
 }
 
 

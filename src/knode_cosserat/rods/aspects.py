@@ -77,6 +77,9 @@ class Ends(_Aspect):
 class Drawing(_Aspect):
     """Positions, orientations and lines of a system's states."""
 
+    #: number of the last curves that are outlines of bodies, not rods
+    outlines: int = 0
+
     def positions(self, y: Any) -> Any:
         """Return positions (…, 3) in metres of states y (…, y)."""
         return self._named(y, "p", "position")

@@ -241,6 +241,7 @@ class _Tubes(CrossSection):
 class ConcentricTubeRobot(SlenderRod):
     """A robot of concentric tubes, the innermost first; `length` is that of the longest without insertion."""
 
+    kind: ClassVar[str] = "concentric-tube-robot"
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = ()
     radius: ClassVar[Any] = None  # type: ignore[misc]
     density: ClassVar[Any] = None  # type: ignore[misc]
