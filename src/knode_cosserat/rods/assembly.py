@@ -153,6 +153,10 @@ class Assembly(System):
                     )
                 if not end.held and (end.body or end is rod.base_end):
                     raise ParameterError(f"{where} is free; allowed is an end that is held, or a free tip")
+            if any(part.gyroscopic for part in rod.parts.values()):
+                raise ParameterError(
+                    f"{rod.name} has a spinning frame; allowed are rods seen from the ground"
+                )
             known = GRAVITY, self.gravity
             if not is_traced((rod, self.gravity)) and not any(np.array_equal(rod.gravity, g) for g in known):
                 raise ParameterError(f"{rod.name} has a gravity of its own; allowed is that of the assembly")
@@ -339,7 +343,7 @@ class Assembly(System):
         for rod, u, *both in zip(self.placed(frames), self.controls(control), states, rates, strict=True):
             rows.append(rod.tip(t, u, *both))
             if name := rod.tip_end.body:
-                n, m = rod.tip_wrench(u, *both)
+                n, m = rod.tip_wrench(t, u, *both)
                 tips[name] += Wrench(-n, -m - cross(rod.pose(both[0]).p - frames[name].p, n))
         for body, own, own_t in zip(self.bodies, bodies, body_rates, strict=True):
             _, h, n, m, *_ = Y_LAYOUT.split(own)

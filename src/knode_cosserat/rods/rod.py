@@ -487,7 +487,7 @@ class SlenderRod(System):
         """Return the pose in a packed y."""
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
-    def tip_wrench(self, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Wrench:
+    def tip_wrench(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Wrench:
         """Return n and m at the tip less the loads there: the wrench of the support on the rod."""
         n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
         if any(part.applied_at == 1.0 for part in self.parts.values()):
@@ -497,7 +497,7 @@ class SlenderRod(System):
 
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
-        n, m = self.tip_wrench(control, y, y_t)
+        n, m = self.tip_wrench(t, control, y, y_t)
         if type(self.tip_end) is Free:
             rows = [-n, -m]
         else:
