@@ -299,6 +299,9 @@ WRONG = {
     "arm.base_end is free; allowed is an end that is held": lambda: Assembly(
         rods=(ARM.replace(base_end=Free()),)
     ),
+    "arm has a spinning frame": lambda: Assembly(
+        rods=(ARM.replace(effects=(kc.robots.SpinningFrame(1.0),)),)
+    ),
     "arm has a gravity of its own": lambda: Assembly(rods=(ARM.replace(gravity=(0.0, 0.0, 1.0)),)),
     "a contact is of 'arm' and 'leg'; allowed is two of arm": lambda: Assembly(
         rods=(ARM,), contacts=(NeighbourContact(first="arm", second="leg"),)

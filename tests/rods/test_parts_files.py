@@ -115,7 +115,8 @@ FIELDS = {
         "rods": st.tuples(
             st.builds(
                 SlenderRod, name=st.just("arm"), **{name: st.just(value) for name, value in BODY.items()},
-                **ROD | {"base_end": parts(End).filter(lambda end: end.anywhere and end.held)},
+                **{name: ROD[name] for name in ROD if name != "effects"}
+                | {"base_end": parts(End).filter(lambda end: end.anywhere and end.held)},
             )
         ),
     },
