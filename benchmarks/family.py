@@ -120,6 +120,28 @@ def others() -> dict[str, float]:
     }
 
 
+def assembled() -> dict[str, float]:
+    """A step of the gripper as a multiple of the steps of its rods alone: median of ratios; its time (ms)."""
+    import knode_cosserat as kc
+
+    gripper, t = kc.load_robot("three-finger-gripper"), 0.01 * np.arange(1, 201)[:, None]
+    control = 1.0 + np.sin(2.0 * np.pi * t + np.arange(6))
+    alone = {
+        "base_end": kc.robots.ends.Clamped(), "tip_end": kc.robots.ends.Free(), "nodes": gripper.nodes,
+        "gravity": gripper.gravity,
+    }  # fmt: skip
+    runs = [functools.partial(kc.simulate, gripper, control, 0.01)]
+    for rod, first, last in zip(gripper.rods, (0, 3, 4, 5), (3, 4, 5, 6), strict=True):
+        runs.append(functools.partial(kc.simulate, rod.replace(**alone), control[:, first:last], 0.01))
+    for run in runs:
+        run()
+    times = np.array([[seconds(run) for run in runs] for _ in range(ROUNDS)])
+    return {
+        "ratio": float(np.median(times[:, 0] / times[:, 1:].sum(axis=1))),
+        "milliseconds": 1e3 * float(np.median(times[:, 0])) / len(control),
+    }
+
+
 def parallel() -> dict[str, Any]:
     """A step of the six-legged robot, its actuators moving by 20 mm (ms)."""
     import knode_cosserat as kc
@@ -134,4 +156,5 @@ def parallel() -> dict[str, Any]:
 
 if __name__ == "__main__":
     one_core()
-    print(json.dumps({"tendons": tendons(), "reel": reel(), "others": others(), "parallel": parallel()}))
+    found = {"tendons": tendons(), "reel": reel(), "others": others(), "parallel": parallel()}
+    print(json.dumps(found | {"assembled": assembled()}))

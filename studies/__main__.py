@@ -47,6 +47,7 @@ JOBS: dict[str, tuple[Any, Any]] = {
     "dask": (Annotated[str | None, DASK], None),
     "progress": (Progress, None),
 }
+ROBOTS = "The paper's robot, three-chamber-arm or three-tube-robot."
 #: function that runs a study, and facts on it
 Study = tuple[Callable[[], Any], dict[str, Any]]
 
@@ -175,26 +176,29 @@ def _report(run: Callable[[], Report], facts: dict[str, Any], out: Path, as_json
 @_study(
     "simulation --out results",
     "simulation --out results --methods baseline,best --seeds 1",
+    "simulation --out results --robot three-chamber-arm --methods baseline,paper,best",
     "simulation --out results --dask tcp://scheduler:8786",
 )
 def simulation(
     out: Out,
     seeds: Seeds = 5,
     methods: Annotated[str | None, _subset("baseline, paper, calibrated, best")] = None,
+    robot: Annotated[str, typer.Option(metavar="NAME", help=ROBOTS)] = "delrin-tendon-robot",
     **how: Any,
 ) -> Study:
-    """Repeat the paper's simulation study, Table I.
+    """Repeat the paper's simulation study, Table I, of its robot or of another one.
 
     Four imperfect models are each trained on two short sines. Writes Table I with the paper's published
     values (table1.md, .csv, .json), figures, trajectories and models. Resumes an earlier run in the same
     folder.
     """
     from studies.methods import METHODS
-    from studies.simulation import rerun
+    from studies.simulation import SETTINGS, rerun
 
     chosen = _selected("methods", methods, METHODS)
-    facts = {"methods": chosen, "seeds": seeds}
-    return lambda: rerun(out, seeds=range(seeds), methods=chosen, **how), facts
+    _selected("robot", robot, SETTINGS)
+    facts = {"methods": chosen, "seeds": seeds, "robot": robot}
+    return lambda: rerun(out, seeds=range(seeds), methods=chosen, robot=robot, **how), facts
 
 
 @_study("control --out results", "control --quick --out results", name="control")

@@ -116,10 +116,11 @@ def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], note
 
     The paper has no angles between orientations, so that table has no columns of it.
     """
-    parts = ["Mean and standard deviation over seeds. Ratios are to the paper's KNODE; less is better."]
+    ratios = " Ratios are to the paper's KNODE; less is better." if published else ""
+    parts = [f"Mean and standard deviation over seeds.{ratios}"]
     for k, (measure, (title, factor)) in enumerate(MEASURES.items()):
         found = spreads(cells, measure, factor)
-        known = measure in PAPER_MEASURES
+        known = bool(published) and measure in PAPER_MEASURES
         methods = list(dict.fromkeys(method for by_method in found.values() for method in by_method))
         heads = ["imperfection", "control"]
         heads += ["paper: baseline", "paper: KNODE", "its rerun"] if known else []

@@ -1,5 +1,7 @@
 """The paper's simulation study: a robot, four imperfect models of it, and learned corrections.
 
+The same study can be made of an arm with pressure chambers and of a robot of concentric tubes.
+
 All settings are data in this module, and are passed to the jobs as plain values. Each imperfect model
 learns from two short sines of the true robot, by each method, from several seeds at once; no method knows
 the imperfection. It then predicts a held-out sine and a held-out step.
@@ -7,10 +9,11 @@ the imperfection. It then predicts a held-out sine and a held-out step.
 
 from __future__ import annotations
 
+import math
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 from knode_cosserat import controls
 from knode_cosserat.learning.knode import KNODE
@@ -62,10 +65,68 @@ NOTES = (
 REFERENCE = "reference"
 
 
-def jobs(seeds: Sequence[int], methods: Sequence[str]) -> list[Job]:
+class Setting(NamedTuple):
+    """Controls and imperfections of a robot, its scheme along the rod, and what the paper has on it."""
+
+    training: Sequence[str]
+    controls: Mapping[str, str]
+    imperfections: Mapping[str, Mapping[str, Any]]
+    space: str
+    published: Mapping[tuple[str, str], Published] = {}
+    notes: Sequence[str] = NOTES[1:]
+
+
+def _signals(*controls: tuple[str, float, float, float]) -> tuple[list[str], dict[str, str]]:
+    """Return controls of training and evaluation from names, means, amplitudes and phases (rad)."""
+
+    def sines(period: float) -> str:
+        return ";".join(
+            f"{name}=sine:{period},base={mean},amplitude={amplitude},phase={phase}"
+            for name, mean, amplitude, phase in controls
+        )
+
+    steps = (f"{name}=step:{amplitude},base={mean},at=1.5" for name, mean, amplitude, _ in controls)
+    return [sines(1.0), sines(2.0)], {"sine": sines(1.5), "step": ";".join(steps)}
+
+
+_EVEN = 2.0 * math.pi / 3.0
+SETTINGS = {
+    ROBOT: Setting(TRAINING, CONTROLS, IMPERFECTIONS, "euler", PUBLISHED, NOTES),
+    "three-chamber-arm": Setting(
+        *_signals(*((f"pressure_{k + 1}", 2e4, 1.2e4 - 1e4 * k, k * _EVEN) for k in range(3))),
+        {
+            "self-weight": {"gravity": [0.0, 0.0, 0.0]},
+            "length": {"length": 0.15},
+            "stiffness": {"bending_stiffness": [4.46e-3, 4.46e-3, 3.44e-3]},
+            "length-stiffness": {"length": 0.15, "bending_stiffness": [4.46e-3, 4.46e-3, 3.44e-3]},
+            # Yeoh's law in place of the neo-Hookean one
+            "law": {"effects.1.second": 2.0},
+        },
+        "lobatto2",
+    ),
+    "three-tube-robot": Setting(
+        *_signals(
+            *((f"rotation_{k + 1}", 0.0, 0.6 - 0.1 * k, 2.0 * k) for k in range(3)),
+            *((f"insertion_{k + 1}", 0.0, 0.01, 2.0 * k + 1.0) for k in range(3)),
+        ),
+        {
+            "self-weight": {"gravity": [0.0, 0.0, 0.0]},
+            "length": {"length": 0.26},
+            "stiffness": {"tubes.1.youngs_modulus": 100e9},
+            "length-stiffness": {"length": 0.26, "tubes.1.youngs_modulus": 100e9},
+        },
+        "lobatto2",
+    ),
+}
+
+
+def jobs(seeds: Sequence[int], methods: Sequence[str], robot: str = ROBOT) -> list[Job]:
     """One job for each imperfection and method, with all seeds and both controls, and one for the truth."""
-    common = {"robot": ROBOT, "dt": DT, "rows": ROWS, "controls": CONTROLS}
-    learning = {"training": list(TRAINING), "training_rows": TRAINING_ROWS, "seeds": list(seeds)}
+    setting = SETTINGS[robot]
+    common = {
+        "robot": robot, "dt": DT, "rows": ROWS, "controls": dict(setting.controls), "space": setting.space,
+    }  # fmt: skip
+    learning = {"training": list(setting.training), "training_rows": TRAINING_ROWS, "seeds": list(seeds)}
     made = [
         Job(
             f"{imperfection}-{method}",
@@ -73,7 +134,7 @@ def jobs(seeds: Sequence[int], methods: Sequence[str]) -> list[Job]:
             {**common, **learning, "imperfection": imperfection, "changes": changes, "method": method},
         )
         for method in methods
-        for imperfection, changes in IMPERFECTIONS.items()
+        for imperfection, changes in setting.imperfections.items()
     ]
     return [Job(REFERENCE, reference, common), *made]
 
@@ -84,24 +145,26 @@ def jobs(seeds: Sequence[int], methods: Sequence[str]) -> list[Job]:
 def reference(settings: Any) -> Product:
     """Return the true robot's motions under the controls of the evaluation."""
     kept = _Kept()
-    robot = load_robot(settings["robot"])
+    robot, space = load_robot(settings["robot"]), settings["space"]
     for name, control in settings["controls"].items():
-        kept.trajectory(moved(robot, control, settings["rows"], settings["dt"]), name, REFERENCE)
+        kept.trajectory(moved(robot, control, settings["rows"], settings["dt"], space), name, REFERENCE)
     return Product({"cells": [], "trajectories": kept.trajectories}, kept.files)
 
 
 def predict(settings: Any) -> Product:
     """Return the cells of one imperfection and method: every seed under every control."""
-    robot, dt = load_robot(settings["robot"]), settings["dt"]
+    robot, dt, space = load_robot(settings["robot"]), settings["dt"], settings["space"]
     imperfection, method = settings["imperfection"], settings["method"]
-    training = [moved(robot, control, settings["training_rows"], dt) for control in settings["training"]]
+    training = [
+        moved(robot, control, settings["training_rows"], dt, space) for control in settings["training"]
+    ]
     learned = METHODS[method](robot.replace(**settings["changes"]), training, settings["seeds"])
     cells: list[Cell] = []
     kept = _Kept()
     for name, control in settings["controls"].items():
-        truth = moved(robot, control, settings["rows"], dt)
+        truth = moved(robot, control, settings["rows"], dt, space)
         for seed, system in learned.systems.items():
-            prediction = predicted(system, control, settings["rows"], dt)
+            prediction = predicted(system, control, settings["rows"], dt, space)
             case = {"imperfection": imperfection, "control": name, "method": method, "seed": seed}
             cells.append(cast(Cell, case | compared(prediction, truth)))
             if isinstance(prediction, Trajectory) and seed == min(learned.systems):
@@ -131,66 +194,72 @@ class _Kept:
         self.files[f"models/{name}"] = model.to_bytes()
 
 
-def predicted(system: System | str, control: str, rows: int, dt: float) -> Trajectory | str:
+def predicted(
+    system: System | str, control: str, rows: int, dt: float, space: str = "euler"
+) -> Trajectory | str:
     """Return a prediction, or the reason of a failure."""
     try:
-        return system if isinstance(system, str) else moved(system, control, rows, dt)
+        return system if isinstance(system, str) else moved(system, control, rows, dt, space)
     except SimulationError as error:
         return str(error)
 
 
-def moved(system: System, control: str, rows: int, dt: float) -> Trajectory:
+def moved(system: System, control: str, rows: int, dt: float, space: str = "euler") -> Trajectory:
     """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
-    tensions = controls.parse(control, rows, dt, sampled="end")
-    return simulate(system, tensions, dt, time="bdf2", start="paper", space="euler")[:rows]
+    values = controls.parse(control, rows, dt, system, sampled="end")
+    return simulate(system, values, dt, time="bdf2", start="paper", space=space)[:rows]
 
 
 Facts = Mapping[str, Mapping[str, Any]]
 
 
-def rerun(out: Path, *, seeds: Sequence[int], methods: Sequence[str], **how: Any) -> Report:
+def rerun(
+    out: Path, *, seeds: Sequence[int], methods: Sequence[str], robot: str = ROBOT, **how: Any
+) -> Report:
     """Run the study's pending jobs and write its table and figures into the folder.
 
     Args:
         out: the folder; an earlier run in it is continued.
         seeds: whole numbers.
         methods: some of those in `methods.METHODS`.
+        robot: one of those in `SETTINGS`.
         how: as `runner.run` has it.
 
     Raises:
         StudyError: see `runner.run`.
     """
-    facts = runner.run(jobs(seeds, methods), out, **how)
-    cells = cells_of(facts)
-    return Report(cells, write_table(cells, out), draw(facts, methods, out))
+    facts = runner.run(jobs(seeds, methods, robot), out, **how)
+    cells = cells_of(facts, robot)
+    return Report(cells, write_table(cells, out, robot), draw(facts, methods, out, robot))
 
 
-def cells_of(facts: Facts) -> list[Cell]:
+def cells_of(facts: Facts, robot: str = ROBOT) -> list[Cell]:
     """Return all cells of the jobs in the order of the paper's table: control, imperfection, method, seed."""
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    controls, imperfections = list(CONTROLS), list(IMPERFECTIONS)
+    controls, imperfections = list(CONTROLS), list(SETTINGS[robot].imperfections)
     return sorted(
         cells, key=lambda it: (controls.index(it["control"]), imperfections.index(it["imperfection"]))
     )
 
 
-def write_table(cells: Sequence[Cell], out: Path) -> list[Path]:
+def write_table(cells: Sequence[Cell], out: Path, robot: str = ROBOT) -> list[Path]:
     """Write `table1.md`, `table1.csv` and `table1.json`."""
+    setting = SETTINGS[robot]
     return write_texts(
         out,
         {
-            "table1.md": as_markdown(cells, PUBLISHED, NOTES),
-            "table1.csv": as_csv(cells, PUBLISHED),
+            "table1.md": as_markdown(cells, setting.published, setting.notes),
+            "table1.csv": as_csv(cells, setting.published),
             "table1.json": as_json(cells),
         },
     )
 
 
-def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
+def draw(facts: Facts, methods: Sequence[str], out: Path, robot: str = ROBOT) -> list[Path]:
     """Write figures to OUT/figures: controls, shapes and tips of the first seed, losses of all."""
     truths = _trajectories(facts[REFERENCE], out)
     drawn = {"controls": figures.controls(truths)}
-    for imperfection in IMPERFECTIONS:
+    for imperfection in SETTINGS[robot].imperfections:
         found = {method: _trajectories(facts[f"{imperfection}-{method}"], out) for method in methods}
         cases = {
             control: (truth, {method: each[control] for method, each in found.items() if control in each})
@@ -203,7 +272,7 @@ def draw(facts: Facts, methods: Sequence[str], out: Path) -> list[Path]:
     losses = {
         imperfection: list(facts[f"{imperfection}-{method}"]["loss"].values())
         for method in methods
-        for imperfection in IMPERFECTIONS
+        for imperfection in SETTINGS[robot].imperfections
         if facts[f"{imperfection}-{method}"]["loss"]
     }
     if losses:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.engine.program import EngineError
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, Residual, network
@@ -91,11 +92,19 @@ ROBOTS = {
     "model of own": with_network(CANE, 2),
     "arm": kc.load_robot("three-chamber-arm").replace(nodes=5),
     "tubes": kc.load_robot("three-tube-robot").replace(nodes=13),
+    "catheter": kc.load_robot("magnetic-catheter").replace(nodes=5),
+    "gripper": kc.load_robot("three-finger-gripper").replace(nodes=5),
 }  # fmt: skip
 #: means of the controls of robots whose controls are not the paper's four tensions
 MEANS = {
     "own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4],
     "tubes": [1.0, 0.02, -0.5, 0.01, 0.3, 0.02],
+    "gripper": [1.0, 1.5, 2.0, 0.8, 0.9, 1.0], "catheter": [2e-3, 1e-3, 3e-3],
+}  # fmt: skip
+#: identified parameters of robots of which it is not Young's modulus
+PARAMETERS = {
+    "own": "bending", "model of own": "bending", "arm": "effects.0.offset", "tubes": "tubes.1.curvature",
+    "gripper": "rods.thumb.youngs_modulus",
 }  # fmt: skip
 
 
@@ -123,9 +132,8 @@ def made(kind: str) -> Made:
 
 
 def name_of_a_parameter(robot: kc.System) -> str:
-    return {2: "bending", 3: "effects.0.offset", 6: "tubes.1.curvature"}.get(
-        robot.control_layout.size, "youngs_modulus"
-    )
+    kind = next(kind for kind, one in ROBOTS.items() if one is robot)
+    return PARAMETERS.get(kind, "youngs_modulus")
 
 
 def fitted(robot: kc.System, it: Made, config: kc.FitConfig) -> Any:
@@ -190,6 +198,20 @@ def predicted(robot: kc.System, it: Made) -> Any:
     return found.tip_rmse
 
 
+def controlled(robot: kc.System, it: Made) -> Any:
+    tip, (low, high) = kc.estimation.TipPosition(), it.limits
+    mean = 0.5 * (low + high)
+    goal = kc.equilibrium(robot, mean).tip_position[0]
+    limits = kc.control.ControlLimits(np.minimum(0.0, mean - np.abs(mean)), mean + np.abs(mean))
+    controller = kc.control.PredictiveController(
+        kc.estimation.KalmanObserver(robot, DT, tip), tip, limits, horizon=6, knots=3
+    )
+    plant = kc.control.SimulatedPlant(robot, DT, kc.control.Sensor(tip))
+    log = kc.control.run_loop(controller, plant, kc.control.constant(goal), 1.5)
+    assert log.tip_distance[-5:].max() < 0.2 * np.linalg.norm(goal - robot.rest(robot.length)[0][:3])
+    return log.tip
+
+
 #: function by name: called with a robot and with what it `Made`, it returns numbers
 FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "simulate": lambda robot, it: it.motion.y,
@@ -210,9 +232,12 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "estimate_states": lambda robot, it: estimated(robot, it, "best"),
     "estimate_states, paper": lambda robot, it: estimated(robot, it, "paper"),
     "evaluate": predicted,
+    "predictive control": controlled,
 }
 #: they compile for long
-SLOW = {"stability", "equilibrium_path", "identify, poses", "fit, passive", "fit, network"}
+SLOW = {
+    "stability", "equilibrium_path", "identify, poses", "fit, passive", "fit, network", "predictive control",
+}  # fmt: skip
 #: kinds for which every other function is called each time
 OFTEN = {"model of a model"}
 #: functions that are not called each time for a model of a model: they compile as long again
@@ -223,7 +248,7 @@ OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configu
 LACKING = {
     **{
         ("fit, passive", kind): (kc.learning.FitError, "without bending_stiffness")
-        for kind in ("own", "model of own", "tubes")
+        for kind in ("own", "model of own", "tubes", "gripper")
     },
     **{
         (name, "tubes"): (
@@ -232,6 +257,13 @@ LACKING = {
         )
         for name in ("estimate_states", "estimate_states, paper")
     },
+    **{
+        (name, "gripper"): (kc.recordings.RecordingError, "estimation is for rods with p, h, q, w, n, m")
+        for name in ("estimate_states", "estimate_states, paper")
+    },
+    ("stability", "gripper"): (ValueError, "its motions have more than 4000 history terms"),
+    ("compliance", "gripper"): (ValueError, "the robot's tip has no force n or moment m"),
+    ("fit, network", "gripper"): (EngineError, "more than 180000 operations; use smaller laws"),
 }
 
 

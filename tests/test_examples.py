@@ -269,9 +269,18 @@ def test_syringe_or_regulator(run):
 
 
 @CAMPAIGN
+def test_gripper(run):
+    found = run("gripper", points=5)
+    # three fingers alike, which touch the ball at the end only
+    assert np.ptp(found["grips"][-1]) < 1e-6 and found["grips"][0, 0] < 1e-6 < 0.2 < found["grips"][-1, 0]
+    assert np.ptp(found["closed"]) < 0.1 * np.ptp(found["open"])
+
+
+@CAMPAIGN
 def test_concentric_tubes(run):
     jumps = run("concentric_tubes", steps=120)
     assert jumps[0.7] < 30.0 < 90.0 < jumps[1.6]
+
 
 @pytest.mark.slow
 def test_spinning_shaft(run):

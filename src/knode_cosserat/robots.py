@@ -18,6 +18,7 @@ from knode_cosserat.rods import (
     tubes,
 )
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.assembly import Assembly, RigidBody
 from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.insertion import Insertion
 from knode_cosserat.rods.layout import Layout
@@ -32,6 +33,7 @@ from knode_cosserat.rods.system import Discontinuities, Scales, System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot
 
 __all__ = [
+    "Assembly",
     "Discontinuities",
     "Drawing",
     "Effect",
@@ -42,6 +44,7 @@ __all__ = [
     "ParallelRobot",
     "ParameterError",
     "Relaxation",
+    "RigidBody",
     "RobotFileError",
     "RoutedTendonRobot",
     "Scales",

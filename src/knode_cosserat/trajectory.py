@@ -27,7 +27,7 @@ from knode_cosserat.io.container import ContainerError, Variable
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.parameters import Parameter, ParameterError, parameters_of, slots_of
+from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, parameters_of, slots_of
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
@@ -440,9 +440,10 @@ def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any
             yield before + name, parameter, value
     for name in slots_of(type(owner)):
         parts = getattr(owner, name)
-        for k, part in enumerate(parts) if isinstance(parts, tuple) else [(None, parts)]:
+        several = isinstance(parts, tuple)
+        for own, part in zip(names_of(parts), parts, strict=True) if several else [("", parts)]:
             if part is not None:
-                yield from _numbers(part, f"{before}{name}." if k is None else f"{before}{name}.{k}.")
+                yield from _numbers(part, f"{before}{name}.{own}." if several else f"{before}{name}.")
 
 
 def load_trajectory(

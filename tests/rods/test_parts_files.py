@@ -19,6 +19,7 @@ from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Load, PointWrench
 from knode_cosserat.rods.parameters import Choice, kinds_of, parameters_of, stated_of
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.routing import FunctionRouting, Routing
 from knode_cosserat.rods.section import SectionChange
 from knode_cosserat.rods.strands import strand_of
@@ -110,7 +111,16 @@ FIELDS = {
         **{name: ROD[name] for name in ("loads", "surroundings", "tip_end")},
         "tubes": TUBES,
     },
-}
+    "assembly": {
+        "rods": st.tuples(
+            st.builds(
+                SlenderRod, name=st.just("arm"), **{name: st.just(value) for name, value in BODY.items()},
+                **{name: ROD[name] for name in ROD if name != "effects"}
+                | {"base_end": parts(End).filter(lambda end: end.anywhere and end.held)},
+            )
+        ),
+    },
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", [kind for kind in KINDS if kind != "parallel-robot"])
@@ -119,7 +129,7 @@ FIELDS = {
 def test_robots_with_parts_come_back_equal(kind, data):
     # a robot of several rods has no parts
     assert {*FIELDS, "parallel-robot"} == set(KINDS)
-    body = {"length": 0.5} if kind == "concentric-tube-robot" else BODY
+    body = {"concentric-tube-robot": {"length": 0.5}, "assembly": {}}.get(kind, BODY)
     robot = KINDS[kind](**body, **data.draw(st.fixed_dictionaries(FIELDS[kind])))
     text = format_robot(robot)
     assert_equal(parse_robot(text, "here"), robot)

@@ -185,7 +185,7 @@ def test_matrices(matrix):
         # missing and unknown
         ({"radius": None}, ["radius is missing; required is radius, or a cross_section"]),
         ({"youngs_module": "1.0"}, ["the key 'youngs_module' is unknown", "did you mean youngs_modulus?"]),
-        ({"name": "x"}, ["parameters: the key 'name' is unknown", "length, radius"]),
+        ({"nickname": "x"}, ["parameters: the key 'nickname' is unknown", "length, radius"]),
         ({"1": "2"}, ["the key 1 is unknown"]),
         # wrong types
         ({"youngs_modulus": "2.7 GPa"},

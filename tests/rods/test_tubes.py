@@ -177,6 +177,31 @@ def test_the_tip_has_exact_derivatives_by_every_control():
         )
 
 
+@pytest.mark.slow
+def test_a_residual_finds_the_stiffness_of_one_tube():
+    truth = kc.load_robot("three-tube-robot").replace(nodes=13)
+    wrong = truth.replace(**{"tubes.1.youngs_modulus": 100e9})
+    time = 0.05 * np.arange(1, 25)[:, None]
+    seen, unseen = (
+        np.array([0.6, 0.01, 0.5, 0.01, 0.4, 0.01]) * np.sin(2 * np.pi * time / period + np.arange(6))
+        for period in (1.0, 1.6)
+    )
+    model = kc.fit(wrong, [kc.simulate(truth, seen, 0.05, space="lobatto2")])
+    stiffer = np.asarray(truth.cross_section.EI - wrong.cross_section.EI)[1]
+    softer = np.asarray(1.0 / truth.cross_section.GJ - 1.0 / wrong.cross_section.GJ)[1]
+    terms = {(term.part, term.target, term.function): term.coefficient for term in kc.learning.explain(model)}
+    for target, function in (("u_x", "bent_3"), ("u_y", "bent_4")):
+        assert terms["stress", target, function] == pytest.approx(stiffer, rel=1e-5)
+    assert terms["load", "torsion_1", "torque_y"] == pytest.approx(stiffer, rel=1e-5)
+    assert terms["load", "angle_y", "twisting_y"] == pytest.approx(softer, rel=1e-5)
+    assert terms["base", "angle_y", "straight_y"] == pytest.approx(softer, rel=1e-5)
+    ends = [
+        kc.simulate(robot, unseen, 0.05, space="lobatto2").tip_position for robot in (truth, wrong, model)
+    ]
+    assert np.max(np.abs(ends[1] - ends[0])) > 1e-3
+    np.testing.assert_allclose(ends[2], ends[0], atol=1e-7)
+
+
 def test_the_catalog_s_robot_reads_back_equal(tmp_path):
     robot = kc.load_robot("three-tube-robot")
     kc.save_robot(robot, tmp_path / "tubes.yaml")

@@ -123,7 +123,9 @@ def test_a_cluster_gives_the_same_table(tmp_path, baseline):
 
 @pytest.fixture
 def one_imperfection(monkeypatch):
-    monkeypatch.setattr(simulation, "IMPERFECTIONS", {"length": simulation.IMPERFECTIONS["length"]})
+    setting = simulation.SETTINGS[simulation.ROBOT]
+    only = setting._replace(imperfections={"length": setting.imperfections["length"]})
+    monkeypatch.setitem(simulation.SETTINGS, simulation.ROBOT, only)
 
 
 @pytest.mark.campaign
@@ -221,3 +223,12 @@ def test_cells_are_in_the_order_of_the_papers_table():
         for name in ("self-weight", "stiffness")
         for seed in (0, 1)
     ]
+
+
+@pytest.mark.campaign
+@pytest.mark.parametrize("robot", ["three-chamber-arm", "three-tube-robot"])
+def test_other_robots_are_learned_as_well(tmp_path, robot):
+    report = rerun(tmp_path, seeds=range(2), methods=["baseline", "best"], robot=robot)
+    for found in spreads(report.cells, "tip_dtw").values():
+        assert max(found["best"].values) < 1e-4 * found["baseline"].mean
+        assert not found["best"].failures

@@ -33,6 +33,9 @@ FAMILIES = {
     "Load": "Loads: `loads`",
     "MagneticField": "Magnetic fields: `field` of magnets",
     "Tube": "Tubes: `tubes`",
+    "SlenderRod": "Rods: `rods` of an assembly",
+    "RigidBody": "Bodies: `bodies` of an assembly",
+    "NeighbourContact": "Contact of neighbours: `contacts` of an assembly",
     "Effect": "Further physics: `effects`",
     "Obstacle": "Surroundings: `surroundings`",
     "CrossSection": "Cross-section: `cross_section`",
@@ -74,6 +77,9 @@ def page() -> str:
                 holders += kinds_of(slot.family).values()
     for name, family in families.items():
         parts += [f"## {FAMILIES[name]}", _first(family)]
+        if family is SlenderRod:
+            parts.append("The kinds of robots of one rod, with their entries.")
+            continue
         for kind, cls in kinds_of(family).items():
             rows = _rows(cls, None)
             parts += [f"### `{kind}`", _first(cls), HEAD + "\n".join(rows) if rows else "No parameters."]

@@ -388,17 +388,13 @@ class Core(EliminationCode):
                 found.set(f.apply("max", found.get(), value))
                 total.set(total.get() + value)
 
-            names = layout.names
-            if "p" in names:
-                span = layout.slice("p")
-                largest(offs, _sum(d * d for d in map(change, range(span.start, span.stop))))
-            else:
+            for rows in layout.ranges("p"):
+                largest(offs, _sum(d * d for d in map(change, rows)))
+            if not layout.ranges("p"):
                 for i in range(self.equations.ny):
                     size = change(i) * self._unit(i, j) * self._wide(self.length, 0)
                     largest(offs, size * size)
-            if "h" in names:
-                span = layout.slice("h")
-                rows = range(span.start, span.stop)
+            for rows in layout.ranges("h"):
                 h, d = [self._wide(self.y, i, j) for i in rows], [change(i) for i in rows]
                 square = _sum(a * a for a in h)
                 along = _sum(a * b for a, b in zip(d, h, strict=True)) / square

@@ -12,7 +12,9 @@ the method of particular solutions (Ascher, Mattheij & Russell 1995, ch. 4).
 from __future__ import annotations
 
 import functools
+import itertools
 import operator
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -57,6 +59,11 @@ class EliminationCode(RodCode):
         )
         if any(i // ny != c // self.own for i, c, _ in self.base_slopes):
             raise EngineError("engine: the base of a strand depends on the unknowns of another")
+        #: structural nonzeros of X, of a change of the unknowns, and of M
+        self.nonzero_X, self.nonzero_T = self._filled()
+        self.nonzero_M = np.zeros((k, ny), dtype=bool)
+        for i, c, _ in self.tip_slopes:
+            self.nonzero_M[i, c % ny] = True
         self.factor = a(len(self.elimination.factors), self.pieces)
         #: entries of A
         if robots or self.has_entries:
@@ -66,7 +73,7 @@ class EliminationCode(RodCode):
             self.added = self.r
         else:
             #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
-            self.wide_matrix, self.wide_added = a(ny * ny, self.pieces), a(ny, self.pieces)
+            self.wide_matrix, self.wide_added = a(ny * (ny + 1), self.pieces), a(ny, self.pieces)
             self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
         #: columns of the unknowns along the rod
         self.X = by_rows(ny, self.own, self.points)
@@ -91,58 +98,80 @@ class EliminationCode(RodCode):
         #: history terms of the step
         self.H = a(self.equations.numbers, self.count)
 
-    def _write_solved(self, name: str = "solved", columns: int = 1) -> Function:
-        """A piece's B⁻¹ r, of one column or of several one after the other."""
+    def _filled(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the structural nonzeros of X and of T anywhere along the rod."""
+        ny, X, T = (
+            self.equations.ny,
+            np.zeros((self.equations.ny, self.own), dtype=bool),
+            np.eye(self.own) > 0,
+        )
+        for i, c, _ in self.base_slopes:
+            X[i % ny, c % self.own] = True
+        for _ in range(self.own + ny):
+            T = T @ T | X[self.pivots]
+            X = X | self.elimination.nonzero @ X | X @ T
+        return X, T
+
+    def _used(self, nonzero: np.ndarray) -> list[bool]:
+        """Return true for the blocks of a column that are not zero."""
+        return [bool(nonzero[row : row + self._rows_at_once].any()) for row in self._blocks(len(nonzero))]
+
+    def _write_solved(self, name: str = "solved", columns: int = 1, rows: Sequence[int] = ()) -> Function:
+        """A piece's B⁻¹ r, of one column or of several one after the other, which are zero in other rows."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
         j, component = f.index(piece), self.r.component
-        known = {int(node): self._get(self.factor, k, j, self.L) for k, node in enumerate(el.stored)}
         n = len(el.r)
+        rows = rows or range(n)
+        used = set(el.program.needed([el.solved[i] for i in rows]))
+        known = {
+            int(node): self._get(self.factor, k, j, self.L)
+            for k, node in enumerate(el.stored)
+            if node in used
+        }
         every = []
         for c in range(columns):
-            r = {int(node): f.load(source, (c * n + i) * component, self.L) for i, node in enumerate(el.r)}
+            r = {int(el.r[i]): f.load(source, (c * n + i) * component, self.L) for i in rows}
             every.append(known | r)
         # one operation of each column in turn
-        for node in el.program.needed(el.solved, frozenset(every[0])):
+        for node in el.program.needed([el.solved[i] for i in rows], frozenset(every[0])):
             for values in every:
                 values |= f.evaluate(el.program, [node], values, self.L)
         for c, values in enumerate(every):
-            for i, node in enumerate(el.solved):
-                f.store(values[node], target, (c * n + i) * component, self.L)
+            for i in rows:
+                f.store(values[el.solved[i]], target, (c * n + i) * component, self.L)
         return f
+
+    def _blocks_of_rows(self) -> list[range]:
+        """Return the ranges of rows of B⁻¹ A that are not coupled, such as the rods of an assembly."""
+        nonzero = self.elimination.nonzero | self.elimination.nonzero.T
+        ends = (i for i in range(1, len(nonzero) + 1) if not nonzero[:i, i:].any())
+        return [range(*bounds) for bounds in itertools.pairwise([0, *ends])]
 
     def _write_factor(self) -> None:
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
+        el, n, blocks = self.elimination, self.equations.ny, self._blocks_of_rows()
+        # a function for each block: LLVM's time grows faster than the size of a function
+        functions = [self._write_factor_of(f"factored{k}", rows) for k, rows in enumerate(blocks)]
+        # nothing is to be solved for a constant field
+        blocks = [rows for rows in blocks if any(el.solved[i] != int(el.r[i]) for i in rows)]
         if not self.batch:
-            solved_columns = self._write_solved("solved_columns", COLUMNS)
-        f, el, n = self._function("factored"), self.elimination, self.equations.ny
-        self.factored = f
+            solved_columns = [
+                self._write_solved(f"solved_columns{k}", COLUMNS, rows) for k, rows in enumerate(blocks)
+            ]
+        self.factored = f = self._function("factored")
         memory = f.arguments[0]
-        with self._places(self.pieces) as j:
-            known = {el.h: self._wide(self.h, 0, j)}
-            slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
-            for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
-                known |= {int(node): self._wide(array, k, at) for k, node in enumerate(nodes)}
-            outputs = [*el.factors, *map(int, el.matrix.reshape(-1))]
-            values = f.evaluate(el.program, outputs, known, self.L)
-            for k, node in enumerate(el.factors):
-                self._write_wide(values[node], self.factor, k, j)
-            if self.batch or self.has_entries:
-                for k, entry in enumerate(el.entries):
-                    self._write_wide(values[int(el.matrix[entry])], self.entries, k, j)
-            if not self.batch:
-                for i, c in np.ndindex(n, n):
-                    self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+        for function in functions:
+            f.call(function, memory)
         if self.batch:
             return
         with self._places(self.pieces) as j:
             first = self._pointer(self.wide_matrix, j)
-            with f.loop(n // COLUMNS * COLUMNS, 0, COLUMNS) as c:
-                column = f.pointer(first, c.value * (n * self.wide_matrix.component))
-                f.call(solved_columns, memory, column, column, j.value)
-            with f.loop(n, n // COLUMNS * COLUMNS) as c:
-                column = f.pointer(first, c.value * (n * self.wide_matrix.component))
-                f.call(self.solved, memory, column, column, j.value)
+            for rows, function in zip(blocks, solved_columns, strict=True):
+                # the last column may be another block's, zero in these rows
+                with f.loop(rows.stop, rows.start, COLUMNS) as c:
+                    column = f.pointer(first, c.value * (n * self.wide_matrix.component))
+                    f.call(function, memory, column, column, j.value)
         with f.loop(n) as c:
             source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
             target = c.value * self._padded(n) + self.matrix.offset
@@ -151,6 +180,29 @@ class EliminationCode(RodCode):
                     n, (f.pointer(memory, source + j.value), self.wide_matrix.component),
                     (f.pointer(memory, target + j.value * self.matrix.place), 1),
                 )  # fmt: skip
+
+    def _write_factor_of(self, name: str, block: range) -> Function:
+        """Factors and A of all pieces, in a block of rows and columns."""
+        f, el, n = self._function(name), self.elimination, self.equations.ny
+        factors = [k for k, (i, _) in enumerate(el.places) if i in block]
+        entries = [k for k, (i, _) in enumerate(el.entries) if i in block]
+        outputs = [el.factors[k] for k in factors] + [int(node) for node in el.matrix[block][:, block].flat]
+        used = set(el.program.needed(outputs))
+        with self._places(self.pieces) as j:
+            known = {el.h: self._wide(self.h, 0, j)}
+            slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
+            for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
+                known |= {int(node): self._wide(array, k, at) for k, node in enumerate(nodes) if node in used}
+            values = f.evaluate(el.program, outputs, known, self.L)
+            for k in factors:
+                self._write_wide(values[el.factors[k]], self.factor, k, j)
+            if self.batch or self.has_entries:
+                for k in entries:
+                    self._write_wide(values[int(el.matrix[el.entries[k]])], self.entries, k, j)
+            if not self.batch:
+                for i, c in itertools.product(block, block):
+                    self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+        return f
 
     def _copy(self, count: int, source: tuple[Value, int], target: tuple[Value, int]) -> None:
         """Write numbers from an address to another, each with the distance between numbers."""
@@ -191,14 +243,14 @@ class EliminationCode(RodCode):
         eye = [self._unit_column(c, k) for c in range(k)]
         for r, pivot in enumerate(self.pivots):
             scale = 1.0 / self._entry(columns[r], pivot)
-            factors = [self._entry(column, pivot) * scale for column in columns]
-            for matrix in (columns, eye):
-                pivotal = matrix[r]
-                for c in range(k):
-                    if c != r:
-                        pairs = zip(matrix[c], pivotal, strict=True)
-                        matrix[c] = [a - factors[c] * b for a, b in pairs]
-                matrix[r] = [scale * b for b in pivotal]
+            others = [c for c in range(k) if c != r and self.nonzero_X[pivot, c]]
+            factors = {c: self._entry(columns[c], pivot) * scale for c in others}
+            for matrix, nonzero in ((columns, self.nonzero_X), (eye, self.nonzero_T)):
+                pivotal, used = matrix[r], self._used(nonzero[:, r])
+                for c in others:
+                    blocks = zip(matrix[c], pivotal, used, strict=True)
+                    matrix[c] = [a - factors[c] * b if some else a for a, b, some in blocks]
+                matrix[r] = [scale * b if some else b for b, some in zip(pivotal, used, strict=True)]
         return eye
 
     def _unit_column(self, c: int, rows: int) -> list[Value]:
@@ -241,7 +293,11 @@ class EliminationCode(RodCode):
             component, lanes = self.X.component, self.P
             for c in range(own):
                 x = f.pointer(*self._at(self.X, c * self._padded(ny), tip))
-                product = self._product(M, [f.load(x, i * component, lanes) for i in range(ny)])
+                rows = [i for i in range(ny) if self.nonzero_X[i, c]]
+                product = self._product(
+                    [M[i] for i in rows], [f.load(x, i * component, lanes) for i in rows],
+                    self.nonzero_M[:, rows],
+                )  # fmt: skip
                 column = f.pointer(memory, (strand.value * own + c) * (self._padded(k) * component))
                 for row, value in zip(self._blocks(k), product, strict=True):
                     f.store(value, column, self.at_tip.at(row, 0), self.L)
@@ -297,12 +353,19 @@ class EliminationCode(RodCode):
             for each, at in zip(found, rows, strict=True):
                 f.store(each.get() * unit, column(inverse, c), at)
 
-    def _product(self, columns: list[list[Value]], x: list[Value]) -> list[Value]:
-        """Return a matrix times a vector."""
-        found = [x[0] * part for part in columns[0]]
-        for column, number in zip(columns[1:], x[1:], strict=True):
-            found = [a + number * part for a, part in zip(found, column, strict=True)]
-        return found
+    def _product(
+        self, columns: list[list[Value]], x: list[Value], nonzero: np.ndarray | None = None
+    ) -> list[Value]:
+        """Return a matrix times a vector; `nonzero` are the matrix's structural nonzeros."""
+        found: list[Any] = [None] * len(columns[0])
+        for c, (column, number) in enumerate(zip(columns, x, strict=True)):
+            used = [True] * len(column) if nonzero is None else self._used(nonzero[:, c])
+            for block, part in enumerate(column):
+                if used[block]:
+                    product = number * part
+                    found[block] = product if found[block] is None else found[block] + product
+        zero = self._now.splat(self._now.value(0.0), self.L)
+        return [zero if each is None else each for each in found]
 
     def _write_linearise(self) -> None:
         """Rates, slopes and factors at y."""
@@ -377,7 +440,9 @@ class EliminationCode(RodCode):
                     piece(j)
                 w = self._column(self.w, ny, 0, last)
                 columns = [self._column(self.X, ny, c, last) for c in range(own)]
-                moved = self._product(columns, [self._entry(w, pivot) for pivot in self.pivots])
+                moved = self._product(
+                    columns, [self._entry(w, pivot) for pivot in self.pivots], self.nonzero_X
+                )
                 self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
                 group = f.index(strand.value * count + g.value)
                 self._set_column(self._gathered(w, self.pivots), self.beta, own, 0, group)
@@ -386,7 +451,7 @@ class EliminationCode(RodCode):
                 piece(j)
             w = self._column(self.w, ny, 0, tip)
             M = [self._column(self.M, k, i, strand) for i in range(ny)]
-            products = self._product(M, [self._entry(w, i) for i in range(ny)])
+            products = self._product(M, [self._entry(w, i) for i in range(ny)], self.nonzero_M)
             for variable, value in zip(tips, products, strict=True):
                 variable.set(variable.get() + value)
         inverse = [self._column(self.inverse, k, c) for c in range(k)]
@@ -401,7 +466,7 @@ class EliminationCode(RodCode):
             numbers = [self._entry([each.get() for each in alpha], c) for c in range(own)]
             with f.loop(stop, start) as j:
                 columns = [self._column(self.X, ny, c, j) for c in range(own)]
-                moved = self._product(columns, numbers)
+                moved = self._product(columns, numbers, self.nonzero_X)
                 w = self._column(self.w, ny, 0, j)
                 self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.column_dy, ny, 0, j)
 
@@ -416,7 +481,7 @@ class EliminationCode(RodCode):
                 beta = self._column(self.beta, own, 0, group)
                 change = [a.get() - b for a, b in zip(alpha, beta, strict=True)]
                 T = [self._column(self.T, own, c, group) for c in range(own)]
-                moved = self._product(T, [self._entry(change, c) for c in range(own)])
+                moved = self._product(T, [self._entry(change, c) for c in range(own)], self.nonzero_T)
                 for variable, value in zip(alpha, moved, strict=True):
                     variable.set(value)
                 correct(base + (g.value * size + 1), end)

@@ -27,6 +27,11 @@ RUN, STEP, PLACE, STATE = 1, 2, 3, 4
 MOST_OPERATIONS = 60_000
 
 
+def most_operations(ny: int) -> int:
+    """Return the largest number of operations of a system by the size of y: an assembly has several rods."""
+    return MOST_OPERATIONS * (1 + ny // 40)
+
+
 def constant_zeros(leaf: np.ndarray) -> np.ndarray:
     """Return true where a parameter is a constant of the program: zeros, but not those of large arrays.
 
@@ -64,7 +69,7 @@ class Equations:
         self.nc, self.k = system.control_layout.size, unknown_count(system)
         #: numbers of a record: y, z and, if B is not zero, y_s
         self.numbers = self.ny + self.nz + (self.ny if system.mixed else 0)
-        program = self.program = Program(MOST_OPERATIONS)
+        program = self.program = Program(most_operations(self.ny))
         self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN, True) for i, leaf in enumerate(leaves)]
         #: the place of each parameter's node in the vector of parameters
         self.parameter_values = np.concatenate([leaf.reshape(-1) for leaf in leaves])
@@ -361,8 +366,9 @@ class Elimination:
     """
 
     def __init__(self, equations: Equations):
-        program = self.program = Program(MOST_OPERATIONS)
-        apply, n = program.apply, equations.ny
+        n = equations.ny
+        program = self.program = Program(most_operations(n))
+        apply = program.apply
         zero, one = program.constant(0.0), program.constant(1.0)
         self.h = program.input("h", 1)
         stages, weights = equations.space.formula
@@ -421,11 +427,11 @@ class Elimination:
                 for j in order[at + 1 :]:
                     product = apply("mul", int(B[i, p]), int(B[p, j]))
                     B[i, j] = apply("sub", int(B[i, j]), product)
-        #: factors that are not constant
-        places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
-        self.factors = [int(B[i, j]) for i, j in places]
-        self.stored = program.inputs("factor", (len(places),), 1)
-        for node, (i, j) in zip(self.stored, places, strict=True):
+        #: factors that are not constant, and their rows and columns
+        self.places = [(i, j) for i, j in np.ndindex(B.shape) if not program.is_constant(int(B[i, j]))]
+        self.factors = [int(B[i, j]) for i, j in self.places]
+        self.stored = program.inputs("factor", (len(self.places),), 1)
+        for node, (i, j) in zip(self.stored, self.places, strict=True):
             B[i, j] = node
         #: nonzeros of B⁻¹ A
         self.nonzero = np.not_equal(A, zero)

@@ -11,11 +11,10 @@ from knode_cosserat.learning.structured.residual import (
     Expansion,
     Structured,
     Term,
-    ambient_layout,
     loaded,
     material_layout,
 )
-from knode_cosserat.rods.aspects import Ends
+from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_of
 
@@ -39,8 +38,8 @@ class ExplainedTerm(NamedTuple):
 def explain(model: KNODE) -> list[ExplainedTerm]:
     """Return the terms that the residual adds to the nominal model, the largest first within each part.
 
-    The parts are length, stress, load and tip. A star marks terms in the global frame; all others are in the
-    material frame.
+    The parts are length, stress, base, load and tip. A star marks terms in the global frame; all others are
+    in the material frame.
 
     A coefficient multiplies the function in SI units, of the unscaled vector; for a saturating function it is
     the initial slope. Stress is the missing term of the constitutive law, C z + D z_t + stress = f2. Loads
@@ -57,11 +56,10 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     terms = []
     if float(residual.stretch) != 0.0:
         terms.append(ExplainedTerm("length", "", "of the knowledge's length", float(residual.stretch), "1"))
-    strain = knowledge.z_layout
-    rates = Layout(
-        *((f"{name}_t", size, f"{unit}/s", meaning) for name, size, unit, meaning, *_ in strain.fields)
-    )
-    terms += _terms("stress", strain, residual.stress, strain + rates)
+    aspect, y_layout = Observed.of(knowledge), knowledge.y_layout
+    terms += _terms("stress", knowledge.z_layout, residual.stress, aspect.law_layout)
+    fields = Layout(*(field for field in y_layout.fields if field.name in aspect.base_law))
+    terms += _terms("base", fields, residual.at_base, aspect.base_layout)
     whole = model.knowledge
     for part, system, targets, load in (
         ("load", knowledge, loaded(knowledge), residual.load),
@@ -69,7 +67,7 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     ):
         if load is not None:
             terms += _terms(part, targets, load.material, material_layout(system))
-            terms += _terms(f"{part}*", targets, load.ambient, ambient_layout(system))
+            terms += _terms(f"{part}*", targets, load.ambient, Observed.of(system).ambient_layout)
     return terms
 
 

@@ -102,6 +102,10 @@ class KNODE(Wrapped):
         """Return the nominal model's balance along the rod with the residual's loads."""
         return self.residual.balance(self.adapted, s, t, y, y_t, z, z_t, control)
 
+    def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return y at s = 0, with the learned residual."""
+        return self.residual.base(self.adapted, t, control, unknowns)
+
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's boundary conditions, with the learned residual."""
         return self.residual.tip(self.adapted, t, control, y, y_t)

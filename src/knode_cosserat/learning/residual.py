@@ -53,6 +53,10 @@ class Residual(eqx.Module):
         """Return the balance along the rod with the residual's loads (`System.balance`)."""
         return knowledge.balance(s, t, y, y_t, z, z_t, control)
 
+    def base(self, knowledge: System, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return y at the base (`System.base`)."""
+        return knowledge.base(t, control, unknowns)
+
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
     ) -> Float[Any, " k"]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar, Self
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -76,6 +77,9 @@ class Ends(_Aspect):
 class Drawing(_Aspect):
     """Positions, orientations and lines of a system's states."""
 
+    #: number of the last curves that are outlines of bodies, not rods
+    outlines: int = 0
+
     def positions(self, y: Any) -> Any:
         """Return positions (…, 3) in metres of states y (…, y)."""
         return self._named(y, "p", "position")
@@ -130,6 +134,45 @@ class Observed(_Aspect):
     def has_actuation(self) -> bool:
         """True if the actuation differs from the control."""
         return type(self).actuation is not Observed.actuation
+
+    @property
+    def ambient_layout(self) -> Layout:
+        """Layout of `ambient`: the control, and its actuation if that differs."""
+        controls = self.system.control_layout
+        if not self.has_actuation:
+            return controls
+        size = jax.eval_shape(self.actuation, np.zeros(controls.size)).shape[0]
+        return controls + Layout(("actuation", size, "", "part of the control that enters the equations"))
+
+    def ambient(self, s: Any, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the possible arguments of a load in the global frame at s."""
+        return jnp.concatenate([control, self.actuation(control)]) if self.has_actuation else control
+
+    @property
+    def law_layout(self) -> Layout:
+        """Layout of `law_inputs`: the strains relative to those without stress, and their rates."""
+        strain = self.system.z_layout
+        return strain + Layout(
+            *((f"{name}_t", size, f"{unit}/s", meaning) for name, size, unit, meaning, *_ in strain.fields)
+        )
+
+    def law_inputs(self, s: Any, y: Float[Any, " y"], control: Any) -> Callable[[Any, Any], Any]:
+        """Return a function of z and z_t: the possible arguments of a stress, scaled by `law_factors`."""
+        rest, factors = self.unstressed(s, control), self.law_factors(s, control)
+        strain, rate = (1.0, 1.0) if factors is None else factors
+        return lambda z, z_t: jnp.concatenate([(z - rest) * strain, z_t * rate])
+
+    def load_factor(self, s: Any, control: Any) -> Any:
+        """Return the rate of arclength along the grid, by which a load per length acts on y_s."""
+        return 1.0
+
+    #: fields of y at the base that follow from its unknowns by a law, and the arguments of that law
+    base_law: ClassVar[tuple[str, ...]] = ()
+    base_layout: ClassVar[Layout] = Layout()
+
+    def base_inputs(self, y: Float[Any, " y"], control: Any) -> Float[Any, " b"]:
+        """Return the arguments of the law at the base."""
+        return jnp.zeros(0)
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
         """Return z at s of the unstressed material under this control; by default z at rest."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import choice, parameter
+from knode_cosserat.rods.parameters import ParameterError, choice, parameter, text
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rotation import conjugate, dot, quaternion_of, quaternion_product, rotation_matrix
 
@@ -33,6 +33,19 @@ class Pose(NamedTuple):
 
     p: Float[Any, "3"]
     h: Float[Any, "4"]
+
+    def then(self, other: Pose) -> Pose:
+        """Return a pose that is stated in the frame of this one."""
+        return Pose(self.p + dot(rotation_matrix(self.h), other.p), quaternion_product(self.h, other.h))
+
+    def inverse(self) -> Pose:
+        """Return the pose of the origin in the frame of this pose, of unit quaternion."""
+        h = conjugate(self.h)
+        return Pose(-dot(rotation_matrix(h), self.p), h)
+
+
+#: default pose of the base
+AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 class End(Part):
@@ -53,9 +66,20 @@ class End(Part):
     orientation: Any = parameter(
         "1", "orientation of the held end, a quaternion", shape="quaternion", low=-1e3, high=1e3, default=None
     )
+    body: str = text("body of an assembly that holds the end, in whose frame it is then stated")
+    #: pose of the body; the assembly states it
+    frame: Pose | None = None
 
     def pose(self, rest: Pose, control: Any) -> Pose:
-        """Return the pose in which the end is held; by default the pose at rest."""
+        """Return the pose in which the end is held."""
+        if not self.body:
+            return self.place(rest, control)
+        if self.frame is None:
+            raise ParameterError(f"an end is held by the body {self.body!r}; allowed is that in an assembly")
+        return self.frame.then(self.place(AT_ORIGIN, control))
+
+    def place(self, rest: Pose, control: Any) -> Pose:
+        """Return the pose in the frame of the ground or of the body; by default the pose at rest."""
         p = rest.p if self.position is None else self.position
         h = rest.h if self.orientation is None else self.orientation
         return Pose(jnp.asarray(p), jnp.asarray(h) / jnp.sqrt(jnp.sum(jnp.asarray(h) ** 2)))
@@ -140,9 +164,9 @@ class Driven(Clamped):
         fields += [Field(axis, 1, "rad", f"rotation about {axis[1]}") for axis in AXES[3:]]
         return tuple(fields[AXES.index(axis)] for axis in self.axes)
 
-    def pose(self, rest: Pose, control: Any) -> Pose:
+    def place(self, rest: Pose, control: Any) -> Pose:
         """Return the clamped pose, rotated by the vector (rx, ry, rz) and displaced by (x, y, z)."""
-        held = super().pose(rest, control)
+        held = super().place(rest, control)
         places = np.zeros((6, len(self.axes)))
         places[[AXES.index(axis) for axis in self.axes], np.arange(len(self.axes))] = 1.0
         motion = jnp.sum(places * jnp.asarray(control), axis=1)
@@ -161,6 +185,12 @@ class Sliding(Driven):
     )
 
     along: str = choice("the global axis that it slides along", AXES[:3], "z")
+
+    def __check_init__(self) -> None:
+        if self.body:
+            raise ParameterError(
+                "an end on a body cannot slide; allowed is the ground, as it slides along a global axis"
+            )
 
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the clamped residual, with zero force along the axis instead of the position along it."""

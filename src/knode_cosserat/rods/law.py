@@ -5,6 +5,7 @@ A system states its law in one of these forms (`System.constitutive`):
     LinearLaw     C z + D z_t = f2, the general class
     MaterialLaw   K ε + B ε_t + … = σ for each strain ε of z, and laws of evolution for internal variables
     StressedLaw   one of these, with another stress of all of z and z_t
+    JointLaw      laws of several rods, whose z follow one another
     an array      z itself, if it depends on no rate of z
 """
 
@@ -15,6 +16,7 @@ from typing import Any, NamedTuple
 
 from jaxtyping import Float
 
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rotation import dot, inverse
 
 #: values of fields of z, by name
@@ -130,3 +132,10 @@ class StressedLaw(NamedTuple):
     stress: Callable[[Any, Any], Float[Any, " z"]]
     #: True if the stress is linear
     linear: bool = False
+
+
+class JointLaw(NamedTuple):
+    """Laws of several rods at one place of the grid; z holds that of the first rod, then of the next."""
+
+    #: laws of the rods, with the layout of z and the length (m) of each
+    laws: tuple[tuple[Any, Layout, Any], ...]

@@ -67,6 +67,11 @@ class Layout:
             start += field.size
         raise KeyError(f"no field {name!r}; there are {', '.join(self.names)}")
 
+    def ranges(self, name: str) -> list[range]:
+        """Return the places of the fields of this name, one of each rod of an assembly."""
+        names = (each for each in self.names if each == name or each.endswith(f"_{name}"))
+        return [range(self.slice(each).start, self.slice(each).stop) for each in names]
+
     def get(self, packed: Any, name: str) -> Any:
         """Return one field of a packed vector (or of an array of them: the last axis is packed)."""
         where = self.slice(name)

@@ -66,6 +66,7 @@ class ParallelRobot(Bundle):
     the theory of slender beams. A simulation therefore starts at the equilibrium under zero control.
     """
 
+    kind: ClassVar[str] = "parallel-robot"
     strand_class: ClassVar[type[System]] = _Leg
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = _Leg.alternatives
     length: Any = _of_rod("length")
@@ -274,6 +275,7 @@ class _PlatformDrawing(Drawing, of=ParallelRobot):
     """Axis of the robot, and lines of its legs and platform."""
 
     system: ParallelRobot
+    outlines = 1
 
     def curves(self, y: Any) -> list[Any]:
         """Return every leg's curve, and the polygon of the platform's joints."""

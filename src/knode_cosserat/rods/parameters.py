@@ -36,6 +36,8 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 
 #: fraction of the rod's length: a place nearer to an end than this is at the end
 AT_END = 1e-9
+#: pattern of a name, or none
+NAME = "([A-Za-z][A-Za-z0-9_-]*)?"
 #: largest number of elements of a list in an error message
 MOST_SHOWN = 12
 #: by unit: the typical range
@@ -272,6 +274,35 @@ class Choice:
 
 
 @dataclasses.dataclass(frozen=True)
+class _Text:
+    """Statement of a field that holds a name, or nothing."""
+
+    meaning: str
+
+    optional: ClassVar[bool] = False
+
+    def check(self, name: str, value: Any, text: str | None = None) -> None:
+        """Raise `ParameterError` unless a value is a name."""
+        if not isinstance(value, str) or not re.fullmatch(NAME, value):
+            raise ParameterError(
+                f"{name} is {text or shown(value)}; allowed is a name of letters, digits, - and _"
+            )
+
+    def read(self, name: str, value: Any) -> Any:
+        """Return a value of a file. Raises `ParameterError`."""
+        self.check(name, value, shown(value))
+        return value
+
+    def written(self, value: Any) -> str:
+        """Return the text of a value in a file."""
+        return flow(value)
+
+    def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
+        """Return the JSON Schema of the values."""
+        return {"type": "string", "pattern": f"^{NAME}$", "description": self.meaning, "default": default}
+
+
+@dataclasses.dataclass(frozen=True)
 class _Slot:
     """Statement of a field that holds a part, or (`many`) a tuple of parts, of a family of classes."""
 
@@ -310,6 +341,10 @@ class _Slot:
             hint = did_you_mean(kind, known)
             raise ParameterError(f"{name}.kind is {shown(kind)}; allowed is {names}{hint}")
         return read_object(known[kind], {key: value[key] for key in value if key != "kind"}, name)
+
+    def flowed(self, value: Any) -> str:
+        """Return the text of a part, or of several, on one line."""
+        return f"[{', '.join(map(_part_text, value))}]" if self.many else _part_text(value)
 
     def written(self, value: Any) -> str:
         """Return the text of a part in a file, or lines of several."""
@@ -390,6 +425,11 @@ def choice(meaning: str, allowed: tuple[Any, ...], default: Any) -> Any:
     return _field(stated, default, _as_tuple if stated.many else None, static=True)
 
 
+def text(meaning: str) -> Any:
+    """Return a dataclass field for a name; by default it is empty."""
+    return _field(_Text(meaning), "", static=True)
+
+
 def slot(meaning: str, family: type, *, many: bool = False, default: Any) -> Any:
     """Return a dataclass field for a part, or parts (see `parts.Part`); default None makes it optional."""
 
@@ -461,7 +501,8 @@ def slots_of(cls: type) -> dict[str, _Slot]:
 
 def kinds_of(family: Any) -> dict[str, Any]:
     """Return the classes of a family that robot files can name: the family and its subclasses."""
-    kinds = {} if inspect.isabstract(family) or not family.kind else {family.kind: family}
+    kind = vars(family).get("kind")  # a class without its own kind is not in files
+    kinds = {} if inspect.isabstract(family) or not kind else {kind: family}
     for member in family.__subclasses__():
         kinds |= kinds_of(member)
     return dict(sorted(kinds.items()))
@@ -469,12 +510,14 @@ def kinds_of(family: Any) -> dict[str, Any]:
 
 def in_order(cls: type) -> dict[str, Any]:
     """Return the statements of a class by name: parameters, then choices, then parts."""
-    return parameters_of(cls) | stated_of(cls, Choice) | slots_of(cls)
+    return parameters_of(cls) | stated_of(cls, Choice) | stated_of(cls, _Text) | slots_of(cls)
 
 
 class Parametrised(eqx.Module):
     """Base of systems and their parts: parameters, stated in the class and passed by name."""
 
+    #: name in robot files; empty if none can describe it
+    kind: ClassVar[str] = ""
     #: for the schema: sets of optional entries, of which one is required
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = ()
 
@@ -566,8 +609,10 @@ def _part_text(part: Any) -> str:
     entries = [f"kind: {part.kind}"]
     for name, stated in in_order(type(part)).items():
         value = getattr(part, name)
-        if value is not None and not np.array_equal(value, defaults[name]):
-            entries.append(f"{name}: {stated.written(value)}")
+        is_part = isinstance(stated, _Slot)
+        equal: Any = eqx.tree_equal if is_part else np.array_equal
+        if value is not None and equal(value, defaults[name]) is not True:
+            entries.append(f"{name}: {stated.flowed(value) if is_part else stated.written(value)}")
     return "{" + ", ".join(entries) + "}"
 
 
@@ -588,7 +633,7 @@ def object_schema(cls: type[Parametrised], families: dict[str, Any], **more: Any
     }
 
 
-# names with dots, such as `loads.0.mass`
+# names with dots, such as `loads.0.mass` or `rods.thumb.length`
 
 
 def value_at(owner: Any, path: str) -> Any:
@@ -630,18 +675,24 @@ def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
     inner = _entry(owner, first, name)
     changed = with_value(inner, rest, value, name) if rest else value
     if isinstance(owner, tuple):
-        return tuple(changed if k == int(first) else part for k, part in enumerate(owner))
+        known = zip(names_of(owner), owner, strict=True)
+        return tuple(changed if own == first else part for own, part in known)
     return dataclasses.replace(owner, **{first: changed})
+
+
+def names_of(parts: tuple[Any, ...]) -> list[str]:
+    """Return the names of parts in a path: their own names, or else their numbers."""
+    return [getattr(part, "name", "") or str(k) for k, part in enumerate(parts)]
 
 
 def _entry(owner: Any, part: str, name: str) -> Any:
     """Return a field of a robot or part, or an entry of a tuple of parts. Raises `ParameterError`."""
     if isinstance(owner, tuple):
-        known = [str(k) for k in range(len(owner))]
+        known = names_of(owner)
     else:
         known = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
     if part not in known:
         raise ParameterError(
             f"there is no parameter {name!r}: no {part!r} among {', '.join(known) or 'nothing'}"
         )
-    return owner[int(part)] if isinstance(owner, tuple) else getattr(owner, part)
+    return owner[known.index(part)] if isinstance(owner, tuple) else getattr(owner, part)

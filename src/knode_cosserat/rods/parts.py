@@ -189,9 +189,6 @@ class Contribution:
 class Part(Contribution, Parametrised):
     """Base class of parts with parameters."""
 
-    #: name in robot files; empty if the part cannot be written to one
-    kind: ClassVar[str] = ""
-
     def eased(self, part: float) -> Self:
         """Return the part with near-discontinuities spread over 1/part of their width; by default itself."""
         return self
@@ -218,7 +215,9 @@ def eased(system: Any, part: float) -> Any:
     for name in slots_of(type(system)):
         value = getattr(system, name)
         parts = value if isinstance(value, tuple) else (value,)
-        easier = tuple(one and one.eased(part) for one in parts)
+        easier = tuple(
+            one.eased(part) if isinstance(one, Part) else one and eased(one, part) for one in parts
+        )
         if any(new is not old for new, old in zip(easier, parts, strict=True)):
             changes[name] = easier if isinstance(value, tuple) else easier[0]
     return system.replace(**changes) if changes else system

@@ -28,6 +28,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods import chambers, fluids, insertion, magnets  # noqa: F401 (files name their kinds)
+from knode_cosserat.rods.assembly import Assembly
 from knode_cosserat.rods.ends import End
 from knode_cosserat.rods.parallel_robot import ParallelRobot
 from knode_cosserat.rods.parameters import (
@@ -54,13 +55,11 @@ REQUIRED = ("format", "kind", "parameters")
 
 #: classes that a file can name as its kind
 KINDS: dict[str, type[System]] = {
-    "tendon-robot": TendonRobot,
-    "routed-tendon-robot": RoutedTendonRobot,
-    "slender-rod": SlenderRod,
-    "virtual-robot": VirtualRobot,
-    "parallel-robot": ParallelRobot,
-    "concentric-tube-robot": ConcentricTubeRobot,
-}
+    cls.kind: cls
+    for cls in (
+        TendonRobot, RoutedTendonRobot, SlenderRod, VirtualRobot, ParallelRobot, ConcentricTubeRobot, Assembly
+    )
+}  # fmt: skip
 
 #: distance (m) of the tendons from the axis of the paper's robot
 PAPER_OFFSET = 0.02

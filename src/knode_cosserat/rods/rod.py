@@ -18,11 +18,11 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Ends, Observed
-from knode_cosserat.rods.ends import Clamped, End, Free, Pose, velocities
+from knode_cosserat.rods.ends import AT_ORIGIN, Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import Load, Motion, point_wrench, square_law_drag
-from knode_cosserat.rods.parameters import ParameterError, parameter, slot
+from knode_cosserat.rods.parameters import ParameterError, parameter, slot, text
 from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
 from knode_cosserat.rods.section import (
     ALONG,
@@ -63,8 +63,6 @@ FIRST_ROOT = 1.875104068711961
 WEAK_DRAG = 0.05
 #: control of a part that has none
 NO_CONTROL = np.zeros(0)
-#: default pose of the base
-AT_ORIGIN = Pose(np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]))
 
 
 class SlenderRod(System):
@@ -77,6 +75,7 @@ class SlenderRod(System):
     as actuators.
     """
 
+    kind: ClassVar[str] = "slender-rod"
     mixed: ClassVar[bool] = False
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = (
         ("radius", "density", "youngs_modulus"), ("cross_section",)
@@ -127,6 +126,7 @@ class SlenderRod(System):
     effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
     base_end: End = slot("end at s = 0", End, default=Clamped())
     tip_end: End = slot("end at s = length", End, default=Free())
+    name: str = text("name in an assembly")
 
     def __check_init__(self) -> None:
         if not self.base_end.anywhere:
@@ -496,13 +496,17 @@ class SlenderRod(System):
         """Return the pose in a packed y."""
         return Pose(self.y_layout.get(y, "p"), self.y_layout.get(y, "h"))
 
+    def tip_wrench(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Wrench:
+        """Return n and m at the tip less the loads there: the wrench of the support on the rod."""
+        n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
+        if any(part.applied_at == 1.0 for part in self.parts.values()):
+            loaded = self._point_wrench({1.0: 1.0}, RodPoint(self, self.length, t, y, y_t, control))
+            n, m = n - loaded.force, m - loaded.moment
+        return Wrench(n, m)
+
     def tip(self, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions with the loads there, and of the quaternion's norm."""
-        n, m = self.y_layout.get(y, "n"), self.y_layout.get(y, "m")
-        point = RodPoint(self, self.length, t, y, y_t, control)
-        if any(part.applied_at == 1.0 for part in self.parts.values()):
-            loaded = self._point_wrench({1.0: 1.0}, point)
-            n, m = n - loaded.force, m - loaded.moment
+        n, m = self.tip_wrench(t, control, y, y_t)
         if type(self.tip_end) is Free:
             rows = [-n, -m]
         else:
@@ -512,7 +516,8 @@ class SlenderRod(System):
         if "h" in self.base_unknowns:
             h = self.y_layout.get(y, "h")
             rows.append(jnp.sum(h * h)[None] - 1.0)
-        point = self.absolute(point, Motion.of(self.y_layout, y, y_t))
+        here = RodPoint(self, self.length, t, y, y_t, control)
+        point = self.absolute(here, Motion.of(self.y_layout, y, y_t))
         others = (part.tip_rows(at) for part, at in self.at_parts(point))
         return jnp.concatenate([*rows, *(row for row in others if row is not None)])
 
@@ -566,7 +571,7 @@ class RodEnds(Ends, of=SlenderRod):
     def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
         """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
         rod = self.system
-        if type(rod.base_end) is not Clamped:
+        if type(rod.base_end) is not Clamped or rod.base_end.body:
             q, w = velocities(rod.pose(y), rod.pose(y_t))
             y = jnp.concatenate([y[:13], q, w, y[19:]])
         point = RodPoint(rod, 0.0, None, y, y_t)
@@ -576,7 +581,7 @@ class RodEnds(Ends, of=SlenderRod):
         return y
 
 
-class _RodObserved(Observed, of=SlenderRod):
+class RodObserved(Observed, of=SlenderRod):
     """Motion and bending of a rod, in the material frame, and the controls of its parts."""
 
     system: SlenderRod

@@ -6,8 +6,11 @@ import abc
 import functools
 from typing import Any, ClassVar
 
+import jax.numpy as jnp
+import numpy as np
+
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
 
 
 @functools.singledispatch
@@ -26,6 +29,13 @@ def in_strands(system: System, packed: Any) -> Any:
     """Return a packed y, z or vector of unknowns (…, n) split by strand: (…, strands, n / strands)."""
     count = strand_count(system)
     return packed.reshape(*packed.shape[:-1], count, packed.shape[-1] // count)
+
+
+def of_rods(system: System, y: Any, name: str) -> Any:
+    """Return a field of y of all strands, or rods of an assembly: (…, y) becomes (…, rods, size)."""
+    strands, places = in_strands(system, y), strand_of(system).y_layout.ranges(name)
+    numeric: Any = jnp if is_traced(y) else np
+    return numeric.concatenate([strands[..., rows.start : rows.stop] for rows in places], axis=-2)
 
 
 class Bundle(System):

@@ -28,11 +28,8 @@ from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rotation import cross, dot
 
 
-class Obstacle(Part):
-    """An obstacle that a rod touches and does not penetrate."""
-
-    held: ClassVar[bool] = True
-    damps: ClassVar[bool] = True
+class ContactLaw(Part):
+    """The law of a contact: its force by the gap and the velocity of one surface relative to the other."""
 
     stiffness: Any = parameter(
         "N/m2", "k, contact force per length and depth", low=0.0, high=1e12, default=1e4
@@ -47,6 +44,28 @@ class Obstacle(Part):
         "m/s", "ε, speed of sliding at which friction is full", low=1e-9, high=1e3, default=1e-3
     )
 
+    def force(self, gap: Any, normal: Float[Any, "3"], velocity: Float[Any, "3"]) -> Float[Any, "3"]:
+        """Return the force per length on a surface that has this normal and velocity off the other (N/m)."""
+        approach = -jnp.sum(velocity * normal)
+        pressed = self.stiffness * self.smoothing * jax.nn.softplus(-gap / self.smoothing)
+        pressed = pressed * jnp.maximum(1.0 + self.damping * approach, 0.0)
+        sliding = velocity + approach * normal
+        held = self.friction * pressed / jnp.sqrt(jnp.sum(sliding**2) + self.slip**2)
+        return pressed * normal - held * sliding
+
+    def eased(self, part: float) -> Self:
+        """Return the law with contact and sliding smoothed over 1/part of the depth and the speed."""
+        return dataclasses.replace(
+            self, smoothing=np.minimum(self.smoothing / part, 1.0), slip=np.minimum(self.slip / part, 1e3)
+        )
+
+
+class Obstacle(ContactLaw):
+    """An obstacle that a rod touches and does not penetrate."""
+
+    held: ClassVar[bool] = True
+    damps: ClassVar[bool] = True
+
     @abc.abstractmethod
     def distance(self, p: Float[Any, "3"]) -> tuple[Any, Float[Any, "3"]]:
         """Return the distance (m) to the obstacle's surface, negative inside, and the outward unit vector."""
@@ -59,20 +78,13 @@ class Obstacle(Part):
         """Return the load on a rod of this radius (m) at a point, per length (N/m, N), global frame."""
         distance, normal = self.distance(motion.p)
         arm = -radius * normal
-        velocity = dot(motion.R, motion.q) + cross(dot(motion.R, motion.w), arm)
-        approach = -jnp.sum(velocity * normal)
-        pressed = self.stiffness * self.smoothing * jax.nn.softplus((radius - distance) / self.smoothing)
-        pressed = pressed * jnp.maximum(1.0 + self.damping * approach, 0.0)
-        sliding = velocity + approach * normal
-        held = self.friction * pressed / jnp.sqrt(jnp.sum(sliding**2) + self.slip**2)
-        force = pressed * normal - held * sliding
+        force = self.force(distance - radius, normal, velocity_at(motion, arm))
         return Wrench(force, cross(arm, force))
 
-    def eased(self, part: float) -> Self:
-        """Return the obstacle with contact and sliding smoothed over 1/part of the depth and the speed."""
-        return dataclasses.replace(
-            self, smoothing=np.minimum(self.smoothing / part, 1.0), slip=np.minimum(self.slip / part, 1e3)
-        )
+
+def velocity_at(motion: Motion, arm: Float[Any, "3"]) -> Float[Any, "3"]:
+    """Return the velocity of a point of a rod's cross-section (m/s), global frame."""
+    return dot(motion.R, motion.q) + cross(dot(motion.R, motion.w), arm)
 
 
 def _unit(vector: Any) -> Any:

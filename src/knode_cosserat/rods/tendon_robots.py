@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -103,6 +103,8 @@ class TendonRobot(TendonRod):
     `tendon_offset` does not matter. See `RoutedTendonRobot` for tendons that run beside the rod.
     """
 
+    kind: ClassVar[str] = "tendon-robot"
+
     @property
     def tendons(self) -> _TransverseTendons:
         """Tendons that push the rod sideways."""
@@ -115,6 +117,8 @@ class RoutedTendonRobot(TendonRod):
     Without friction and vibration (the defaults) damping is its only internal variable. Tendons are at
     `tendon_offset` and `tendon_angles`, or follow `routing`.
     """
+
+    kind: ClassVar[str] = "routed-tendon-robot"
 
     routing: tuple[Routing, ...] | None = slot(
         "paths of the tendons; by default straight, at their offset and angles", Routing, many=True,
@@ -271,6 +275,8 @@ class VirtualRobot(TendonRod):
     are masses, each distributed over a part of the length. The balance of n and m is that of a rod without
     tendons, because the tendons act within the section. At the tip, where they end, n and m are zero.
     """
+
+    kind: ClassVar[str] = "virtual-robot"
 
     friction: Any = parameter(
         "", "μ, part of a tendon's tension lost to the tip", low=0.0, high=0.9, default=0.1

@@ -19,6 +19,7 @@ neglected.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
@@ -27,11 +28,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw
-from knode_cosserat.rods.layout import Field
+from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.parameters import ParameterError, as_number, parameter, place, slot
 from knode_cosserat.rods.parts import Part, RodPoint
-from knode_cosserat.rods.rod import RodEnds, SlenderRod
+from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
+    ALONG,
     CrossSection,
     Material,
     Section,
@@ -173,8 +175,10 @@ class _Tubes(CrossSection):
     def y_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
         """Return θ, and τ of all tubes but the first."""
         n = len(self.tubes)
-        torsion = (("torsion", n - 1, "N m", "torsion of the tubes from the second on"),) if n > 1 else ()
-        return (("angle", n, "rad", "angle of each tube about the rod"), *torsion)
+        torsion = (
+            (("torsion", n - 1, "N m", "torsion of the tubes from the second on", "", "N"),) if n > 1 else ()
+        )
+        return (("angle", n, "rad", "angle of each tube about the rod", "", "rad/m"), *torsion)
 
     def base_fields(self, rod: Any) -> tuple[str, ...]:
         """Return the torsion's name."""
@@ -241,6 +245,7 @@ class _Tubes(CrossSection):
 class ConcentricTubeRobot(SlenderRod):
     """A robot of concentric tubes, the innermost first; `length` is that of the longest without insertion."""
 
+    kind: ClassVar[str] = "concentric-tube-robot"
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = ()
     radius: ClassVar[Any] = None  # type: ignore[misc]
     density: ClassVar[Any] = None  # type: ignore[misc]
@@ -289,3 +294,82 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
     """Ends of a robot of tubes."""
 
     rest_is_guess = True
+
+
+class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
+    """Motion, and bending, torsion and sliding of the tubes, from which their laws follow."""
+
+    system: ConcentricTubeRobot
+    base_law: ClassVar[tuple[str, ...]] = ("angle",)
+
+    def _point(self, s: Any, y: Any, control: Any, **others: Any) -> tuple[_Tubes, RodPoint]:
+        point = RodPoint(self.system, s, None, y, None, control)._replace(**others)
+        return next((part, at) for part, at in self.system.at_parts(point) if isinstance(part, _Tubes))
+
+    @property
+    def layout(self) -> Layout:
+        """Layout of `observables`."""
+        n = len(self.system.tubes)
+        sliding = (("sliding", n - 1, "rad/s", "relative rate of rotation of neighbours"),) if n > 1 else ()
+        return super().layout + Layout(
+            ("twisting", n, "N m", "torsion of the tubes that are present"),
+            ("torque", n, "1/m2", "torque about each tube, by its bending stiffness"), *sliding,
+        )  # fmt: skip
+
+    def observables(self, point: RodPoint) -> Float[Any, " o"]:
+        """Return those of a rod, and torsion, torque and sliding of the tubes."""
+        tubes, at = self._point(point.s, point.y, point.control, y_t=point.y_t, z=point.z, z_t=point.z_t)
+        (presence, curvatures), u = tubes.rest_curvatures(at), at.get("u")
+        torque = u[0] * curvatures[:, 1] - u[1] * curvatures[:, 0]
+        spin = self.system.y_layout.get(point.y_t, "angle")
+        sliding = presence[1:] * presence[:-1] * (spin[1:] - spin[:-1])
+        own = [presence * tubes.torsions(at), torque, sliding]
+        return jnp.concatenate([super().observables(point), *own])
+
+    @property
+    def ambient_layout(self) -> Layout:
+        """Layout of `ambient`: the innermost tube, which is always present, adds nothing to a constant."""
+        meaning = "1 for each tube but the first that is present"
+        return super().ambient_layout + Layout(("presence", len(self.system.tubes) - 1, "1", meaning))
+
+    def ambient(self, s: Any, control: Float[Any, " c"]) -> Float[Any, " a"]:
+        """Return the control, and 1 for each tube but the first that is present."""
+        tubes, at = self._point(s, None, control)
+        presence, _ = tubes.present(self.system, s, at.input)
+        return jnp.concatenate([super().ambient(s, control), presence[1:]])
+
+    @property
+    def law_layout(self) -> Layout:
+        """Layout of `law_inputs`."""
+        n = len(self.system.tubes)
+        return super().law_layout + Layout(
+            ("stretched", 3 * n, "1", "shear and extension of each tube"),
+            ("bent", 2 * n, "1/m", "bending of each tube, x and y"),
+        )  # fmt: skip
+
+    def law_inputs(self, s: Any, y: Float[Any, " y"], control: Any) -> Callable[[Any, Any], Any]:
+        """Return the function of z and z_t: those of a rod, and the strains of each tube."""
+        inputs, (tubes, at) = super().law_inputs(s, y, control), self._point(s, y, control)
+        presence, curvatures = tubes.rest_curvatures(at)
+
+        def strains(z: Any, z_t: Any) -> Any:
+            v, u = self.system.z_layout.split(z)
+            stretched, bent = presence[:, None] * (v - ALONG), presence[:, None] * u[:2] - curvatures
+            return jnp.concatenate([inputs(z, z_t), stretched.reshape(-1), bent.reshape(-1)])
+
+        return strains
+
+    def load_factor(self, s: Any, control: Any) -> Any:
+        """Return the rate of arclength along the grid."""
+        tubes, at = self._point(s, None, control)
+        return tubes.arclength(self.system, s, at.input)[1]
+
+    @property
+    def base_layout(self) -> Layout:  # type: ignore[override]
+        """Layout of `base_inputs`."""
+        return Layout(("straight", len(self.system.tubes), "N m2", "torsion times length behind the plate"))
+
+    def base_inputs(self, y: Float[Any, " y"], control: Any) -> Float[Any, " b"]:
+        """Return the torsion of each tube times its length behind the plate."""
+        tubes, at = self._point(0.0, y, control)
+        return (tubes.values("transmission") - at.input[1::2]) * tubes.torsions(at)

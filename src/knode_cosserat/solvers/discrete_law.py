@@ -19,6 +19,7 @@ from knode_cosserat.rods.law import (
     Evolution,
     Fields,
     InternalState,
+    JointLaw,
     LinearLaw,
     MaterialLaw,
     StressedLaw,
@@ -61,6 +62,10 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
     """
     if isinstance(law, StressedLaw):
         return _StressedStep(discrete_law(law.law, layout, c0, hz, length), law, c0, hz)
+    if isinstance(law, JointLaw):
+        ends = np.cumsum([layout.size for _, layout, _ in law.laws])
+        parts = zip(law.laws, jnp.split(hz, ends[:-1]), strict=True)
+        return _JointStep([discrete_law(own, each, c0, h, size) for (own, each, size), h in parts], ends)
     if isinstance(law, InternalState):
         internal = {
             name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
@@ -215,6 +220,34 @@ class MaterialStep:
             for name, evolution in self.law.internal(strains, rates).items():
                 found[name] = evolved(evolution, self.history[name], self.c0)
         return found
+
+
+@dataclasses.dataclass(frozen=True)
+class _JointStep:
+    """Laws of several rods, and the ends of their z."""
+
+    laws: list[DiscreteLaw]
+    ends: np.ndarray
+
+    @property
+    def linear(self) -> bool:
+        """True if all laws are."""
+        return all(law.linear for law in self.laws)
+
+    def _split(self, z: Float[Any, " z"]) -> Any:
+        return zip(self.laws, jnp.split(z, self.ends[:-1]), strict=True)
+
+    def strains(self) -> Float[Any, " z"]:
+        """Return z of all rods."""
+        return jnp.concatenate([law.strains() for law in self.laws])
+
+    def residual(self, z: Float[Any, " z"]) -> Float[Any, " z"]:
+        """Return the residuals of all laws."""
+        return jnp.concatenate([law.residual(part) for law, part in self._split(z)])
+
+    def matrix(self, z: Float[Any, " z"]) -> Float[Any, "z z"]:
+        """Return the blocks of all laws on the diagonal."""
+        return jax.scipy.linalg.block_diag(*(law.matrix(part) for law, part in self._split(z)))
 
 
 class _NonlinearStrain(NamedTuple):

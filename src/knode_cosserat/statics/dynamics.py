@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.aspects import Ends
-from knode_cosserat.rods.law import InternalState, MaterialLaw
-from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
+from knode_cosserat.rods.law import InternalState, JointLaw, MaterialLaw
+from knode_cosserat.rods.strands import in_strands, of_rods, strand_count, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.grid import grid_of
@@ -81,25 +81,26 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     Raises `ValueError`, with a reason, if they cannot be computed.
     """
     grids = next((pair for pair in GRIDS if system.nodes <= pair[1]), GRIDS[-1])
+    if used_places(system.replace(nodes=grids[1]), Lobatto4()) * _history_size(system) > MOST_TERMS:
+        raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
     layout, scale = strand_of(system).y_layout, np.asarray(strand_of(system).scales().y)
-    if "q" not in layout.names:
+    if not layout.ranges("q"):
         raise ValueError(f"a {type(system).__name__} has no velocity q in y")
     s = jnp.zeros(())
     base = in_strands(system, jnp.asarray(y[0]))[0]
     strand, still = strand_of(nominal_model(system)), jnp.zeros_like(base)
     law = strand.constitutive(s, s, base, still, jnp.asarray(control))
-    if isinstance(law, InternalState) or (isinstance(law, MaterialLaw) and law.internal is not None):
-        raise ValueError("its friction has no linearisation at rest")
-    time = float(scale[layout.slice("p")][0] / scale[layout.slice("q")][0])
+    for own in [own for own, *_ in law.laws] if isinstance(law, JointLaw) else [law]:
+        if isinstance(own, InternalState) or (isinstance(own, MaterialLaw) and own.internal is not None):
+            raise ValueError("its friction has no linearisation at rest")
+    time = float(scale[layout.ranges("p")[0][0]] / scale[layout.ranges("q")[0][0]])
     found, c0 = [], RATE / time
     for nodes in grids:
         own = system.replace(nodes=nodes)
-        if used_places(own, Lobatto4()) * _history_size(own) > MOST_TERMS:
-            raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
         at = np.linspace(0.0, 1.0, nodes)
         guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), each) for each in y.T], axis=1)
         solved, error, step, unit = _step(own, guess, control, c0)
-        off = np.max(np.abs(in_strands(system, solved - guess)[..., layout.slice("p")]))
+        off = np.max(np.abs(of_rods(system, solved - guess, "p")))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
         factors, vectors = _largest_eigenvalues(step, unit, WANTED * strand_count(system))
@@ -201,7 +202,7 @@ def displacements(system: System, motion: np.ndarray) -> np.ndarray:
 
     Their phase is that of the largest displacement.
     """
-    p = in_strands(system, motion)[..., strand_of(system).y_layout.slice("p")]
+    p = of_rods(system, motion, "p")
     moves = np.real(p * np.conj(p.ravel()[np.argmax(np.abs(p))]))
     grid, nodes = (np.linspace(0.0, 1.0, size) for size in (len(moves), system.nodes))
     return np.apply_along_axis(lambda own: np.interp(nodes, grid, own), 0, moves)

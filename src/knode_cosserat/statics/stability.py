@@ -178,11 +178,10 @@ def checked_equilibrium(equilibrium: Any, row: Any) -> tuple[System, np.ndarray,
     if not isinstance(row, int | np.integer) or not -len(y) <= row < len(y):
         raise ValueError(f"row is {row!r}; allowed is {-len(y)} to {len(y) - 1}")
     system = equilibrium.system
-    names = strand_of(system).y_layout.names
-    if not set(NEEDED) <= set(names):
-        raise ValueError(
-            f"a {type(system).__name__} has y = {', '.join(names)}; allowed are rods with p, h, n and m"
-        )
+    layout = strand_of(system).y_layout
+    if not all(map(layout.ranges, NEEDED)):
+        names = ", ".join(layout.names)
+        raise ValueError(f"a {type(system).__name__} has y = {names}; allowed are rods with p, h, n and m")
     y, z, control = y[row], np.asarray(equilibrium.z)[row], np.asarray(equilibrium.control)[row]
     space = (equilibrium.settings or Settings()).space
     found, scales = still_state(system, space, control, y), system.scales()

@@ -21,7 +21,7 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.rod import SlenderRod
-from knode_cosserat.rods.strands import strand_count, strand_of
+from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
@@ -410,8 +410,7 @@ def drawn_lines(system: System, y: np.ndarray, positions: np.ndarray) -> list[di
     curves = [] if flat else [np.asarray(curve, dtype=float) for curve in Drawing.of(system).curves(y)]
     if not curves or (len(curves) == 1 and np.array_equal(curves[0], positions, equal_nan=True)):
         return []
-    count = strand_count(system)
-    rods = count if count > 1 else len(curves)
+    rods = len(curves) - Drawing.of(system).outlines
     return [{"shape": "rod" if k < rods else "outline", "points": curve} for k, curve in enumerate(curves)]
 
 

@@ -18,7 +18,6 @@ from knode_cosserat.learning.structured.residual import (
     CURVED,
     Load,
     Structured,
-    ambient_layout,
     expansion,
     loaded,
 )
@@ -55,8 +54,10 @@ def structured(knowledge=ROBOT, seed=0):
         return dataclasses.replace(found, weights=1e-4 * rng.normal(size=found.weights.shape))
 
     balanced = loaded(knowledge).size
-    load = Load(law(Observed.of(knowledge).layout, balanced), law(ambient_layout(knowledge), balanced))
-    tip = Load(None, law(ambient_layout(knowledge), unknown_count(knowledge)))
+    load = Load(
+        law(Observed.of(knowledge).layout, balanced), law(Observed.of(knowledge).ambient_layout, balanced)
+    )
+    tip = Load(None, law(Observed.of(knowledge).ambient_layout, unknown_count(knowledge)))
     assert y.size > balanced
     return Structured(np.asarray(0.01 * seed), law(z + rates, z.size, u=CURVED), load, tip)
 

@@ -35,10 +35,7 @@ from knode_cosserat.learning.structured.residual import (
     Expansion,
     Load,
     Structured,
-    ambient_inputs,
-    ambient_layout,
     expansion,
-    law_inputs,
     loaded,
     material_layout,
     tip_observables,
@@ -47,7 +44,8 @@ from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.strands import strand_of
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.rods.wrapped import with_length_factor
 from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.grid import ON_NODE
@@ -120,11 +118,12 @@ class _Counting(NamedTuple):
 
 
 class _Views(NamedTuple):
-    """Inputs of loads at every sample, and A + c0 B if B is not zero."""
+    """Inputs of loads at every sample, A + c0 B if B is not zero, and the factor of the loads."""
 
     material: Float[Any, "S o"]
     ambient: Float[Any, "S a"]
     matrix: Any
+    factor: Any
 
 
 class _Sides(NamedTuple):
@@ -146,17 +145,34 @@ class _Regressions:
         #: True if y at the end of a segment is linear in the rates at its ends
         self.linear = not data.space.formula.stages
         self._along: tuple[_Views, Any, _Sides] | None = None
+        self._laws: dict[float, tuple[list[_Offer], list[_Target]]] = {}
 
     def residual(self, seed: int) -> Structured:
         """Return the residual of one seed."""
         segments, tips = (self._counting(part, seed) for part in (self.data.segments, self.data.tips))
-        offers, targets = self._law
-        stress, _ = _best(offers, np.ones((len(segments.shares), 1)), targets, segments)
-        residual = self._with_loads(Structured(np.zeros(()), stress, None, None), segments)
+        residual = Structured(np.zeros(()), None, None, None)
+        # the law may depend on the length, and strains before a discontinuity on the law
+        for _ in range(2 if self.strand.discontinuities.places else 1):
+            residual = self._with_stress(self._with_length(residual, segments), segments)
+        residual = self._with_loads(residual, segments)
+        residual = dataclasses.replace(residual, at_base=self._at_base(residual, segments))
         tip, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(self.knowledge), self.data.tips))
         sides = _sides(self.knowledge, Ends.of(self.knowledge).layout, self.data.tips.y, views, curved=False)
         load = _load(sides, -tip, TOLERANCE * np.asarray(self.knowledge.scales().tip), tips)
         return dataclasses.replace(residual, tip_load=load)
+
+    def _at_base(self, residual: Structured, counting: _Counting) -> Expansion | None:
+        """Return the change of the law at the base."""
+        aspect, data = Observed.of(self.knowledge), self.data.segments
+        if not aspect.base_law:
+            return None
+        first = data.place == 0.0
+        at_base = jax.tree.map(lambda values: values[first], (data.t, data.control, data.y))
+        missing, inputs = map(np.asarray, _base_law(residual.adapted(self.knowledge), *at_base))
+        offer = _Offer(expansion(aspect.base_layout, inputs, {}, missing.shape[1]), inputs)
+        target = _Target(missing, None, np.full(missing.shape[1], TOLERANCE))
+        counts = _Counting(*(part[first] for part in counting))
+        return _best([offer], np.ones((len(missing), 1)), [target], counts)[0]
 
     def _counting(self, data: Samples | TipSamples, seed: int) -> _Counting:
         shares = data.weight
@@ -165,12 +181,22 @@ class _Regressions:
             shares = shares * np.random.default_rng(seed).exponential(size=len(rows))[which.ravel()]
         return _Counting(shares / np.mean(shares), regression.folds(data.origin))
 
-    @functools.cached_property
-    def _law(self) -> tuple[list[_Offer], list[_Target]]:
-        """Features and targets of the constitutive law."""
-        values, size, inputs = map(np.asarray, _law_residual(self.strand, self.data.segments))
-        layout = self.strand.z_layout
-        both = layout + Layout(*((f"{name}_t", *rest) for name, *rest in layout.fields))
+    def _with_stress(self, residual: Structured, counting: _Counting) -> Structured:
+        """Return the residual with its stress, of the constitutive law."""
+        offers, targets = self._law(float(residual.stretch))
+        stress, _ = _best(offers, np.ones((len(counting.shares), 1)), targets, counting)
+        return dataclasses.replace(residual, stress=stress)
+
+    def _law(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
+        """Return features and targets of the constitutive law; seeds with the same length share them."""
+        if stretch not in self._laws:
+            self._laws = {stretch: self._law_by_length(stretch)}
+        return self._laws[stretch]
+
+    def _law_by_length(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
+        strand = with_length_factor(self.strand, 1.0 + stretch)
+        values, size, inputs = map(np.asarray, _law_residual(strand, self.data.segments))
+        layout, both = strand.z_layout, Observed.of(strand).law_layout
         offers = [
             _Offer(expansion(both, inputs, dict.fromkeys(both.names, forms), layout.size), inputs)
             for forms in ((LINEAR, CURVED) if self.options.curved else (LINEAR,))
@@ -185,41 +211,62 @@ class _Regressions:
         return offers, targets
 
     def along(self, residual: Structured) -> tuple[_Views, Float[Any, "S y"], _Sides]:
-        """Return inputs, nominal y_s and features at the ends of segments; they depend on the stress at cuts.
+        """Return inputs, y_s and features at the ends of segments, by the law and length of a residual.
 
         The points are the starts of all segments and, if the scheme uses them, then their ends.
         """
-        if self._along is None or self.strand.discontinuities.places:
-            points, z = _points(self.strand, residual, self.data)
-            views: _Views = jax.tree.map(np.asarray, _views(self.strand, points, z))
-            rates = mean_of_ends(np.asarray(_rates(self.strand, points, z)), len(self.data.segments.t))
-            sides = _sides(self.strand, loaded(self.strand), points.y, views, self.options.curved)
+        if self._along is None or residual.stretch or self.strand.discontinuities.places:
+            strand = residual.adapted(self.strand)
+            points, z = _points(strand, residual, self.data)
+            views: _Views = jax.tree.map(np.asarray, _views(strand, points, z))
+            rates = mean_of_ends(np.asarray(_rates(strand, points, z)), len(self.data.segments.t))
+            sides = _sides(strand, loaded(strand), points.y, views, self.options.curved)
             self._along = views, rates, sides
         return self._along
 
+    def _moved(self, counting: _Counting) -> tuple[Float[Any, "S y"], _Counting]:
+        """Return the mean y_s of the segments by the nominal length, and the samples that count."""
+        segments, length, nodes = self.data.segments, float(self.strand.length), self.strand.nodes
+        if not self.linear:
+            return np.asarray(segments.slope) / length, counting
+        # y at the ends gives the mean rate only where no discontinuity is inside
+        counts = counting.shares * undivided(self.strand, segments.place)
+        if np.any(counts):
+            counting = counting._replace(shares=counts / np.mean(counts))
+        return (segments.y_next - segments.y) * ((nodes - 1) / length), counting
+
+    def _with_length(self, residual: Structured, counting: _Counting) -> Structured:
+        """Return the residual with its change of length, by the geometry alone."""
+        moved, counting = self._moved(counting)
+        strand = residual.adapted(self.strand)
+        points, z = _points(strand, residual, self.data)
+        factor, before = 1.0, 1.0 + float(residual.stretch)
+        for _ in range(MOST_CORRECTIONS):
+            values = _by_length(strand, points, z, factor)
+            rates, slopes = (mean_of_ends(np.asarray(part), len(moved)) for part in values)
+            change = _longer(strand, moved / before - rates, slopes, counting.shares)
+            factor += change
+            if abs(change) < LEAST:
+                break
+        return dataclasses.replace(residual, stretch=np.array(factor * before - 1.0))
+
     def _with_loads(self, residual: Structured, counting: _Counting) -> Structured:
-        """Return the residual with its stretch and its loads."""
+        """Return the residual with its loads."""
         knowledge, data, (views, rates, sides) = self.strand, self.data, self.along(residual)
-        segments, length = data.segments, float(knowledge.length)
+        moved, counting = self._moved(counting)
+        length = float(residual.adapted(knowledge).length)
         ds = length / (knowledge.nodes - 1)
-        if self.linear:
-            # y at the ends gives the mean rate only where no discontinuity is inside
-            moved = (segments.y_next - segments.y) * ((knowledge.nodes - 1) / length)
-            counts = counting.shares * undivided(knowledge, segments.place)
-            if np.any(counts):
-                counting = counting._replace(shares=counts / np.mean(counts))
-        else:
-            moved = np.asarray(segments.slope) / length
-        longer = _longer(knowledge, moved, rates, counting.shares)
-        missing = moved / longer - rates
+        moved = moved / (1.0 + residual.stretch)
+        missing = moved - rates
         if knowledge.mixed:
             missing = np.einsum("sij,sj->si", mean_of_ends(views.matrix, len(missing)), missing)
+        missing = missing / views.factor[: len(missing), None]
         floors = _floors(knowledge.y_layout, np.abs(rates) + np.abs(moved))
         floors = np.maximum(floors, TOLERANCE * np.asarray(knowledge.scales().y) / ds)
         where = knowledge.y_layout.indices(sides.layout.names)
         least = floors if self.linear else np.maximum(floors, data.doubt / length)
         load = _load(sides, missing[:, where], least[where], counting)
-        residual = dataclasses.replace(residual, stretch=np.array(longer - 1.0), load=load)
+        residual = dataclasses.replace(residual, load=load)
         # with two ends: strains on the near side of discontinuities, and the mean of A + c0 B, are not exact
         if self.linear and not (
             data.space.implicit and (knowledge.discontinuities.places or knowledge.mixed)
@@ -237,7 +284,7 @@ def _law_residual(knowledge: System, data: Samples) -> tuple[Any, Any, Any]:
 
     def one(sample: Samples) -> Any:
         point, z = start_point(knowledge, sample), sample.z
-        inputs = law_inputs(knowledge, point.s, point.control)(z, point.z_t(z))
+        inputs = Observed.of(knowledge).law_inputs(point.s, point.y, point.control)(z, point.z_t(z))
         # the derivative along z gives the size of the law's terms
         residual, size = jax.jvp(functools.partial(semi_discrete.law_residual, knowledge, point), (z,), (z,))
         return -residual, size, inputs
@@ -275,14 +322,27 @@ _rates = jax.jit(jax.vmap(semi_discrete.rates, in_axes=(None, 0, 0)))
 @jax.jit
 def _views(knowledge: System, points: Any, z: Any) -> _Views:
     def one(point: Any, z: Any) -> Any:
-        observables = Observed.of(knowledge).observables(
+        aspect = Observed.of(knowledge)
+        observables = aspect.observables(
             RodPoint(knowledge, point.s, point.t, point.y, point.y_t, point.control, z=z, z_t=point.z_t(z))
         )
         matrix = semi_discrete.load_matrix(knowledge, point, z) if knowledge.mixed else None
-        ambient = ambient_inputs(knowledge, point.control)
-        return _Views(jnp.concatenate([observables, ambient]), ambient, matrix)
+        ambient, factor = aspect.ambient(point.s, point.control), aspect.load_factor(point.s, point.control)
+        return _Views(jnp.concatenate([observables, ambient]), ambient, matrix, factor)
 
     return jax.vmap(one)(points, z)
+
+
+@jax.jit
+def _base_law(adapted: System, t: Any, control: Any, y: Any) -> tuple[Any, Any]:
+    """Return the change of what follows by a law at the base, and the arguments of the law."""
+    aspect = Observed.of(adapted)
+
+    def one(t: Any, control: Any, y: Any) -> Any:
+        change = y - adapted.base(t, control, unknowns_of(adapted, y))
+        return change[adapted.y_layout.indices(aspect.base_law)], aspect.base_inputs(y, control)
+
+    return jax.vmap(one)(t, control, y)
 
 
 @jax.jit
@@ -293,8 +353,8 @@ def _at_tip(adapted: System, data: TipSamples) -> tuple[Any, _Views]:
         point = tip_point(adapted, sample)
         conditions = adapted.tip(point.t, point.control, point.y, point.y_t)
         observables = tip_observables(adapted, point.y, point.y_t, point.control)
-        ambient = ambient_inputs(adapted, point.control)
-        return conditions, _Views(jnp.concatenate([observables, ambient]), ambient, None)
+        ambient = Observed.of(adapted).ambient(point.s, point.control)
+        return conditions, _Views(jnp.concatenate([observables, ambient]), ambient, None, 1.0)
 
     return jax.vmap(one)(data)
 
@@ -311,7 +371,7 @@ def _sides(system: System, layout: Layout, y: Any, views: _Views, curved: bool) 
         _Offer(expansion(inputs, views.material, form, layout.size), views.material)
         for form in forms[: 2 if curved else 1]
     ]
-    ambient = expansion(ambient_layout(system), views.ambient, {}, layout.size)
+    ambient = expansion(Observed.of(system).ambient_layout, views.ambient, {}, layout.size)
     rotations = {
         name: np.asarray(_rotations(jnp.asarray(system.y_layout.get(y, name))))
         for name in {field.frame for field in layout.fields if field.frame}
@@ -341,24 +401,36 @@ def _floors(layout: Layout, values: Float[Any, "S n"]) -> Float[Any, " n"]:
     return np.maximum(floors, 1e-300)
 
 
-def _longer(knowledge: System, moved: Any, rates: Any, shares: Any) -> float:
-    """Return the ratio of the rod's length to the nominal length, from the geometric rates."""
-    ratios, precisions = [], []
+@jax.jit
+def _by_length(knowledge: System, points: Any, z: Any, factor: Any) -> tuple[Any, Any]:
+    """Return y_s by the nominal length of a rod with its length times a factor, and the derivative by it."""
+
+    def rates(factor: Any) -> Any:
+        longer = with_length_factor(knowledge, factor)
+        there = points._replace(s=factor * points.s)
+        return factor * jax.vmap(semi_discrete.rates, in_axes=(None, 0, 0))(longer, there, z)
+
+    return jax.jvp(rates, (factor,), (jnp.ones(()),))
+
+
+def _longer(knowledge: System, missing: Any, slopes: Any, shares: Any) -> float:
+    """Return the change of a length factor that explains missing geometric rates; 0 within their noise."""
+    changes, precisions = [], []
     for name in knowledge.y_layout.names:
         if name in loaded(knowledge).names:
             continue
         where = knowledge.y_layout.slice(name)
-        r, d = rates[:, where], moved[:, where]
+        r, d = slopes[:, where], missing[:, where]
         size = np.sum(shares[:, None] * r * r)
         if size > 0.0:
-            ratio = np.sum(shares[:, None] * r * d) / size
-            remainder = np.sum(shares[:, None] * (d - ratio * r) ** 2) / d.size
-            ratios.append(ratio)
-            precisions.append(1.0 / (remainder / size + (LEAST * ratio) ** 2))
-    if not ratios:
-        return 1.0
-    ratio = float(np.average(ratios, weights=precisions))
-    return ratio if abs(ratio - 1.0) > 5.0 / np.sqrt(np.sum(precisions)) else 1.0
+            change = np.sum(shares[:, None] * r * d) / size
+            remainder = np.sum(shares[:, None] * (d - change * r) ** 2) / d.size
+            changes.append(change)
+            precisions.append(1.0 / (remainder / size + LEAST**2))
+    if not changes:
+        return 0.0
+    change = float(np.average(changes, weights=precisions))
+    return change if abs(change) > 5.0 / np.sqrt(np.sum(precisions)) else 0.0
 
 
 # regressions of a load or a stress

@@ -26,7 +26,6 @@ from collections.abc import Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -34,7 +33,7 @@ from jaxtyping import Float
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.aspects import Ends, Observed
 from knode_cosserat.rods.law import StressedLaw
-from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import with_length_factor
@@ -189,13 +188,15 @@ class Structured(Residual):
 
     linear_in: ClassVar[tuple[str, ...]] = (
         "stretch", "stress.weights", "load.material.weights", "load.ambient.weights",
-        "tip_load.material.weights", "tip_load.ambient.weights",
+        "tip_load.material.weights", "tip_load.ambient.weights", "at_base.weights",
     )  # fmt: skip
 
     stretch: Float[Any, ""]
     stress: Expansion | None
     load: Load | None
     tip_load: Load | None
+    #: change of what follows from the unknowns at the base by a law (`Observed.base_law`)
+    at_base: Expansion | None = None
 
     def adapted(self, knowledge: System) -> System:
         """Return the nominal model with corrected length."""
@@ -206,7 +207,7 @@ class Structured(Residual):
         law, stress = knowledge.constitutive(s, t, y, y_t, control), self.stress
         if stress is None:
             return law
-        inputs = law_inputs(knowledge, s, control)
+        inputs = Observed.of(knowledge).law_inputs(s, y, control)
         return StressedLaw(law, lambda z, z_t: stress(inputs(z, z_t)), not stress.curved)
 
     def balance(
@@ -216,18 +217,26 @@ class Structured(Residual):
         balance = knowledge.balance(s, t, y, y_t, z, z_t, control)
         if self.load is None:
             return balance
-        observed = None
+        aspect, observed = Observed.of(knowledge), None
         if self.load.material is not None:
-            observed = Observed.of(knowledge).observables(
-                RodPoint(knowledge, s, t, y, y_t, control, z=z, z_t=z_t)
-            )
-        layout, inputs = loaded(knowledge), ambient_inputs(knowledge, control)
-        load = self.load(layout, knowledge.y_layout, y, observed, inputs)
+            observed = aspect.observables(RodPoint(knowledge, s, t, y, y_t, control, z=z, z_t=z_t))
+        layout = loaded(knowledge)
+        load = self.load(layout, knowledge.y_layout, y, observed, aspect.ambient(s, control))
+        load = load * aspect.load_factor(s, control)
         load = jnp.zeros(y.shape[0]).at[knowledge.y_layout.indices(layout.names)].set(load)
         if not isinstance(balance, tuple):
             return balance + load
         A, B, f1 = balance
         return A, B, f1 + load
+
+    def base(self, knowledge: System, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
+        """Return the nominal model's y at the base with the learned change of what follows by a law."""
+        y, aspect = knowledge.base(t, control, unknowns), Observed.of(knowledge)
+        if self.at_base is None:
+            return y
+        change = self.at_base(aspect.base_inputs(y, control))
+        old = y[knowledge.y_layout.indices(aspect.base_law)]
+        return knowledge.y_layout.replaced(y, aspect.base_law, old + change)
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
@@ -237,16 +246,8 @@ class Structured(Residual):
         if self.tip_load is None:
             return conditions
         observed = tip_observables(knowledge, y, y_t, control)
-        inputs = ambient_inputs(knowledge, control)
+        inputs = Observed.of(knowledge).ambient(knowledge.length, control)
         return conditions + self.tip_load(Ends.of(knowledge).layout, knowledge.y_layout, y, observed, inputs)
-
-
-def law_inputs(knowledge: System, s: Any, control: Any) -> Any:
-    """Return a function of z and z_t: the inputs of stress, scaled by the local factors of the section."""
-    observed = Observed.of(knowledge)
-    rest, factors = observed.unstressed(s, control), observed.law_factors(s, control)
-    strain, rate = (1.0, 1.0) if factors is None else factors
-    return lambda z, z_t: jnp.concatenate([(z - rest) * strain, z_t * rate])
 
 
 def tip_observables(knowledge: System, y: Float[Any, " y"], y_t: Any, control: Any) -> Any:
@@ -265,20 +266,4 @@ def loaded(knowledge: System) -> Layout:
 
 def material_layout(knowledge: System) -> Layout:
     """Return the input layout of a material-frame load: the observables, and the ambient inputs."""
-    return Observed.of(knowledge).layout + ambient_layout(knowledge)
-
-
-def ambient_layout(knowledge: System) -> Layout:
-    """Return the input layout of an ambient load: the control, and its actuation if that differs."""
-    if not Observed.of(knowledge).has_actuation:
-        return knowledge.control_layout
-    size = jax.eval_shape(Observed.of(knowledge).actuation, np.zeros(knowledge.control_layout.size)).shape[0]
-    actuation = Field("actuation", size, "", "part of the control that enters the equations")
-    return knowledge.control_layout + Layout(actuation)
-
-
-def ambient_inputs(knowledge: System, control: Any) -> Any:
-    """Return the numbers laid out by `ambient_layout`."""
-    if not Observed.of(knowledge).has_actuation:
-        return control
-    return jnp.concatenate([control, Observed.of(knowledge).actuation(control)])
+    return Observed.of(knowledge).layout + Observed.of(knowledge).ambient_layout
