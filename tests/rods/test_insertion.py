@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.learning.config import NetworkOptions
@@ -32,6 +33,35 @@ def rod(**changes):
 
 def rest(robot, *control):
     return kc.equilibrium(robot, list(control), space="lobatto4")
+
+
+# a stiff arm that turns while it is fed
+
+
+def eased(time, start=0.1):
+    """Integral of a rate that rises smoothly from 0 to 1 until `start` (s)."""
+    x = time / start
+    return start * np.where(x < 1.0, x**6 - 3.0 * x**5 + 2.5 * x**4, x - 0.5)
+
+
+def test_material_that_moves_along_a_turning_arm_has_coriolis_forces():
+    rate, speed, radius = 3.0, 0.5, 0.01
+    arm = rod(
+        radius=radius, youngs_modulus=2e12, bending_damping=40.0, shear_damping=2e4, nodes=7,
+        base_end=Driven(axes=("rx",)),
+    )  # fmt: skip
+    way = eased(2e-3 * np.arange(1, 101))
+    turning = kc.simulate(
+        arm, np.stack([rate * way, speed * way], axis=1), 2e-3, time="bdf2", space="lobatto4"
+    )
+    y, get = turning.y[-1, 0], arm.y_layout.get
+    R = Rotation.from_quat(get(y, "h"), scalar_first=True).as_matrix()
+    n, m = R.T @ get(y, "n"), R.T @ get(y, "m")
+    mass, inertia, exposed = DENSITY * np.pi * radius**2, DENSITY * np.pi * radius**4 / 4, L + speed * way[-1]
+    # 2 Ω × c d₃ of every point; n and m are without the momentum that comes through the hole
+    assert n[1] == pytest.approx(2.0 * mass * rate * speed * exposed, rel=1e-5)
+    assert m[0] + speed * inertia * rate == pytest.approx(-mass * rate * speed * exposed**2, rel=1e-5)
+    assert n[2] + mass * speed**2 == pytest.approx(0.5 * mass * rate**2 * exposed**2, rel=1e-5)
 
 
 # statics
