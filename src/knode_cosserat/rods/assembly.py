@@ -139,7 +139,11 @@ class Assembly(System):
         if not self.rods:
             raise ParameterError("rods is []; allowed is one or more")
         for name in names:
-            if not name or names.count(name) > 1:
+            if not name:
+                raise ParameterError(
+                    "a rod or a body has no name; allowed is one for each, such as name: arm"
+                )
+            if names.count(name) > 1:
                 raise ParameterError(
                     f"{names.count(name)} of the rods and bodies have the name {name!r}; "
                     "allowed is another name for each"

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.strands import in_strands, strand_of
+from knode_cosserat.rods.strands import of_rods
 from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalised
 from knode_cosserat.statics.stability import checked_equilibrium
 from knode_cosserat.trajectory import Trajectory
@@ -82,5 +82,5 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
             other = shapes[same].reshape(shape.shape)
             shape = shape - other * np.vdot(other, shape) / np.vdot(other, other)
         shapes.append(normalised(shape))
-    p = in_strands(system, y)[..., strand_of(system).y_layout.slice("p")]
+    p = of_rods(system, y, "p")
     return Modes(values, error, np.stack(shapes), p[:, 0] if p.shape[1] == 1 else p)
