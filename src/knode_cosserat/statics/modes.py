@@ -45,9 +45,11 @@ class Modes:
         return -self.values.real / np.where(size > 0.0, size, 1.0)
 
     def __repr__(self) -> str:
-        rows = zip(self.frequency, self.damping, self.error, strict=True)
-        lines = [f"{k + 1:4}  {f:13.6g}  {d:13.4g}  {e:8.1g}" for k, (f, d, e) in enumerate(rows)]
-        return "\n".join(["mode  frequency, Hz  damping ratio     error", *lines])
+        rows = zip(self.frequency, self.damping, self.values.real, self.error, strict=True)
+        lines = [
+            f"{k:4}  {f:13.6g}  {d:13.4g}  {g:16.5g}  {e:14.1g}" for k, (f, d, g, e) in enumerate(rows, 1)
+        ]
+        return "\n".join(["mode  frequency, Hz  damping ratio  growth rate, 1/s  relative error", *lines])
 
 
 def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
