@@ -183,17 +183,16 @@ class _Regressions:
 
     def _with_stress(self, residual: Structured, counting: _Counting) -> Structured:
         """Return the residual with its stress, of the constitutive law."""
-        offers, targets = self._law(float(residual.stretch))
+        stretch = float(residual.stretch)
+        # seeds with the same length share them
+        if stretch not in self._laws:
+            self._laws = {stretch: self._law(stretch)}
+        offers, targets = self._laws[stretch]
         stress, _ = _best(offers, np.ones((len(counting.shares), 1)), targets, counting)
         return dataclasses.replace(residual, stress=stress)
 
     def _law(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
-        """Return features and targets of the constitutive law; seeds with the same length share them."""
-        if stretch not in self._laws:
-            self._laws = {stretch: self._law_by_length(stretch)}
-        return self._laws[stretch]
-
-    def _law_by_length(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
+        """Return features and targets of the constitutive law."""
         strand = with_length_factor(self.strand, 1.0 + stretch)
         values, size, inputs = map(np.asarray, _law_residual(strand, self.data.segments))
         layout, both = strand.z_layout, Observed.of(strand).law_layout
