@@ -46,9 +46,8 @@ class Modes:
 
     def __repr__(self) -> str:
         rows = zip(self.frequency, self.damping, self.values.real, self.error, strict=True)
-        lines = [
-            f"{k:4}  {f:13.6g}  {d:13.4g}  {g:16.5g}  {e:14.1g}" for k, (f, d, g, e) in enumerate(rows, 1)
-        ]
+        form = "{:4}  {:13.6g}  {:13.4g}  {:16.5g}  {:14.1g}".format
+        lines = [form(k, *row) for k, row in enumerate(rows, 1)]
         return "\n".join(["mode  frequency, Hz  damping ratio  growth rate, 1/s  relative error", *lines])
 
 

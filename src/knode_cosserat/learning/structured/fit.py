@@ -166,12 +166,11 @@ class _Regressions:
         aspect, data = Observed.of(self.knowledge), self.data.segments
         if not aspect.base_law:
             return None
-        first = data.place == 0.0
-        at_base = jax.tree.map(lambda values: values[first], (data.t, data.control, data.y))
+        first, parts = data.place == 0.0, ((data.t, data.control, data.y), counting)
+        at_base, counts = jax.tree.map(lambda values: values[first], parts)
         missing, inputs = map(np.asarray, _base_law(residual.adapted(self.knowledge), *at_base))
         offer = _Offer(expansion(aspect.base_layout, inputs, {}, missing.shape[1]), inputs)
         target = _Target(missing, None, np.full(missing.shape[1], TOLERANCE))
-        counts = _Counting(*(part[first] for part in counting))
         return _best([offer], np.ones((len(missing), 1)), [target], counts)[0]
 
     def _counting(self, data: Samples | TipSamples, seed: int) -> _Counting:
