@@ -341,7 +341,8 @@ def curves(
 def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
     """Return a figure of the first modes of `kc.statics.modes`: both extremes about the equilibrium.
 
-    The largest displacement is drawn as a quarter of the robot's extent. Titles have frequency and damping.
+    The largest displacement is drawn as a quarter of the robot's extent. Titles have frequency and damping,
+    or the growth rate of a motion without oscillation.
     """
     if count < 1 or not len(modes.values):
         raise ValueError(f"count is {count} of {len(modes.values)} modes; allowed is 1 or more")
@@ -365,8 +366,10 @@ def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
                 for curve in np.swapaxes(points, 0, 1):
                     seen.axes.plot(*seen.of(curve), **look)
             seen.frame(np.concatenate([*ends, still]).reshape(-1, 3), zoom=0.8)
-            title = f"{k + 1}: {modes.frequency[k]:.4g} Hz, damping {modes.damping[k]:.2g}"
-            seen.axes.set_title(title)
+            title = f"{modes.frequency[k]:.4g} Hz, damping {modes.damping[k]:.2g}"
+            if not modes.frequency[k]:
+                title = f"growth rate {modes.values[k].real:.3g} 1/s"
+            seen.axes.set_title(f"{k + 1}: {title}")
     return figure
 
 

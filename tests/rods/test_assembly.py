@@ -13,6 +13,7 @@ from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.robot_file import format_robot, parse_robot
+from knode_cosserat.solvers.simulate import check_limits
 
 L, RADIUS, E, DENSITY = 0.3, 4e-3, 2e9, 1000.0
 EI = E * np.pi * RADIUS**4 / 4
@@ -287,8 +288,8 @@ def test_bodies_and_rods_are_at_rest_where_they_are_joined():
 ARM, HAND = rod("arm"), RigidBody(name="hand")
 WRONG = {
     "rods is \\[\\]; allowed is one or more": lambda: Assembly(),
+    "a rod or a body has no name": lambda: Assembly(rods=(ARM,), bodies=(RigidBody(),)),
     "2 of the rods and bodies have the name 'arm'": lambda: Assembly(rods=(ARM, ARM)),
-    "have the name ''; allowed": lambda: Assembly(rods=(ARM.replace(name=""),)),
     "arm.tip_end.body is 'hnad'; allowed is hand; did you mean hand": lambda: Assembly(
         rods=(ARM.replace(tip_end=on("hnad")),), bodies=(HAND,)
     ),
@@ -317,3 +318,9 @@ def test_what_is_wrong_is_named_in_one_line(words):
     with pytest.raises(ParameterError, match=words) as raised:
         WRONG[words]()
     assert "\n" not in str(raised.value)
+
+
+def test_a_tendon_of_a_rod_that_would_push_is_told():
+    robot = kc.load_robot("three-finger-gripper")
+    with pytest.warns(UserWarning, match="a tension is -1 N: a tendon only pulls"):
+        check_limits(robot, np.array([0.0, 0.0, 0.0, -1.0, 0.0, 0.0]))

@@ -253,7 +253,7 @@ def test_a_rod_in_the_frame_moves_as_one_with_a_turning_base():
 def test_without_damping_energy_less_spin_times_angular_momentum_is_constant():
     """Jacobi's integral, of order 4 along the rod; relative to the change of the elastic energy."""
     drift, steps = [], 200
-    spin, J = np.array([0.0, 0.0, 15.0]), 1000.0 * np.asarray(rod().section.inertia)
+    spin, J = np.array([0.0, 0.0, 15.0]), np.asarray(rod().section.rhoJ)
     for nodes in (21, 41):
         robot = rod(
             SpinningFrame(15.0), nodes=nodes,

@@ -2,6 +2,8 @@
 
 import dataclasses
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -18,6 +20,7 @@ from knode_cosserat.rods.ends import Driven, End
 from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Load, PointWrench
 from knode_cosserat.rods.parameters import Choice, kinds_of, parameters_of, stated_of
+from knode_cosserat.rods.parts import Part
 from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.routing import FunctionRouting, Routing
@@ -325,3 +328,14 @@ def test_models_of_robots_with_parts_come_back(tmp_path, name):
 def test_the_virtual_robot_may_have_parts_too():
     robot = VirtualRobot(**BODY, tendon_offset=0.01, tendon_angles=[0.0], loads=(AttachedMass(mass=0.1),))
     assert_equal(parse_robot(format_robot(robot), "here"), robot)
+
+
+def test_files_are_read_by_a_fresh_process_with_every_kind():
+    """A kind that only another module registers would be unknown there."""
+    code = (
+        "from knode_cosserat.rods.parameters import kinds_of; import knode_cosserat.rods.robot_file;"
+        "from knode_cosserat.rods.parts import Part; print(*kinds_of(Part))"
+    )
+    listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    own = {name for name, cls in kinds_of(Part).items() if cls.__module__.startswith("knode_cosserat.rods")}
+    assert own <= {*listed.split()}

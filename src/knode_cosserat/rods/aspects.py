@@ -107,6 +107,9 @@ class Observed(_Aspect):
 
     #: velocities among the observables, on which drag and friction depend; empty: not specified
     velocities: ClassVar[tuple[str, ...]] = ()
+    #: fields of y at the base that follow from its unknowns by a law, and the arguments of that law
+    base_law: ClassVar[tuple[str, ...]] = ()
+    base_layout: ClassVar[Layout] = Layout()
 
     @property
     def layout(self) -> Layout:
@@ -165,10 +168,6 @@ class Observed(_Aspect):
     def load_factor(self, s: Any, control: Any) -> Any:
         """Return the rate of arclength along the grid, by which a load per length acts on y_s."""
         return 1.0
-
-    #: fields of y at the base that follow from its unknowns by a law, and the arguments of that law
-    base_law: ClassVar[tuple[str, ...]] = ()
-    base_layout: ClassVar[Layout] = Layout()
 
     def base_inputs(self, y: Float[Any, " y"], control: Any) -> Float[Any, " b"]:
         """Return the arguments of the law at the base."""

@@ -139,7 +139,11 @@ class Assembly(System):
         if not self.rods:
             raise ParameterError("rods is []; allowed is one or more")
         for name in names:
-            if not name or names.count(name) > 1:
+            if not name:
+                raise ParameterError(
+                    "a rod or a body has no name; allowed is one for each, such as name: arm"
+                )
+            if names.count(name) > 1:
                 raise ParameterError(
                     f"{names.count(name)} of the rods and bodies have the name {name!r}; "
                     "allowed is another name for each"
@@ -478,6 +482,9 @@ class _AssemblyObserved(Observed, of=Assembly):
     def _rods(self) -> list[Any]:
         return [Observed.of(rod) for rod in self.system.members]
 
+    def _points(self, point: RodPoint) -> Any:
+        return zip(self._rods, self.system.points(point), strict=True)
+
     @property
     def velocities(self) -> tuple[str, ...]:  # type: ignore[override]
         """Velocities of all rods."""
@@ -491,8 +498,7 @@ class _AssemblyObserved(Observed, of=Assembly):
 
     def observables(self, point: RodPoint) -> Float[Any, " o"]:
         """Return the observables of all rods."""
-        points = zip(self._rods, self.system.points(point), strict=True)
-        return jnp.concatenate([own.observables(at) for own, at in points])
+        return jnp.concatenate([rod.observables(at) for rod, at in self._points(point)])
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return the actuation of all rods."""
@@ -506,19 +512,15 @@ class _AssemblyObserved(Observed, of=Assembly):
 
     def unstressed(self, s: Any, control: Any) -> Float[Any, " z"]:
         """Return z of the unstressed rods."""
-        parts = zip(
-            self._rods, self.system.points(RodPoint(self.system, s, None, None, None, control)), strict=True
-        )
-        return jnp.concatenate([own.unstressed(at.s, at.control) for own, at in parts])
+        points = self._points(RodPoint(self.system, s, None, None, None, control))
+        return jnp.concatenate([rod.unstressed(at.s, at.control) for rod, at in points])
 
     def law_factors(self, s: Any, control: Any) -> tuple[Any, Any] | None:
         """Return the factors of all rods; None if all are uniform."""
-        parts = zip(
-            self._rods, self.system.points(RodPoint(self.system, s, None, None, None, control)), strict=True
-        )
-        factors = [
-            own.law_factors(at.s, at.control) or (np.ones(at.rod.z_layout.size),) * 2 for own, at in parts
-        ]
         if all(rod.is_uniform for rod in self.system.members):
             return None
+        factors = [
+            rod.law_factors(at.s, at.control) or (np.ones(at.rod.z_layout.size),) * 2
+            for rod, at in self._points(RodPoint(self.system, s, None, None, None, control))
+        ]
         return tuple(jnp.concatenate(each) for each in zip(*factors, strict=True))  # type: ignore[return-value]

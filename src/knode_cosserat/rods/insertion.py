@@ -25,7 +25,6 @@ from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.law import Fields, MaterialLaw
@@ -145,19 +144,20 @@ class Insertion(Effect):
             law = law.with_strain(name, carried.soften(c * c * mass))
         return law
 
-    def along_grid(self, point: RodPoint, y_s: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return the rates along the grid, with the material that moves along it."""
+    def arclength_rate(self, point: RodPoint) -> Any:
+        """Return ℓ/L."""
+        return 1.0 + point.input[0] / point.rod.length
+
+    def rates(self, point: RodPoint) -> Fields:
+        """Return the terms of the material that moves along the grid."""
         exposed, feed, v, u = (point.get(name) for name in ("exposed", "feed", "v", "u"))
         motion, c, growth = point.motion, self.speed(point, point.y), feed / exposed
         R, P = rotation_matrix(point.get("h")), point.material.rhoA * motion.q
         H = dot(point.material.rhoJ, motion.w)
         # in the balance ω × P has the motion of the material, here c u too much
-        more = jnp.concatenate([
-            np.zeros(7),
-            dot(R, growth * P - c * cross(u, P)),
-            dot(R, growth * H - c * (cross(u, H) + cross(v, P))),
-            growth * v,
-            growth * u,
-            np.zeros(y_s.shape[0] - 19),
-        ])  # fmt: skip
-        return (y_s + more) * (exposed / point.rod.length)
+        return {
+            "n": dot(R, growth * P - c * cross(u, P)),
+            "m": dot(R, growth * H - c * (cross(u, H) + cross(v, P))),
+            "q": growth * v,
+            "w": growth * u,
+        }

@@ -142,12 +142,12 @@ class Contribution:
         return None
 
     def rates(self, point: RodPoint) -> Fields:
-        """Return the rates along the rod of the part's fields of y."""
+        """Return the rates along the rod of the part's fields of y, and terms in the rod's own, such as n."""
         return {}
 
-    def along_grid(self, point: RodPoint, y_s: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return the rates along the grid from those along the rod; by default they are the same."""
-        return y_s
+    def arclength_rate(self, point: RodPoint) -> Any:
+        """Return the rate of arclength along the grid, from the controls."""
+        return 1.0
 
     def tip_rows(self, point: RodPoint) -> Any:
         """Return the residuals of the part's conditions at the tip, one number a row; None without any."""

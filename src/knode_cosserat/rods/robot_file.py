@@ -27,7 +27,7 @@ import numpy as np
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.rods import chambers, fluids, insertion, magnets  # noqa: F401 (files name their kinds)
+from knode_cosserat.rods import chambers, fluids, frame, insertion, magnets  # noqa: F401 (files name their kinds)
 from knode_cosserat.rods.assembly import Assembly
 from knode_cosserat.rods.ends import End
 from knode_cosserat.rods.parallel_robot import ParallelRobot

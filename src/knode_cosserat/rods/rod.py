@@ -11,6 +11,7 @@ as in the paper's table of notations. `tendon_robots` adds tendons.
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any, ClassVar
 
 import jax.numpy as jnp
@@ -395,22 +396,22 @@ class SlenderRod(System):
             dragged = dragged + dot(self.linear_drag, q)
 
         p_s = dot(R, v)
-        h_s = quaternion_rate(h, u)
         n_s = dot(R, rhoA * (cross(w, q) + q_t) + dragged) - rhoA * self.seen(t, self.gravity)
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
-        q_s = v_t - cross(u, relative.q) + cross(relative.w, v)
-        w_s = u_t - cross(u, relative.w)
-        rates: Fields = {}
+        rates: Fields = {
+            "p": p_s, "h": quaternion_rate(h, u), "n": n_s, "m": m_s,
+            "q": v_t - cross(u, relative.q) + cross(relative.w, v), "w": u_t - cross(u, relative.w),
+        }  # fmt: skip
         parts = self.at_parts(point)
         for part, at in parts:
             load = part.load(at)
             if load is not None:
-                n_s, m_s = n_s - self.seen(t, load.force), m_s - self.seen(t, load.moment)
-            rates |= part.rates(at)
-        y_s = jnp.concatenate([p_s, h_s, n_s, m_s, q_s, w_s, *_ordered(rates, self.y_layout)])
-        for part, at in parts:
-            y_s = part.along_grid(at, y_s)
-        return y_s
+                rates["n"] = rates["n"] - self.seen(t, load.force)
+                rates["m"] = rates["m"] - self.seen(t, load.moment)
+            for name, rate in part.rates(at).items():
+                rates[name] = rates[name] + rate if name in rates else rate
+        y_s = jnp.concatenate(_ordered(rates, self.y_layout, 0))
+        return y_s * math.prod(part.arclength_rate(at) for part, at in parts)
 
     # discontinuities: places where something begins, ends or pulls
 
@@ -609,6 +610,11 @@ class RodObserved(Observed, of=SlenderRod):
         acceleration, spin = cross(w, q) + q_t, cross(w, dot(J, w)) + dot(J, w_t)
         bent = strains.get(point.z, "u") - material.u_star
         return jnp.concatenate([acceleration, spin, q, w, bent, strains.get(point.z_t, "u")])
+
+    def load_factor(self, s: Any, control: Any) -> Any:
+        """Return the rate of arclength along the grid."""
+        parts = self.system.at_parts(RodPoint(self.system, s, None, None, None, control))
+        return math.prod(part.arclength_rate(point) for part, point in parts)
 
     def actuation(self, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return the controls of the parts in the form in which they enter the equations."""

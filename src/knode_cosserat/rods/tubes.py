@@ -210,9 +210,9 @@ class _Tubes(CrossSection):
         straight = self.values("transmission") - point.input[1::2]
         return {"angle": point.input[::2] + straight * self.torsions(point) / self.GJ}
 
-    def along_grid(self, point: RodPoint, y_s: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return the rates times that of arclength along the grid."""
-        return y_s * self.arclength(point.rod, point.s, point.input)[1]
+    def arclength_rate(self, point: RodPoint) -> Any:
+        """Return the rate of arclength along the grid."""
+        return self.arclength(point.rod, point.s, point.input)[1]
 
     def rest_curvatures(self, point: RodPoint) -> tuple[Any, Any]:
         """Return 1 for each tube that is present, and κᵢ (n, 2) in the frame of the rod."""
@@ -228,18 +228,23 @@ class _Tubes(CrossSection):
         stress = jnp.concatenate([u.stress[:2] + moment, jnp.zeros(1)])
         return law.with_strain("u", u._replace(stress=stress))
 
+    def turning(self, point: RodPoint) -> tuple[Any, Any, Any]:
+        """Return τᵢ of tubes that are present, d₃·(u × κᵢ), and the relative spin of present neighbours."""
+        (presence, curvatures), u = self.rest_curvatures(point), point.get("u")
+        torque = u[0] * curvatures[:, 1] - u[1] * curvatures[:, 0]
+        spin = point.rod.y_layout.get(point.y_t, "angle")
+        sliding = presence[1:] * presence[:-1] * (spin[1:] - spin[:-1])
+        return presence * self.torsions(point), torque, sliding
+
     def rates(self, point: RodPoint) -> Fields:
         """Return θᵢ_s and τᵢ_s."""
-        (presence, curvatures), u = self.rest_curvatures(point), point.get("u")
-        turned = {"angle": presence * self.torsions(point) / self.GJ}
+        torsion, torque, sliding = self.turning(point)
+        turned = {"angle": torsion / self.GJ}
         if len(self.tubes) == 1:
             return turned
-        torque = self.EI * (u[0] * curvatures[:, 1] - u[1] * curvatures[:, 0])
-        spin = point.rod.y_layout.get(point.y_t, "angle")
-        # between neighbours that are both present
-        sliding = self.friction * presence[1:] * presence[:-1] * (spin[1:] - spin[:-1])
-        dragged = jnp.concatenate([sliding, jnp.zeros(1)]) - jnp.concatenate([jnp.zeros(1), sliding])
-        return turned | {"torsion": (torque - dragged)[1:]}
+        drag, none = self.friction * sliding, jnp.zeros(1)
+        dragged = jnp.concatenate([drag, none]) - jnp.concatenate([none, drag])
+        return turned | {"torsion": (self.EI * torque - dragged)[1:]}
 
 
 class ConcentricTubeRobot(SlenderRod):
@@ -302,9 +307,12 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
     system: ConcentricTubeRobot
     base_law: ClassVar[tuple[str, ...]] = ("angle",)
 
-    def _point(self, s: Any, y: Any, control: Any, **others: Any) -> tuple[_Tubes, RodPoint]:
-        point = RodPoint(self.system, s, None, y, None, control)._replace(**others)
-        return next((part, at) for part, at in self.system.at_parts(point) if isinstance(part, _Tubes))
+    def _point(self, s: Any, y: Any, control: Any) -> tuple[_Tubes, RodPoint]:
+        return self._tubes(RodPoint(self.system, s, None, y, None, control))
+
+    def _tubes(self, point: RodPoint) -> tuple[_Tubes, RodPoint]:
+        parts = self.system.at_parts(point._replace(rod=self.system))
+        return next((part, at) for part, at in parts if isinstance(part, _Tubes))
 
     @property
     def layout(self) -> Layout:
@@ -318,19 +326,14 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
 
     def observables(self, point: RodPoint) -> Float[Any, " o"]:
         """Return those of a rod, and torsion, torque and sliding of the tubes."""
-        tubes, at = self._point(point.s, point.y, point.control, y_t=point.y_t, z=point.z, z_t=point.z_t)
-        (presence, curvatures), u = tubes.rest_curvatures(at), at.get("u")
-        torque = u[0] * curvatures[:, 1] - u[1] * curvatures[:, 0]
-        spin = self.system.y_layout.get(point.y_t, "angle")
-        sliding = presence[1:] * presence[:-1] * (spin[1:] - spin[:-1])
-        own = [presence * tubes.torsions(at), torque, sliding]
-        return jnp.concatenate([super().observables(point), *own])
+        tubes, at = self._tubes(point)
+        return jnp.concatenate([super().observables(point), *tubes.turning(at)])
 
     @property
     def ambient_layout(self) -> Layout:
         """Layout of `ambient`: the innermost tube, which is always present, adds nothing to a constant."""
-        meaning = "1 for each tube but the first that is present"
-        return super().ambient_layout + Layout(("presence", len(self.system.tubes) - 1, "1", meaning))
+        n, meaning = len(self.system.tubes) - 1, "1 for each tube but the first that is present"
+        return super().ambient_layout + Layout(*((("presence", n, "1", meaning),) if n else ()))
 
     def ambient(self, s: Any, control: Float[Any, " c"]) -> Float[Any, " a"]:
         """Return the control, and 1 for each tube but the first that is present."""
@@ -358,11 +361,6 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
             return jnp.concatenate([inputs(z, z_t), stretched.reshape(-1), bent.reshape(-1)])
 
         return strains
-
-    def load_factor(self, s: Any, control: Any) -> Any:
-        """Return the rate of arclength along the grid."""
-        tubes, at = self._point(s, None, control)
-        return tubes.arclength(self.system, s, at.input)[1]
 
     @property
     def base_layout(self) -> Layout:  # type: ignore[override]

@@ -268,8 +268,10 @@ def check_limits(system: System, controls: Any) -> None:
     beyond = layout.beyond(controls)
     if beyond:
         raise ValueError(f"controls: {beyond}")
-    if "tension" in layout.names:
-        tension = np.asarray(layout.get(controls, "tension"))
+    # also of the rods of an assembly, such as thumb_tension
+    pulling = tuple(name for name in layout.names if name.rpartition("_")[2] == "tension")
+    if pulling:
+        tension = np.asarray(controls)[..., layout.indices(pulling)]
         # measured tensions may be slightly negative
         if np.min(tension) < -PUSHING * np.max(np.abs(tension)):
             warnings.warn(

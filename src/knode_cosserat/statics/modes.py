@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.strands import in_strands, strand_of
+from knode_cosserat.rods.strands import of_rods
 from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalised
 from knode_cosserat.statics.stability import checked_equilibrium
 from knode_cosserat.trajectory import Trajectory
@@ -45,9 +45,10 @@ class Modes:
         return -self.values.real / np.where(size > 0.0, size, 1.0)
 
     def __repr__(self) -> str:
-        rows = zip(self.frequency, self.damping, self.error, strict=True)
-        lines = [f"{k + 1:4}  {f:13.6g}  {d:13.4g}  {e:8.1g}" for k, (f, d, e) in enumerate(rows)]
-        return "\n".join(["mode  frequency, Hz  damping ratio     error", *lines])
+        rows = zip(self.frequency, self.damping, self.values.real, self.error, strict=True)
+        form = "{:4}  {:13.6g}  {:13.4g}  {:16.5g}  {:14.1g}".format
+        lines = [form(k, *row) for k, row in enumerate(rows, 1)]
+        return "\n".join(["mode  frequency, Hz  damping ratio  growth rate, 1/s  relative error", *lines])
 
 
 def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
@@ -82,5 +83,5 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
             other = shapes[same].reshape(shape.shape)
             shape = shape - other * np.vdot(other, shape) / np.vdot(other, other)
         shapes.append(normalised(shape))
-    p = in_strands(system, y)[..., strand_of(system).y_layout.slice("p")]
+    p = of_rods(system, y, "p")
     return Modes(values, error, np.stack(shapes), p[:, 0] if p.shape[1] == 1 else p)

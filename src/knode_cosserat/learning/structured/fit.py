@@ -166,12 +166,11 @@ class _Regressions:
         aspect, data = Observed.of(self.knowledge), self.data.segments
         if not aspect.base_law:
             return None
-        first = data.place == 0.0
-        at_base = jax.tree.map(lambda values: values[first], (data.t, data.control, data.y))
+        first, parts = data.place == 0.0, ((data.t, data.control, data.y), counting)
+        at_base, counts = jax.tree.map(lambda values: values[first], parts)
         missing, inputs = map(np.asarray, _base_law(residual.adapted(self.knowledge), *at_base))
         offer = _Offer(expansion(aspect.base_layout, inputs, {}, missing.shape[1]), inputs)
         target = _Target(missing, None, np.full(missing.shape[1], TOLERANCE))
-        counts = _Counting(*(part[first] for part in counting))
         return _best([offer], np.ones((len(missing), 1)), [target], counts)[0]
 
     def _counting(self, data: Samples | TipSamples, seed: int) -> _Counting:
@@ -183,17 +182,16 @@ class _Regressions:
 
     def _with_stress(self, residual: Structured, counting: _Counting) -> Structured:
         """Return the residual with its stress, of the constitutive law."""
-        offers, targets = self._law(float(residual.stretch))
+        stretch = float(residual.stretch)
+        # seeds with the same length share them
+        if stretch not in self._laws:
+            self._laws = {stretch: self._law(stretch)}
+        offers, targets = self._laws[stretch]
         stress, _ = _best(offers, np.ones((len(counting.shares), 1)), targets, counting)
         return dataclasses.replace(residual, stress=stress)
 
     def _law(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
-        """Return features and targets of the constitutive law; seeds with the same length share them."""
-        if stretch not in self._laws:
-            self._laws = {stretch: self._law_by_length(stretch)}
-        return self._laws[stretch]
-
-    def _law_by_length(self, stretch: float) -> tuple[list[_Offer], list[_Target]]:
+        """Return features and targets of the constitutive law."""
         strand = with_length_factor(self.strand, 1.0 + stretch)
         values, size, inputs = map(np.asarray, _law_residual(strand, self.data.segments))
         layout, both = strand.z_layout, Observed.of(strand).law_layout

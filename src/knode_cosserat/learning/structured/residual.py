@@ -234,9 +234,9 @@ class Structured(Residual):
         y, aspect = knowledge.base(t, control, unknowns), Observed.of(knowledge)
         if self.at_base is None:
             return y
+        values = y[knowledge.y_layout.indices(aspect.base_law)]
         change = self.at_base(aspect.base_inputs(y, control))
-        old = y[knowledge.y_layout.indices(aspect.base_law)]
-        return knowledge.y_layout.replaced(y, aspect.base_law, old + change)
+        return knowledge.y_layout.replaced(y, aspect.base_law, values + change)
 
     def tip(
         self, knowledge: System, t: Any, control: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]
