@@ -103,6 +103,9 @@ def others() -> dict[str, float]:
         "three-tube-robot": np.sin(np.pi / 2.0 * t) * np.array([1.0, -0.02, -0.5, 0.01, 0.5, -0.02]),
         "magnetic-catheter": 5e-3 * np.sin(np.pi / 2.0 * t + np.array([0.0, np.pi / 2.0, 0.0])),
     }
+    motions["fed-catheter"] = np.hstack(
+        [motions["magnetic-catheter"], 0.02 * (1.0 - np.cos(np.pi / 2.0 * t))]
+    )
     runs = {
         name: functools.partial(kc.simulate, kc.load_robot(name), control, 0.02)
         for name, control in motions.items()

@@ -93,6 +93,7 @@ ROBOTS = {
     "arm": kc.load_robot("three-chamber-arm").replace(nodes=5),
     "tubes": kc.load_robot("three-tube-robot").replace(nodes=13),
     "catheter": kc.load_robot("magnetic-catheter").replace(nodes=5),
+    "fed catheter": kc.load_robot("fed-catheter").replace(nodes=5),
     "gripper": kc.load_robot("three-finger-gripper").replace(nodes=5),
 }  # fmt: skip
 #: means of the controls of robots whose controls are not the paper's four tensions
@@ -100,6 +101,7 @@ MEANS = {
     "own": [0.3, 0.1], "model of own": [0.3, 0.1], "arm": [2e4, 1.5e4, 1e4],
     "tubes": [1.0, 0.02, -0.5, 0.01, 0.3, 0.02],
     "gripper": [1.0, 1.5, 2.0, 0.8, 0.9, 1.0], "catheter": [2e-3, 1e-3, 3e-3],
+    "fed catheter": [2e-3, 1e-3, 3e-3, 0.01],
 }  # fmt: skip
 #: identified parameters of robots of which it is not Young's modulus
 PARAMETERS = {

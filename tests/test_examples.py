@@ -165,6 +165,14 @@ def test_magnetic_catheter(run):
 
 
 @CAMPAIGN
+def test_feed_a_catheter(run):
+    wanted, tip = run("feed_a_catheter", points=21, dt=0.1).values()
+    assert wanted[-1, 0] > 0.015
+    # the field leads by half a row, in which the tip moves by 1.9 mm
+    np.testing.assert_allclose(tip, wanted, atol=1e-3)
+
+
+@CAMPAIGN
 def test_calibrate_parameters(run):
     found = run("calibrate_parameters", steps=40)
     for name, true in (("youngs_modulus", 2.757903e9), ("bending_damping", 0.03)):

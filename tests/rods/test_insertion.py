@@ -17,6 +17,7 @@ from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWren
 from knode_cosserat.rods.magnets import Magnet, UniformField
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.relaxation import Relaxation
+from knode_cosserat.solvers.damping import UndampedWarning
 
 L, RADIUS, DENSITY = 0.5, 0.005, 1000.0
 MASS = DENSITY * np.pi * RADIUS**2
@@ -96,6 +97,64 @@ def test_a_hanging_rod_is_stretched_by_its_exposed_weight(insertion):
 
 
 # motions
+
+
+def fed_smoothly(duration, rows):
+    """0.3 m of insertion, with rates and accelerations of zero at both ends."""
+    part = np.arange(1, rows + 1) / rows
+    return 0.3 * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
+
+
+def test_a_hanging_rod_let_out_slowly_is_stretched_by_its_exposed_weight():
+    hanging = rod(gravity=(0.0, 0.0, 9.81), youngs_modulus=1e6, shear_damping=2.0)
+    inserted = fed_smoothly(1.0, 400)
+    exposed = L + inserted
+    expected = exposed + DENSITY * 9.81 * exposed**2 / (2.0 * 1e6)
+    errors = [
+        kc.simulate(
+            hanging, inserted[:, None], duration / 400, space="lobatto4", time="bdf2", between="linear",
+            initial=rest(hanging, 0.0),
+        ).tip_position[1:, 2] - expected
+        for duration in (80.0, 160.0)
+    ]  # fmt: skip
+    assert np.abs(errors[1]).max() < 1e-6 * L
+    # damping and momentum are proportional to the rate and to its square
+    assert np.abs(errors[0]).max() == pytest.approx(2.0 * np.abs(errors[1]).max(), rel=0.02)
+    assert abs(errors[1][-1]) < 1e-9
+
+
+def test_a_swinging_rod_let_out_slowly_keeps_the_ratio_of_energy_and_frequency():
+    """The adiabatic invariant: the amplitude of a bending vibration grows with the root of the length."""
+    dt, swinging = 0.02, rod(bending_damping=0.0)
+
+    def rows_of_three_periods(exposed):
+        rate = 1.8751040687**2 / exposed**2 * np.sqrt(float(swinging.Kbt[0, 0]) / MASS)
+        return round(3.0 * 2.0 * np.pi / rate / dt)
+
+    first, last = rows_of_three_periods(L), rows_of_three_periods(L + 0.3)
+    control = np.concatenate([np.zeros(first), fed_smoothly(20.0, 1000), np.full(last, 0.3)])
+    with pytest.warns(UndampedWarning):
+        found = kc.simulate(
+            swinging, control[:, None], dt, space="lobatto4", time="trapezoidal", between="linear",
+            initial=rest(rod(gravity=(0.02, 0.0, 0.0)), 0.0),
+        )  # fmt: skip
+    swing = found.tip_position[1:, 0]
+    growth = np.sqrt(np.mean(swing[-last:] ** 2) / np.mean(swing[:first] ** 2))
+    assert growth == pytest.approx(np.sqrt((L + 0.3) / L), rel=2e-3)
+
+
+def test_a_motion_converges_with_order_four():
+    inserted = eased(0.02 * np.arange(1, 101), 0.5)[:, None] / 8.0
+
+    def tip(nodes):
+        bent = rod(nodes=nodes, gravity=(3.0, 0.0, 5.0))
+        moved = kc.simulate(bent, inserted, 0.02, space="lobatto4", time="bdf2", initial=rest(bent, 0.0))
+        return np.asarray(moved.tip_position[-1])
+
+    finest = tip(49)
+    errors = [np.linalg.norm(tip(nodes) - finest) for nodes in (7, 13, 25)]
+    assert np.log2(np.divide(errors[:-1], errors[1:])).min() > 3.9
+    assert errors[-1] < 1e-6 * L
 
 
 def test_a_straight_rod_takes_its_momentum_from_the_hole():

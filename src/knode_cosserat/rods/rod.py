@@ -151,7 +151,9 @@ class SlenderRod(System):
                 "Use sections with a stretch, such as {kind: stretch, radius: [1, -0.5]}"
             )
         for part in self.parts.values():
-            part.check(self)
+            # what is no part is refused afterwards
+            if isinstance(part, Contribution):
+                part.check(self)
 
     # parts
 
