@@ -63,7 +63,10 @@ def _check_within_length(robot: System, reference: Reference, seconds: float) ->
         return
     y, _ = robot.rest(0.0)
     base = np.asarray(Drawing.of(robot).positions(np.asarray(y)[None]))[0]
-    length, times = float(length), np.arange(0.0, seconds, SAMPLING)
+    # controls in metres may feed more of it
+    fields = (field for field in robot.control_layout.fields if field.unit == "m" and np.isfinite(field.high))
+    length = float(length) + max((field.high for field in fields), default=0.0)
+    times = np.arange(0.0, seconds, SAMPLING)
     distance = np.sqrt(np.nansum((reference.at(times)[:, :3] - base) ** 2, axis=1))
     k = int(np.argmax(distance))
     if distance[k] > STRETCH * length:

@@ -14,7 +14,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.rods.parts import Contribution
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers import semi_discrete
 from knode_cosserat.solvers.history import coefficient_table
 from knode_cosserat.solvers.semi_discrete import History, Point
@@ -36,6 +38,11 @@ def require_rod(robot: System) -> None:
         raise RecordingError(
             f"{type(robot).__name__} has no {', '.join(missing)} in its states; estimation is for rods with "
             f"{', '.join((*KNOWN, *LOADS))} in y and {', '.join(STRAINS)} in z"
+        )
+    parts = getattr(nominal_model(robot), "parts", {}).values()
+    if any(type(part).arclength_rate is not Contribution.arclength_rate for part in parts):
+        raise RecordingError(
+            f"{type(robot).__name__} has a length that controls change; estimation is for constant lengths"
         )
     if sorted(robot.base_unknowns) != sorted(LOADS):
         raise RecordingError(
