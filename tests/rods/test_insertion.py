@@ -65,9 +65,6 @@ def test_material_that_moves_along_a_turning_arm_has_coriolis_forces():
     assert n[2] + mass * speed**2 == pytest.approx(0.5 * mass * rate**2 * exposed**2, rel=1e-5)
 
 
-# statics
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize("insertion", [-0.2, 0.0, 0.3])
 def test_it_rests_and_vibrates_as_a_rod_of_the_exposed_length(insertion):
@@ -105,6 +102,7 @@ def fed_smoothly(duration, rows):
     return 0.3 * part**3 * (10.0 - 15.0 * part + 6.0 * part**2)
 
 
+@pytest.mark.slow
 def test_a_hanging_rod_let_out_slowly_is_stretched_by_its_exposed_weight():
     hanging = rod(gravity=(0.0, 0.0, 9.81), youngs_modulus=1e6, shear_damping=2.0)
     inserted = fed_smoothly(1.0, 400)
@@ -123,6 +121,7 @@ def test_a_hanging_rod_let_out_slowly_is_stretched_by_its_exposed_weight():
     assert abs(errors[1][-1]) < 1e-9
 
 
+@pytest.mark.slow
 def test_a_swinging_rod_let_out_slowly_keeps_the_ratio_of_energy_and_frequency():
     """The adiabatic invariant: the amplitude of a bending vibration grows with the root of the length."""
     dt, swinging = 0.02, rod(bending_damping=0.0)
@@ -143,6 +142,7 @@ def test_a_swinging_rod_let_out_slowly_keeps_the_ratio_of_energy_and_frequency()
     assert growth == pytest.approx(np.sqrt((L + 0.3) / L), rel=2e-3)
 
 
+@pytest.mark.slow
 def test_a_motion_converges_with_order_four():
     inserted = eased(0.02 * np.arange(1, 101), 0.5)[:, None] / 8.0
 
