@@ -150,19 +150,21 @@ class Trajectory(eqx.Module):
     def part(self, name: str) -> Any:
         """Return a field of y, z or the controls by name: `n`, `m`, `v`, `u`, `tension` … (…, T, N, size).
 
-        For a robot of several rods, such as the legs of a platform, `n2` is the second rod's field and `n`
-        stacks all of them, (…, T, N, rods, size).
+        For several rods `n2` is the field of a platform's second leg, `thumb_n` that of a rod of an assembly,
+        and `n` stacks all of them, bodies last, (…, T, N, rods, size).
         """
         count, known = strand_count(self.system), []
         for layout, packed in self._layouts():
             if name in layout.names:
                 return layout.get(packed, name)
             known += layout.names
-            rods = tuple(f"{name}{k + 1}" for k in range(count))
-            # as many numbered fields as there are rods: one field of each rod
-            if set(rods) <= set(layout.names) and f"{name}{count + 1}" not in layout.names:
-                every = packed[..., layout.indices(rods)]
-                return every.reshape(*every.shape[:-1], count, -1)
+            numbered = tuple(f"{name}{k + 1}" for k in range(count))
+            # as many numbered fields as there are rods, or one after the name of each rod
+            if not set(numbered) <= set(layout.names) or f"{name}{count + 1}" in layout.names:
+                numbered = tuple(each for each in layout.names if each.endswith(f"_{name}"))
+            if len({layout.slice(each).stop - layout.slice(each).start for each in numbered}) == 1:
+                every = packed[..., layout.indices(numbered)]
+                return every.reshape(*every.shape[:-1], len(numbered), -1)
         raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
 
     def _layouts(self) -> tuple[tuple[Any, Any], ...]:

@@ -63,7 +63,6 @@ class Insertion(Effect):
 
     def check(self, rod: Any) -> None:
         """Raise `ParameterError` for parts that are bound to places of the material."""
-        effects = rod.effects
         others = [part for part in rod.parts.values() if not isinstance(part, Insertion)]
         retraction, length = as_number(self.retraction), as_number(rod.length)
         laws = ((type(rod), SlenderRod, name) for name in ("constitutive", "balance", "material"))
@@ -75,8 +74,7 @@ class Insertion(Effect):
             (not isinstance(rod.base_end, Clamped), "allowed is a clamped or driven base_end"),
             (
                 any(part.y_fields(rod) or part.z_fields(rod) for part in others),
-                "a part has states along the material, such as reels, friction or relaxation; allowed are "
-                "parts without states",
+                "a part, such as reels, friction or relaxation, has states; allowed are parts without states",
             ),
             (
                 any(cut < 1.0 for part in rod.parts.values() for cut in part.cuts),
@@ -88,7 +86,7 @@ class Insertion(Effect):
                 "allowed is a rod of one section all along, without changes in sections",
             ),
             (
-                any(part.gyroscopic for part in effects[effects.index(self) :]),
+                any(part.gyroscopic for part in rod.effects[rod.effects.index(self) :]),
                 "allowed is a spinning-frame before it in effects",
             ),
         ):
