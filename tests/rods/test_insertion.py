@@ -85,6 +85,19 @@ def test_it_rests_and_vibrates_as_a_rod_of_the_exposed_length(insertion):
     assert kc.statics.stability(fed).kind == kc.statics.stability(cut).kind == "stable"
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "control"),
+    [("delrin-tendon-robot", [7.0, 5.0, 5.0, 7.0]), ("three-chamber-arm", [2e4, 0.0, 1e4])],
+)
+def test_tendons_and_chambers_act_on_the_exposed_length(name, control):
+    robot = kc.load_robot(name)
+    fed = rest(robot.replace(effects=(*robot.effects, Insertion(retraction=0.1))), *control, -0.05)
+    cut = rest(robot.replace(length=robot.length - 0.05), *control)
+    assert np.linalg.norm(fed.tip_position[-1, :2]) > 0.01
+    np.testing.assert_allclose(fed.tip_position, cut.tip_position, atol=1e-9)
+
+
 @pytest.mark.parametrize("insertion", [-0.2, 0.3])
 def test_a_hanging_rod_is_stretched_by_its_exposed_weight(insertion):
     down = rest(rod(gravity=(0.0, 0.0, 9.81), youngs_modulus=1e6), insertion)

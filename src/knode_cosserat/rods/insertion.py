@@ -63,7 +63,9 @@ class Insertion(Effect):
 
     def check(self, rod: Any) -> None:
         """Raise `ParameterError` for parts that are bound to places of the material."""
-        others = [part for part in rod.parts.values() if not isinstance(part, Insertion)]
+        parts = {name: part for name, part in rod.parts.items() if part is not self}
+        moved = [name for name, part in parts.items() if part.y_fields(rod) or part.z_fields(rod)]
+        within = [name for name, part in parts.items() if any(cut < 1.0 for cut in part.cuts)]
         retraction, length = as_number(self.retraction), as_number(rod.length)
         laws = ((type(rod), SlenderRod, name) for name in ("constitutive", "balance", "material"))
         for wrong, reason in (
@@ -72,14 +74,8 @@ class Insertion(Effect):
                 f"retraction is {retraction} m; allowed is less than the robot's length, {length} m",
             ),
             (not isinstance(rod.base_end, Clamped), "allowed is a clamped or driven base_end"),
-            (
-                any(part.y_fields(rod) or part.z_fields(rod) for part in others),
-                "a part, such as reels, friction or relaxation, has states; allowed are parts without states",
-            ),
-            (
-                any(cut < 1.0 for part in rod.parts.values() for cut in part.cuts),
-                "a part begins, ends or acts within the rod; allowed are loads at the tip or all along",
-            ),
+            (moved, f"{', '.join(moved)} with states along the rod; allowed are parts without states"),
+            (within, f"{', '.join(within)} within the rod; allowed are loads at the tip or all along"),
             (
                 any(getattr(own, name) is not getattr(base, name) for own, base, name in laws)
                 or not rod.is_uniform,
