@@ -71,11 +71,30 @@ def four_bar(nodes, **options):
     return moved(assembly(*rods, bodies=bodies, nodes=nodes), "a", **options)[0]
 
 
-#: a frame of two beams, whose column has the moment F L; a portal frame of equal rods, (2 + 3) / (1 + 6)
-FRAMES = {angle_frame: FORCE * L**3 / EI * (1 / 3 + 1), four_bar: FORCE * L**3 / (12 * EI) * 5 / 7}
+def grid(nodes, **options):
+    """Return the height lost by the crossing of four rods that the ground holds at their other ends (m)."""
+    rods = [
+        rod(name, base_end=Clamped(position=way, orientation=turn), tip_end=on("crossing", orientation=turn))
+        for name, way, turn in (
+            ("west", (-L, 0.0, 0.0), ALONG_X), ("east", (L, 0.0, 0.0), (1.0, 0.0, -1.0, 0.0)),
+            ("north", (0.0, L, 0.0), (1.0, 1.0, 0.0, 0.0)), ("south", (0.0, -L, 0.0), (1.0, -1.0, 0.0, 0.0)),
+        )
+    ]  # fmt: skip
+    crossing = RigidBody(name="crossing", force=(0.0, 0.0, -FORCE))
+    return -moved(assembly(*rods, bodies=[crossing], nodes=nodes), "crossing", **options)[2]
 
 
-@pytest.mark.parametrize("frame", [angle_frame, pytest.param(four_bar, marks=pytest.mark.slow)])
+#: a frame of two beams, whose column has the moment F L; a portal frame of equal rods, (2 + 3) / (1 + 6);
+#: four beams that neither end turns
+FRAMES = {
+    angle_frame: FORCE * L**3 / EI * (1 / 3 + 1), four_bar: FORCE * L**3 / (12 * EI) * 5 / 7,
+    grid: FORCE * L**3 / (48 * EI),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "frame", [angle_frame, *(pytest.param(frame, marks=pytest.mark.slow) for frame in (four_bar, grid))]
+)
 def test_frames_bend_as_beams_with_order_two(frame):
     missing = errors(frame, FRAMES[frame], (11, 21))
     assert np.log2(missing[0] / missing[1]) == pytest.approx(2.0, abs=0.02)
