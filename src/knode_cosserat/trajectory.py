@@ -158,13 +158,13 @@ class Trajectory(eqx.Module):
             if name in layout.names:
                 return layout.get(packed, name)
             known += layout.names
-            numbered = tuple(f"{name}{k + 1}" for k in range(count))
+            rods = tuple(f"{name}{k + 1}" for k in range(count))
             # as many numbered fields as there are rods, or one after the name of each rod
-            if not set(numbered) <= set(layout.names) or f"{name}{count + 1}" in layout.names:
-                numbered = tuple(each for each in layout.names if each.endswith(f"_{name}"))
-            if len({layout.slice(each).stop - layout.slice(each).start for each in numbered}) == 1:
-                every = packed[..., layout.indices(numbered)]
-                return every.reshape(*every.shape[:-1], len(numbered), -1)
+            if not set(rods) <= set(layout.names) or f"{name}{count + 1}" in layout.names:
+                rods = tuple(each for each in layout.names if each.endswith(f"_{name}"))
+            if len(rods) > 1 and len({field.size for field in layout.fields if field.name in rods}) == 1:
+                every = packed[..., layout.indices(rods)]
+                return every.reshape(*every.shape[:-1], len(rods), -1)
         raise KeyError(f"no field {name!r}; there are {', '.join(known)}")
 
     def _layouts(self) -> tuple[tuple[Any, Any], ...]:
