@@ -65,9 +65,9 @@ class Core(EliminationCode):
     It does not depend on Newton's options. A run may have fewer stages in a step than the scheme.
     """
 
-    def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
+    def __init__(self, system: System, settings: Settings, robots: bool):
         self.settings, self.scheme = settings, settings.time
-        super().__init__(Equations(system, space=settings.space), robots, lanes)
+        super().__init__(Equations(system, space=settings.space), robots)
         e = self.equations
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: its options, a trial point, and the correction from the last accepted one

@@ -38,8 +38,8 @@ class EliminationCode(RodCode):
     #: true if the entries of A are needed
     has_entries = False
 
-    def __init__(self, equations: Equations, robots: bool, lanes: int):
-        super().__init__(equations, robots, lanes)
+    def __init__(self, equations: Equations, robots: bool):
+        super().__init__(equations, robots)
         system = equations.system
         self.elimination = Elimination(equations)
         e, a, by_rows = self.equations, self._array, self._by_rows

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Index, Module, Value
+from knode_cosserat.engine.codegen import Function, Index, Module, Value, vector_lanes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -41,12 +41,12 @@ class Array:
 class Memory:
     """Arrays of a run, and the function that is being written."""
 
-    def __init__(self, robots: bool, lanes: int, places: int):
-        self.batch, self.L = robots, lanes
+    def __init__(self, robots: bool, places: int):
+        self.batch, self.L = robots, vector_lanes()
         #: lanes of a plain value
-        self.P = lanes if robots else 1
+        self.P = self.L if robots else 1
         #: distance between components of a single robot's arrays
-        self.stride = (-(-(places + 1) // lanes) + 1) * lanes
+        self.stride = (-(-(places + 1) // self.L) + 1) * self.L
         self.module = Module()
         self._size = 0
 

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.engine.codegen import Module
+from knode_cosserat.engine.codegen import Module, vector_lanes
 from knode_cosserat.engine.equations import MOST_OPERATIONS, PLACE, RUN, STEP, constant_zeros, is_moving
 from knode_cosserat.engine.program import EngineError, Program
 from knode_cosserat.rods.system import System, is_traced
@@ -92,11 +92,9 @@ def parameters_of(system: System) -> np.ndarray:
 class _PlaceCode:
     """Machine code of a function of a system, a place s (m) and a control."""
 
-    def __init__(
-        self, function: Callable[[Any, Any, Any], Any], system: System, controls: int, lanes: int = 8
-    ):
+    def __init__(self, function: Callable[[Any, Any, Any], Any], system: System, controls: int):
         leaves, tree = jax.tree.flatten(system)
-        program, self.lanes = Program(MOST_OPERATIONS), lanes
+        program, self.lanes = Program(MOST_OPERATIONS), vector_lanes()
         parameters = [program.inputs(f"p{k}", np.shape(leaf), RUN) for k, leaf in enumerate(leaves)]
         folded = [
             np.where(constant_zeros(leaf), program.constant(0.0), nodes)
@@ -114,11 +112,11 @@ class _PlaceCode:
         f = module.function("run", ["data", "places", "results", "n_places"], exported=True)
         data, places, results, count = f.arguments
         known = {int(node): f.load(data, k) for k, node in enumerate(inputs) if int(node) in needed}
-        with f.loop(count, 0, lanes) as j:
-            here = known | {s.item(): f.load(places, j.value, lanes)}
-            values, target = f.evaluate(program, nodes, here, lanes), f.pointer(results, j.value)
+        with f.loop(count, 0, self.lanes) as j:
+            here = known | {s.item(): f.load(places, j.value, self.lanes)}
+            values, target = f.evaluate(program, nodes, here, self.lanes), f.pointer(results, j.value)
             for k, node in enumerate(nodes):
-                f.store(values[node], target, count * k, lanes)
+                f.store(values[node], target, count * k, self.lanes)
         self._run = module.compile()["run"]
 
     def evaluate(self, data: np.ndarray, s: Float[np.ndarray, " n"]) -> Any:

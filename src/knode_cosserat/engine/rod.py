@@ -38,7 +38,7 @@ class RodCode(Memory):
     rates: Function
     rates_and_slopes: Function
 
-    def __init__(self, equations: Equations, robots: bool, lanes: int):
+    def __init__(self, equations: Equations, robots: bool):
         system = equations.system
         self.equations, self.grid, self.space = equations, grid_of(system, equations.space), equations.space
         e, grid = self.equations, self.grid
@@ -63,7 +63,7 @@ class RodCode(Memory):
         self.origins += [(q, j) for q in strands for j in range(self.strand_points, grid.ends)]
         for k in range(len(self.check_stages)):
             self.origins += [(q, grid.stage(k).start + min(j, grid.tip - 1)) for q, j in pieces]
-        super().__init__(robots, lanes, self.count)
+        super().__init__(robots, self.count)
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
         self.params, self.scale_tip = a(len(e.parameter_values)), a(k)
         self.scale_y = a(ny, 0 if self.strands == 1 else self.points)
