@@ -65,7 +65,7 @@ class Core(EliminationCode):
     It does not depend on Newton's options. A run may have fewer stages in a step than the scheme.
     """
 
-    def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 8):
+    def __init__(self, system: System, settings: Settings, robots: bool, lanes: int = 0):
         self.settings, self.scheme = settings, settings.time
         super().__init__(Equations(system, space=settings.space), robots, lanes)
         e = self.equations

@@ -81,7 +81,7 @@ class _TangentCode(EliminationCode):
     transposed: bool
     has_entries = True
 
-    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 8):
+    def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray], lanes: int = 0):
         self.settings = settings
         super().__init__(TangentEquations(system, moving, self.transposed, settings.space), False, lanes)
         e, a = self.equations, self._array
@@ -100,7 +100,7 @@ class _TangentCode(EliminationCode):
         #: stages of the pieces between strands
         self.idle = [first + tip for first in self.stages for tip in self.tips[:-1]]
         #: number of tangents side by side, and an array of them
-        self.columns = 1 if self.transposed else lanes
+        self.columns = 1 if self.transposed else self.L
         many = a if self.transposed else self._tangent_array
         whole, self._size = self._size, 0
         records, rate = [many(numbers, self.used, 1) for _ in memory], many(numbers, self.used, 1)
