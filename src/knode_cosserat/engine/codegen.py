@@ -41,7 +41,7 @@ def vector_lanes() -> int:
 
     Vectors that take two registers need twice as long to compile, and steps are up to 1.3 times as slow.
     """
-    import llvmlite.binding as llvm
+    import llvmlite.binding as llvm  # later than the package, which is to be imported fast
 
     return 8 if llvm.get_host_cpu_features().get("avx512f") else 4
 
@@ -53,6 +53,8 @@ def literal(value: float) -> str:
 
 #: arrays with the addresses at which their sums are added, and which lanes are inside
 Sums = tuple[Sequence[tuple[int, "Value"]], Any]
+#: functions that write the value of a node, and return how it is read from then on
+Stores = Mapping[int, Callable[["Value"], Any]]
 Operator = Callable[["Value", Any], "Value"]
 
 
@@ -153,6 +155,14 @@ class Variable:
         """Return the value."""
         kind = self._kind if self._lanes == 1 else f"<{self._lanes} x {self._kind}>"
         return self._function.result(f"load {kind}, ptr {self._place}", self._kind, self._lanes)
+
+
+class Values(dict[int, Any]):
+    """Values of nodes; a function that reads one is called at every use, so that it takes no register."""
+
+    def __getitem__(self, node: int) -> Any:
+        value = super().__getitem__(node)
+        return value() if callable(value) else value
 
 
 class Module:
@@ -268,7 +278,9 @@ class Function:
             [line] if isinstance(line, str) else line for line in self._lines
         )
         body = "\n".join([*self._stack, "  br label %begin", "begin:", *lines])
-        inline = "nounwind" if self.exported else "noinline nounwind"
+        # vectors that do not fit into registers are kept on the stack, aligned
+        aligned = 'nounwind alignstack(64) "stackrealign"'
+        inline = aligned if self.exported else f"noinline {aligned}"
         kind, end = "void", "ret void"
         if self.returned is not None:
             kind, end = self.returned.type, f"ret {self.returned.type} {self.returned.name}"
@@ -548,23 +560,28 @@ class Function:
 
     def evaluate(
         self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int,
-        sums: Sums = ((), True),
-    ) -> dict[int, Any]:  # fmt: skip
+        sums: Sums = ((), True), stores: Stores | None = None,
+    ) -> Values:  # fmt: skip
         """Write the operations that outputs need, and return the values of all of them.
 
-        `known` are values of inputs and of operations that have been evaluated; those of arrays are in memory
-        (`arrays.Stored`). Loops run until every lane is done; lanes that are done keep their values. `sums`
-        are arrays, the sums of which over the lanes inside are added to memory at their addresses.
+        `known` are values of inputs and of operations that have been evaluated, or functions that read them;
+        those of arrays are in memory (`arrays.Stored`). Loops run until every lane is done; lanes that are
+        done keep their values. `sums` are arrays, the sums of which over the lanes inside are added to memory
+        at their addresses. `stores` are called as soon as the value of their node is known, and each output
+        is then evaluated with what it needs before the next one: few values wait in registers.
         """
         added, inside = sums
-        values: dict[int, Any] = dict(known)
+        values = Values(known)
         parts = [part for node, _ in added for part, _ in summands(program, node)]
         arrays = ArrayCode(self, program, outputs, parts, values)
-        for node in arrays.needed:
-            if node in values:
-                continue
+        order = arrays.needed
+        if stores and program.shapes.keys().isdisjoint(order):
+            order = program.depth_first(outputs, values)
+        for node in order:
             operation, *arguments = program.operations[node]
-            if operation == "constant":
+            if node in values:
+                pass
+            elif operation == "constant":
                 value = program.values[node]
                 values[node] = self.value(value if isinstance(value, bool) else float(value))
             elif operation in ("input", "inputs"):
@@ -577,6 +594,8 @@ class Function:
                 arrays.write(node)
             elif operation != "result":
                 values[node] = self.apply(operation, *(values[each] for each in arguments))
+            if stores and node in stores:
+                values[node] = stores[node](values[node])
         for node, target in added:
             arrays.add(node, target, inside)
         return values

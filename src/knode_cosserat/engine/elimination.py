@@ -186,22 +186,21 @@ class EliminationCode(RodCode):
         f, el, n = self._function(name), self.elimination, self.equations.ny
         factors = [k for k, (i, _) in enumerate(el.places) if i in block]
         entries = [k for k, (i, _) in enumerate(el.entries) if i in block]
-        outputs = [el.factors[k] for k in factors] + [int(node) for node in el.matrix[block][:, block].flat]
+        outputs = [int(node) for node in el.matrix[block][:, block].flat] + [el.factors[k] for k in factors]
         used = set(el.program.needed(outputs))
         with self._places(self.pieces) as j:
             known = {el.h: self._wide(self.h, 0, j)}
             slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
             for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
-                known |= {int(node): self._wide(array, k, at) for k, node in enumerate(nodes) if node in used}
-            values = f.evaluate(el.program, outputs, known, self.L)
-            for k in factors:
-                self._write_wide(values[el.factors[k]], self.factor, k, j)
+                reads = (functools.partial(self._wide, array, k, at) for k in range(len(nodes)))
+                known |= {int(node): read for node, read in zip(nodes, reads, strict=True) if node in used}
+            results = [(self.factor, [(k, el.factors[k]) for k in factors])]
             if self.batch or self.has_entries:
-                for k in entries:
-                    self._write_wide(values[int(el.matrix[el.entries[k]])], self.entries, k, j)
+                results += [(self.entries, [(k, el.matrix[el.entries[k]]) for k in entries])]
             if not self.batch:
-                for i, c in itertools.product(block, block):
-                    self._write_wide(values[int(el.matrix[i, c])], self.wide_matrix, c * n + i, j)
+                inside = itertools.product(block, block)
+                results += [(self.wide_matrix, [(c * n + i, el.matrix[i, c]) for i, c in inside])]
+            f.evaluate(el.program, outputs, known, self.L, stores=self._stores(results, j))
         return f
 
     def _copy(self, count: int, source: tuple[Value, int], target: tuple[Value, int]) -> None:

@@ -439,7 +439,8 @@ class Elimination:
         self.substitution: list[tuple[int, int, int]] = []
         for turn, (i, others) in enumerate(
             [(i, order[:at]) for at, i in enumerate(order)]
-            + [(i, order[at + 1 :]) for at, i in reversed(list(enumerate(order)))]
+            # the number that is known last is needed last
+            + [(i, order[:at:-1]) for at, i in reversed(list(enumerate(order)))]
         ):
             for j in others:
                 if B[i, j] != zero:

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Index, Module, Value, vector_lanes
+from knode_cosserat.engine.codegen import Function, Index, Module, Stores, Value, vector_lanes
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,7 +47,8 @@ class Memory:
         #: lanes of a plain value
         self.P = self.L if robots else 1
         #: distance between components of a single robot's arrays
-        self.stride = (-(-(places + 1) // self.L) + 1) * self.L
+        # an odd number of vectors: components spread over all sets of the cache
+        self.stride = (-(-(places + 1) // self.L) + 1 | 1) * self.L
         self.module = Module()
         self._size = 0
 
@@ -138,6 +140,20 @@ class Memory:
 
     def _write_wide(self, value: Any, array: Array, i: Any, j: Any) -> None:
         self._put(value, array, i, j, self.L)
+
+    def _stores(self, results: Iterable[tuple[Array, Iterable[tuple[int, int]]]], j: Any) -> Stores:
+        """Return functions that write nodes to their components of arrays at a place."""
+        places: dict[int, list[tuple[Array, int]]] = {}
+        for array, nodes in results:
+            for i, node in nodes:
+                places.setdefault(int(node), []).append((array, i))
+
+        def store(at: list[tuple[Array, int]], value: Value) -> Callable[[], Value]:
+            for array, i in at:
+                self._write_wide(value, array, i, j)
+            return functools.partial(self._wide, *at[0], j)
+
+        return {node: functools.partial(store, at) for node, at in places.items()}
 
     def _column(self, array: Array, rows: int, column: int = 0, j: int | Index = 0) -> list[Value]:
         """Return the vectors of a column of a matrix."""

@@ -605,6 +605,21 @@ class Program:
                 stack.extend(sources(node))
         return sorted(seen)
 
+    def depth_first(self, outputs: Iterable[int], known: Any = frozenset()) -> list[int]:
+        """Return the nodes that the outputs depend on, each output after what only it needs."""
+        seen: set[int] = set()
+        order: list[int] = []
+        stack = [(int(node), False) for node in reversed(list(outputs))]
+        while stack:
+            node, is_ready = stack.pop()
+            if is_ready:
+                order.append(node)
+            elif node not in seen:
+                seen.add(node)
+                sources = () if node in known else self.arguments(node)
+                stack += [(node, True), *((each, False) for each in reversed(sources))]
+        return order
+
     def is_boolean(self, node: int) -> bool:
         """Return True if the value of a node is a boolean."""
         return self._boolean[node]

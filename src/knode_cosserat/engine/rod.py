@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.engine.arrays import Stored
-from knode_cosserat.engine.codegen import Function, Index, Sums, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, Stores, Sums, Value, Variable
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
 from knode_cosserat.solvers.grid import grid_of
@@ -176,15 +176,15 @@ class RodCode(Memory):
 
     def _evaluated(
         self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any],
-        sums: Sums = ((), True),
+        sums: Sums = ((), True), stores: Stores | None = None,
     ) -> list[Value]:  # fmt: skip
         """Write the operations of outputs at a place, and of arrays that are added (`Function.evaluate`)."""
         own = [int(each) for each in outputs]
         self._outputs = [*own, *(node for node, _ in sums[0])]
         lanes = self.L if wide else self.P
         known = self._known(j, wide, state)
-        values = self._now.evaluate(self.equations.program, own, known, lanes, sums)
-        return [values[node] for node in own]
+        values = self._now.evaluate(self.equations.program, own, known, lanes, sums, stores)
+        return [] if stores else [values[node] for node in own]
 
     def _write_setup(self) -> None:
         """Scales, places and lengths of pieces: once a run."""
@@ -258,10 +258,8 @@ class RodCode(Memory):
 
     def _write_results(self, results: Sequence[tuple[Array, Any]], j: Any, state: dict[int, Value]) -> None:
         """Write the values of nodes at a place into arrays."""
-        found = iter(self._evaluated([node for _, nodes in results for node in nodes], j, True, state))
-        for array, nodes in results:
-            for i in range(len(nodes)):
-                self._write_wide(next(found), array, i, j)
+        stores = self._stores(((array, enumerate(nodes)) for array, nodes in results), j)
+        self._evaluated([node for _, nodes in results for node in nodes], j, True, state, stores=stores)
 
     def _rates_at(
         self, function: Function, y: Array, history: Array, j: Index, place: Index | None = None
@@ -280,7 +278,9 @@ class RodCode(Memory):
             with self._places(self.pieces) as j:
                 results = (far, e.far), *(self.jumps if slopes else ())
                 self._write_results(results, j, self._state(y, history, j) | self._acting_at(j))
-        for k, point in enumerate(self.near):
+        # also in the lanes beyond, where a loop of the equations would not end
+        beyond = 0 if self.batch else -self.ends % self.L
+        for k, point in enumerate([*self.near, *self.near[-1:] * beyond]):
             for i in range(e.ny):
                 self._put(self._get(y, i, point), far, i, self.points + k)
         return far
