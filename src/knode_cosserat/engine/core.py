@@ -12,10 +12,9 @@ import functools
 import itertools
 import operator
 from collections.abc import Callable, Iterable, Iterator
-from typing import Any, NamedTuple, TypeVar
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.elimination import EliminationCode
@@ -24,19 +23,13 @@ from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import StateArrays
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import (
-    COARSE_ANGLE,
-    COARSE_SHARE,
     ESTIMATE_TOLERANCE,
     ESTIMATE_TURNS,
     EXTRAPOLATIONS,
     ROUNDING,
-    StateHistory,
-    StepCoefficients,
-    StepRows,
     stage_extrapolations,
 )
 from knode_cosserat.solvers.problem import FILLING, Evaluated
-from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.time import SDIRK2
 
@@ -48,15 +41,6 @@ LARGEST_CORRECTION = 1e-5
 SURELY_SMALL = 1e-2
 #: index of `acceptable` in Newton's options
 ACCEPTABLE = [field.name for field in dataclasses.fields(NewtonOptions)].index("acceptable")
-
-
-class Shape(NamedTuple):
-    """The state from which an equilibrium is solved."""
-
-    y: Float[np.ndarray, "points y"]
-
-
-States = TypeVar("States", StateHistory, Shape)
 
 
 class Core(EliminationCode):
@@ -78,8 +62,8 @@ class Core(EliminationCode):
         first, memory = self._size, range(settings.memory)
         self.records, self.rate = [a(numbers, self.count) for _ in memory], a(numbers, self.count)
         self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3), a(1)
-        self.errors, self.time_errors = ([a(numbers, self.used) for _ in memory] for _ in range(2))
-        self.error_rate = a(numbers, self.used)
+        self.errors, self.error_rate = [a(numbers, self.used) for _ in memory], a(numbers, self.used)
+        self.time_errors = [a(numbers, self.used) for _ in memory]
         #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
         self._motion = slice(first, self._size)
         self._parts = {
@@ -88,6 +72,8 @@ class Core(EliminationCode):
         }  # fmt: skip
         if settings.time is None:
             self._motion, self._parts = slice(self.y.offset, self.unknowns.offset), {"y": [self.y]}
+        #: of the stage solved last (`USABLE` and the next)
+        self.numbers = a(8)
         #: for sizes relative to the state: one over the natural unit plus |y|
         self.weights_of_y = a(ny, self.points)
         # corrected motions: history terms, defects
@@ -108,8 +94,6 @@ class Core(EliminationCode):
             guesses = stage_extrapolations(settings)
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
-        #: memory at the start of a run, but for parameters and states
-        self._empty = self._empty_memory()
 
     def _write_weights(self) -> None:
         """Weights of sizes relative to the state."""
@@ -521,22 +505,18 @@ class Core(EliminationCode):
     # the time loop
 
     def _write_run(self) -> None:
-        """All steps from `n_start` to `n_stop`, until every robot has failed; `reached` counts the solved."""
+        """All steps, until every robot has failed; `reached` counts the solved."""
         e, P = self.equations, self.P
         names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
-        names += ["n_start", "n_stop", "n_stages"]
+        names += ["n_steps", "n_stages"]
         f = self._now = self.module.function("run", names, exported=True)
-        memory, controls, coefficients, extrapolations, rows, infos, reached, start, stop, stages = (
-            f.arguments
-        )
-        numbers = Value(f, f.reserve(f"[{8 * P} x double]"), "ptr")
-        for k in range(8):
-            f.store(1.0 if k == ALIVE else 0.0, numbers, k * P, P)
-        f.call(self.setup, memory)
-        step, nodes = Variable(f, start), len(self.grid.nodes)
+        memory, controls, coefficients, extrapolations, rows, infos, reached, steps, stages = f.arguments
+        numbers = self._pointer(self.numbers, 0)
+        f.store(1.0, numbers, ALIVE * P, P)
+        step, nodes = Variable(f, f.value(0, "i64")), len(self.grid.nodes)
 
         def going() -> Value:
-            return (step.get() < stop) & f.any(f.load(numbers, ALIVE * P, P) > 0.0)
+            return (step.get() < steps) & f.any(f.load(numbers, ALIVE * P, P) > 0.0)
 
         with f.while_(going):
             with f.loop(stages) as stage:
@@ -639,6 +619,11 @@ class Core(EliminationCode):
             self._put(weight, self.weights, k)
         self._write_shift([self.y, *self.past], self.points)
 
+    def _write_start(self) -> None:
+        """All that depends on the parameters alone."""
+        f = self._now = self.module.function("start", ["memory"], exported=True)
+        f.call(self.setup, *f.arguments)
+
     def _write_evaluate(self) -> None:
         """The state at y and history terms, with y at points between nodes corrected in some turns."""
         names = ["memory", "coefficients", "control", "n_turns"]
@@ -683,6 +668,7 @@ class Core(EliminationCode):
             self._write_time_history()
         self._write_stage()
         self._write_guesses()
+        self._write_start()
         self._write_run()
         if not self.batch:
             self._write_evaluate()
@@ -715,128 +701,6 @@ class Core(EliminationCode):
             return Evaluated(y.copy(), records.copy(), error, tip[0].copy())
 
         return evaluate
-
-    def integrate(
-        self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: States,
-        span: tuple[int, int],
-    ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
-        """Solve a span of steps of each robot until one fails.
-
-        Parameters (n,) of the system, or (robots, n); controls (robots, T, c) or (robots, T, stages * c) and
-        states (robots, ...). Returns the numbers of steps done, the states after them, and rows. In a batch,
-        a robot with a failed step waits for the others in its vector; its last state is not kept, except if
-        the first step failed.
-        """
-        e, P, stages, (start, stop) = self.equations, self.P, np.size(steps.ends), span
-        count, nodes, size = stop - start, len(self.grid.nodes), len(controls)
-        vectors = -(-size // P)
-
-        def in_lanes(values: np.ndarray) -> np.ndarray:
-            """Return values (vectors, lanes, ...); the last vector is filled with the last robot."""
-            if vectors * P > size:
-                values = values[np.minimum(np.arange(vectors * P), size - 1)]
-            return values.reshape(vectors, P, *values.shape[1:])
-
-        held = 1 if controls.shape[2] == e.nc else stages
-        lane_controls = in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
-        lane_controls = np.broadcast_to(lane_controls, (vectors, P, count, stages, e.nc))
-        lane_controls = np.ascontiguousarray(np.moveaxis(lane_controls, 1, -1))
-        lane_parameters = in_lanes(np.broadcast_to(parameters, (size, self.params.size)))
-        table = coefficients_of(steps, span)
-        rows = np.zeros((vectors, count, stages, nodes, self.strands * e.numbers, P))
-        infos = np.zeros((vectors, count, stages, 8 + e.k, P))
-        reached, length = np.zeros((2, vectors, P))
-        first_motions = np.empty((vectors, self._motion.stop - self._motion.start))
-        for array, value in self._parts_of(states):
-            self._put_in(first_motions, array, in_lanes(value), self._motion.start)
-        last_motions = np.empty_like(first_motions)
-
-        memory, empty = self._empty_memory(), self._empty.copy()
-        newton = steps.settings.newton
-        for array, numbers in (
-            (self.options, dataclasses.astuple(newton)), (self.tip_offset, steps.tip_offset)
-        ):  # fmt: skip
-            self._put_in(empty[None], array, np.broadcast_to(numbers, (1, P, 1, array.size)))
-
-        def solve(k: int, stop: int, *results: np.ndarray) -> None:
-            memory[:] = empty
-            memory[self._motion] = first_motions[k]
-            self._put_in(memory[None], self.params, lane_parameters[k][None, :, None])
-            arrays = memory, lane_controls[k], table, self._guesses, *results
-            self._functions["run"](*(each.ctypes.data for each in arrays), 0, stop, stages)
-            last_motions[k], length[k] = (
-                memory[self._motion],
-                self._numbers(memory[None], self.length)[0, :, 0, 0],
-            )
-
-        for k in range(vectors):
-            solve(k, count, rows[k], infos[k], reached[k])
-            if not self.batch and reached[k, 0] < count:
-                # again, for the state before the step that failed
-                solve(k, int(reached[k, 0]), rows[k].copy(), infos[k].copy(), reached[k].copy())
-        done = reached.reshape(-1)[:size].astype(int)
-        lasts = self._states(last_motions, states)
-        for one, other in zip(states, lasts, strict=True):
-            other[done == 0] = one[done == 0]
-        robot_rows, robot_infos = (
-            np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
-        )
-        found = self._rows(robot_rows, robot_infos, newton.acceptable, length.reshape(-1)[:size], done)
-        return start + done, lasts, found
-
-    def _rows(
-        self, rows: np.ndarray, infos: np.ndarray, acceptable: float, length: np.ndarray, done: np.ndarray
-    ) -> StepRows:
-        """Return rows (robots, steps, ...); a step's row is that of its last stage."""
-        if self.strands > 1:
-            rows = self.equations.joined(rows.reshape(*rows.shape[:-1], self.strands, -1))
-        numbers, unknowns = infos[..., :8], infos[..., 8:]
-        error = np.max(numbers[..., ERROR], axis=-1)
-        off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE)
-        result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
-        result = np.where(error <= acceptable, result, int(Result.NO_CONVERGENCE))
-        result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
-        time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
-        corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
-        return StepRows(
-            rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,
-            rows[:, :, :-1], unknowns[:, :, :-1],
-        )  # fmt: skip
-
-    def _parts_of(self, states: States) -> Iterator[tuple[Array, np.ndarray]]:
-        """Yield the arrays of a motion's state with their values (robots, places, size)."""
-        for name, arrays in self._parts.items():
-            values = np.asarray(getattr(states, name), float)
-            values = values.reshape(len(values), len(arrays), -1, self._width(arrays[0]))
-            for part, array in enumerate(arrays):
-                yield array, self._by_strand(array, values[:, part])
-
-    def _states(self, motions: np.ndarray, before: States) -> States:
-        """Return the states in memories (vectors, n)."""
-        found = {}
-        for name, arrays in self._parts.items():
-            shape = np.shape(getattr(before, name))
-            width = self._width(arrays[0])
-            count = int(np.prod(shape[1:])) // (len(arrays) * width)
-            parts = [
-                self._joined(array, self._numbers(motions, array, self._motion.start), count)
-                for array in arrays
-            ]
-            values = np.stack(parts, axis=2).reshape(-1, len(arrays), count, width)
-            found[name] = values[: shape[0]].reshape(shape)
-        return type(before)(**found)
-
-
-def coefficients_of(steps: StepCoefficients, span: tuple[int, int]) -> Float[np.ndarray, "T stages n"]:
-    """Return coefficients and the time since row 0 (s) of all stages of a span of steps."""
-    (start, stop), stages = span, np.size(steps.ends)
-    coefficients = np.asarray(steps.table)
-    coefficients = coefficients.reshape(len(coefficients), stages, -1)
-    table = np.empty((stop - start, stages, coefficients.shape[-1] + 1))
-    table[..., :-1] = coefficients[np.minimum(np.arange(start, stop), len(coefficients) - 1)]
-    table[..., -1] = (np.arange(start, stop)[:, None] + np.asarray(steps.ends)) * steps.dt
-    return table
 
 
 def _sum(values: Iterable[Value]) -> Value:

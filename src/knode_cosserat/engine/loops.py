@@ -8,7 +8,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
-from knode_cosserat.engine.core import Core, Shape, coefficients_of
+from knode_cosserat.engine.core import Core
+from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
@@ -46,7 +47,7 @@ def solve_steps(
 
     The state is a `StateHistory`; of equilibria, solved in turn, it is y at all points. Controls are (T, c).
     A batch has controls (B, T, c), as many states, and one system or as many: its robots are solved side by
-    side in the lanes of vectors, each until a step fails (see `Core.integrate`).
+    side in the lanes of vectors, each until a step fails (see `Motions.solve`).
     """
     alone, is_static = np.ndim(controls) == 2, steps.settings.time is None
     core = core_of(Pattern.of(system), steps.settings, robots=not alone and len(controls) > 1)
@@ -56,7 +57,9 @@ def solve_steps(
         parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
     states = Shape(states) if is_static else states
     controls, states = jax.tree.map(lambda leaf: np.asarray(leaf)[None if alone else ...], (controls, states))
-    done, last, rows = core.integrate(parameters, controls, steps, states, span)
+    motions = Motions(core, parameters, states, steps)
+    done, rows = motions.solve(controls, span)
+    last = motions.states
     found = done, last.y if is_static else last, rows
     return jax.tree.map(lambda leaf: leaf[0], found) if alone else found
 

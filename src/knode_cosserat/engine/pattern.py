@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import threading
 from collections.abc import Callable, Iterable
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import jax
 import numpy as np
@@ -14,6 +14,7 @@ from jaxtyping import Float
 from knode_cosserat.engine.codegen import Module, vector_lanes
 from knode_cosserat.engine.equations import MOST_OPERATIONS, PLACE, RUN, STEP, constant_zeros, is_moving
 from knode_cosserat.engine.program import EngineError, Program
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced
 
 #: compiled code, or the reason why there is none, by what it depends on; the last used come last
@@ -33,8 +34,9 @@ class Pattern:
     #: shape of each leaf, and its zeros as bits
     zeros: tuple[tuple[tuple[int, ...], bytes], ...]
 
-    @classmethod
-    def of(cls, system: System) -> Self:
+    @staticmethod
+    @kept
+    def of(system: System) -> Pattern:
         """Return the pattern of a system; zeros of a batch are those of all, and no traced value is one."""
         leaves, structure = jax.tree.flatten(system)
         axis, zeros = np.ndim(system.length), []
@@ -42,7 +44,7 @@ class Pattern:
             known = np.ones(np.shape(leaf)) if is_traced(leaf) else np.asarray(leaf, float)
             # any number for a parameter that is not zero in all robots of a batch
             zeros.append(constant_zeros(np.any(is_moving(known), axis=tuple(range(axis))).astype(float)))
-        return cls(structure, masks_of(zeros))
+        return Pattern(structure, masks_of(zeros))
 
     @property
     def system(self) -> System:
@@ -84,6 +86,7 @@ def compiled(key: Any, build: Callable[[], Code]) -> Code:
     return code
 
 
+@kept
 def parameters_of(system: System) -> np.ndarray:
     """Return all numeric parameters of a system in one vector."""
     return np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])

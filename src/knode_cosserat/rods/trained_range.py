@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.parts import Part
@@ -132,8 +133,22 @@ def _beyond(layout: Layout, values: Any, low: Any, high: Any) -> Any:
 
 
 def without_range(tree: Any) -> Any:
-    """Return a system, or any tree of systems, without ranges, as the solvers' programs expect."""
+    """Return a system, or any tree of systems, without ranges, as the solvers' programs expect.
 
+    For the same system it is the same one, with arrays of its own.
+    """
+    return _bare_system(tree) if isinstance(tree, System) else _bare(tree)
+
+
+@kept
+def _bare_system(system: System) -> System:
+    bare: System = jax.tree.map(
+        lambda leaf: leaf.copy() if isinstance(leaf, np.ndarray) else leaf, _bare(system)
+    )
+    return bare
+
+
+def _bare(tree: Any) -> Any:
     def is_range(node: Any) -> bool:
         return isinstance(node, TrainedRange)
 

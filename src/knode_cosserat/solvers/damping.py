@@ -10,6 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.recovery import natural_time
@@ -65,12 +66,10 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
     for system in _robots_of_users(robot):
         # the numbers of this robot are known, also inside a `jit` of the caller
         with jax.core.eval_context():
-            strand = strand_of(system)
-            if not getattr(strand, "is_undamped", False):
-                continue
-            frequency = float(np.min(strand.bending_frequency))
-            bending = np.asarray(strand.Kbt)[..., :2, :2]
-            stiffness = float(np.max(np.linalg.eigvalsh(bending)[..., 0]))
+            vibration = _undamped_vibration(system)
+        if vibration is None:
+            continue
+        frequency, stiffness = vibration
         damping = LOSS_FACTOR * stiffness / (2.0 * np.pi * frequency)
         warnings.warn(
             "bending_damping is 0 and nothing else damps the motion: vibrations do not decay, and "
@@ -81,3 +80,14 @@ def warn_if_undamped(robot: Any, dt: float) -> None:
             stacklevel=3,
         )
         return
+
+
+@kept
+def _undamped_vibration(system: System) -> tuple[float, float] | None:
+    """Return frequency (Hz) and bending stiffness (N m²) of a robot without damping; None for any other."""
+    strand = strand_of(system)
+    if not getattr(strand, "is_undamped", False):
+        return None
+    bending = np.asarray(strand.Kbt)[..., :2, :2]
+    stiffness = float(np.max(np.linalg.eigvalsh(bending)[..., 0]))
+    return float(np.min(strand.bending_frequency)), stiffness

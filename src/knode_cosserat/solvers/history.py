@@ -17,7 +17,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat._modules import module_of
 from knode_cosserat.engine.pattern import values_along
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.solvers.grid import at_places, grid_of
 from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, places_of, row_of
@@ -72,7 +74,10 @@ class SolverState(eqx.Module):
     def after(self, history: StateHistory, dt: float, steps: int, settings: Settings) -> SolverState:
         """Return the state after so many steps (s)."""
         distinct = self.known(settings) + steps
-        return SolverState(history, dt, settings.uses_rate, distinct if distinct < settings.memory else None)
+        return module_of(
+            SolverState, history=history, dt=dt, rate_known=settings.uses_rate,
+            distinct=distinct if distinct < settings.memory else None,
+        )  # fmt: skip
 
 
 def coefficient_table(settings: Settings, dt: float, known: int = 1) -> np.ndarray:
@@ -165,11 +170,13 @@ def _rest(system: System, s: Any, _: Any) -> Any:
     return system.rest(s)
 
 
+@kept
 def rest_record(system: System) -> Float[Any, "nodes x"]:
     """Return y and z (nodes, y + z) of the system at rest."""
     return unloaded(system, LOBATTO2)[0]
 
 
+@kept
 def resting_history(system: System, settings: Settings) -> StateHistory:
     """Return the history of the robot at rest under zero control, at time 0."""
     if system.mixed:

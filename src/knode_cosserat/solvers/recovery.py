@@ -17,6 +17,7 @@ import numpy as np
 from knode_cosserat.engine import loops as engine
 from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.aspects import Ends
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
@@ -449,6 +450,7 @@ def _scales_at(system: System, s: Any, _: Any) -> Any:
     return system.scales().y
 
 
+@kept
 def natural_time(system: System) -> float | None:
     """Return the time (s) in which the system moves by its own length; None if its scales do not give it."""
     layout = strand_of(system).y_layout

@@ -21,8 +21,8 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
-from knode_cosserat.engine.core import Shape
 from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.motions import Motions, Shape
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, SolvedSteps, TangentCore
@@ -141,8 +141,9 @@ def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
     leaves, controls = arrays[: spec.leaves], arrays[spec.leaves]
     task, parameters = spec.task, np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
     states = (StateHistory if task.settings.time else Shape)(*arrays[spec.leaves + 1 :])
-    done, last, rows = core.integrate(parameters, controls, task.coefficients, states, (0, task.steps))
-    return [done, *last, *rows]
+    motions = Motions(core, parameters, states, task.coefficients)
+    done, rows = motions.solve(controls, (0, task.steps))
+    return [done, *motions.states, *rows]
 
 
 solve_p = _primitive("solve", _solved_shapes, _core_of_solves, _solve)

@@ -13,9 +13,11 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 from knode_cosserat.engine import loops as engine
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
@@ -180,17 +182,7 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
         return
     ny, nz = system.y_layout.size, system.z_layout.size
     z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
-    radius = np.asarray(strand.section.radius)[..., None]
-    if not strand.is_uniform:
-        still = np.zeros(system.control_layout.size)
-        # on the far side of the ends of sections, inside the rod, as z
-        s = (np.arange(system.nodes) + 0.2 * INWARD) / (system.nodes - 1)
-        s[-1] -= 0.4 * INWARD / (system.nodes - 1)
-
-        def along(rod: Any) -> Any:
-            return np.asarray(materials(rod, s * rod.length, still).radius)
-
-        radius = map_robots(along, strand) if many else along(strand)
+    radius = _radii(strand, system.control_layout.size)
     bent = np.linalg.norm(strand.z_layout.get(z, "u")[..., :2], axis=-1) * radius[..., None, :, None]
     stretch = np.linalg.norm(strand.z_layout.get(z, "v"), axis=-1)
     found = []
@@ -205,6 +197,22 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
             "follows them: check loads, stiffness and radius, and their units",
             stacklevel=4,
         )
+
+
+@kept
+def _radii(rod: Any, controls: int) -> Float[np.ndarray, "... nodes"]:
+    """Return the radius (m) at the nodes of a rod or of a batch of rods, or one for all nodes."""
+    if rod.is_uniform:
+        return np.asarray(rod.section.radius)[..., None]
+    still = np.zeros(controls)
+    # on the far side of the ends of sections, inside the rod, as z
+    s = (np.arange(rod.nodes) + 0.2 * INWARD) / (rod.nodes - 1)
+    s[-1] -= 0.4 * INWARD / (rod.nodes - 1)
+
+    def along(rod: Any) -> Any:
+        return np.asarray(materials(rod, s * rod.length, still).radius)
+
+    return map_robots(along, rod) if np.ndim(rod.length) else along(rod)
 
 
 def warn_of_results(rows: StepRows) -> None:

@@ -14,13 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat._modules import module_of
 from knode_cosserat._numbers import real_array
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
-from knode_cosserat.solvers.history import StepRows, at_stages
+from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
+from knode_cosserat.solvers.result import ResultCodes
 from knode_cosserat.solvers.rollout import Solves, rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -132,9 +134,11 @@ def simulate(
     task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
     if is_traced((system, controls, initial)):
         found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
+        found = dataclasses.replace(found, system=system)
     else:
-        found = _plain(bare, _initial(bare, controls, before, settled, task), on_failure, progress)
-    return marked(dataclasses.replace(found, system=system), initial)
+        run = _initial(bare, controls, before, settled, task)
+        found = _trajectory(system, run, *_plain(bare, run, on_failure, progress))
+    return marked(found, initial)
 
 
 def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
@@ -322,8 +326,8 @@ def _initial(system: Any, controls: Any, initial: Any, settled: bool, task: Time
     return at_start, task, acting
 
 
-def _plain(system: System, run: Any, on_failure: str, progress: bool) -> Trajectory:
-    """Simulate with recovery; `run` as from `_initial`."""
+def _plain(system: System, run: Any, on_failure: str, progress: bool) -> tuple[StepRows, StateHistory]:
+    """Return the rows and the last history, with recovery; `run` as from `_initial`."""
     at_start, task, controls = run
     solve = run_batch if np.ndim(controls) == 3 else run_one
     start = at_start.state.history, at_start.control
@@ -334,7 +338,7 @@ def _plain(system: System, run: Any, on_failure: str, progress: bool) -> Traject
     rows = rows._replace(result=carried_results(rows.result, at_start.result))
     warn_of_coarse_grids(system, task.settings, rows)
     warn_outside_rod_theory(system, rows)
-    return _trajectory(system, run, rows, history)
+    return rows, history
 
 
 @functools.partial(jax.jit, static_argnames=("settled", "spec"))
@@ -378,4 +382,8 @@ def _trajectory(system: System, run: Any, rows: StepRows, history: Any) -> Traje
         name: numeric.concatenate([numeric.expand_dims(first[name], axis), values], axis)
         for name, values in every.items()
     }
-    return Trajectory(system, settings, time, **joined, initial_state=initial, final_state=final)
+    joined["result"] = ResultCodes.of(joined["result"])
+    return module_of(
+        Trajectory, system=system, settings=settings, time=time, **joined, initial_state=initial,
+        final_state=final,
+    )  # fmt: skip
