@@ -26,7 +26,7 @@ from knode_cosserat.control.commands import (
 from knode_cosserat.control.qp import QuadraticProgram
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
-from knode_cosserat.estimation.online import errors_along, split_record
+from knode_cosserat.estimation.online import Structure, errors_along, split_record
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.rods.aspects import Drawing
@@ -207,21 +207,18 @@ class Prediction(NamedTuple):
     path: Float[Any, "T 3"]
 
 
-@functools.partial(jax.jit, static_argnames=("target", "limited"))
+@functools.partial(jax.jit, static_argnames=("structure", "target", "limited", "columns"))
 def _outputs(
-    system: System, motion: tuple[Any, Any], reference: Any, target: Output, limited: tuple[Output, ...]
-) -> Any:
-    """Return errors of the target and the limited outputs, with their tangents, and the tip's path.
-
-    `motion` is its records and their tangents.
-    """
-    records, d_records = motion
-    steps, columns = len(records), d_records.shape[-1]
-    error, slopes = errors_along(system, target, records, d_records, reference)
-    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((columns, steps, 0))]
+    structure: Structure, target: Output, limited: tuple[Output, ...], columns: tuple[int, ...],
+    numbers: Any, records: Any, d_records: Any, reference: Any,
+) -> Any:  # fmt: skip
+    """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
+    system, (steps, *_, count) = structure.system(numbers), d_records.shape
+    error, slopes = errors_along(system, target, records, d_records, reference, columns=columns)
+    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((count, steps, 0))]
     for output in limited:
         zero = jnp.zeros((steps, output.size))
-        value, slope = errors_along(system, output, records, d_records, zero)
+        value, slope = errors_along(system, output, records, d_records, zero, columns=columns)
         values.append(value)
         moved.append(slope)
     path = Drawing.of(system).positions(split_record(system, records[:, -1])[0])
@@ -267,6 +264,8 @@ class PlanController(Controller):
         self._basis = self.knots.basis
         if self.limits.lag:
             self._basis = lag_weights(self._basis, self.limits.lag, self.dt)
+        #: derivatives of the horizon's controls by the plan's numbers, one after the other
+        self._by_plan = np.einsum("tk,ij->kjti", self._basis, np.eye(count)).reshape(-1, knots.horizon, count)
         self.reset(np.asarray(self.limits.safe))
 
     @classmethod
@@ -339,21 +338,23 @@ class PlanController(Controller):
 
         It is linearised by the plan's numbers and by the directions in which the state is uncertain.
         """
-        model, belief, basis = self.observer.model, self.observer.belief, self._basis
-        knots = self.with_acting(plan)
-        (count, c), steps = knots.shape, len(basis)
-        by_plan = np.einsum("tk,ij->kjti", basis, np.eye(c)).reshape(count * c, steps, c)
-        spread = jax.tree.map(
-            lambda part: np.concatenate([np.zeros((count * c, *part.shape[1:])), part]), belief.spread
+        model, belief = self.observer.model, self.observer.belief
+        knots, by_plan = self.with_acting(plan), self._by_plan
+        spread = belief.spread.wider(len(by_plan), 0)
+        none = np.zeros((len(belief.spread.records), *by_plan.shape[1:]))
+        columns = model.columns(self.target, *limited)
+        moved, motion = model.rollout(
+            belief._replace(spread=spread), self._basis @ knots, np.concatenate([by_plan, none]), columns
         )
-        d_controls = np.concatenate([by_plan, np.zeros((len(belief.spread.records), steps, c))])
-        system, motion = model.rollout(belief._replace(spread=spread), basis @ knots, d_controls)
-        if not motion.solved:
+        if motion is None:
             return None
-        outputs = _outputs(system, (motion.records, motion.d_records), wanted, self.target, limited)
+        outputs = _outputs(
+            moved.structure, self.target, limited, columns, moved.numbers, motion.records, motion.d_records,
+            wanted,
+        )  # fmt: skip
         error, slopes, value, slope, path = map(np.asarray, outputs)
         # without the derivatives by the acting controls
-        n, first = plan.size, count * c
+        n, first = plan.size, len(by_plan)
         return Prediction(error, slopes[:n], slopes[first:], value, slope[:n], slope[first:], path)
 
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:
