@@ -144,7 +144,7 @@ class KalmanObserver:
             self._spread_start()
         if n:
             self._rollback = Rollback(self.model, self.output, self.belief.x, self.dt)
-            self._rollback.compile(past, len(self.control))
+            self._rollback.compile(self.record)
 
     def _spread_start(self) -> None:
         """Set the columns to those of a robot at rest under controls that varied before the start."""

@@ -23,13 +23,15 @@ from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import StateHistory
+from knode_cosserat.solvers.history import StateHistory, StepRows
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.settings import Settings
 
 #: rows of any numbers by which the numbers are found on which an output depends
 ROWS = 3
+#: robots that are kept: that of the estimate, and earlier ones with which a rollback compares it
+ROBOTS = 8
 
 
 class Spread(NamedTuple):
@@ -132,8 +134,8 @@ class OnlineModel:
         self.parameters, self.dt, self.settings = parameters, dt, settings
         self._structure = Structure.of(parameters.robot)
         self._coefficients = self.task(1).coefficients
-        #: the last coordinates with their robot, and machine code by the masks of numbers
-        self._last: tuple[bytes, MovedRobot] | None = None
+        #: robots by their coordinates, the newest last, and machine code by the masks of numbers
+        self._robots: dict[bytes, MovedRobot] = {}
         self._codes: dict[tuple[bytes, bytes], tuple[Core, TangentCore]] = {}
         self._columns: dict[Output, np.ndarray] = {}
 
@@ -153,14 +155,15 @@ class OnlineModel:
         loop, as soon as they move.
         """
         key = np.asarray(x, dtype=float).tobytes()
-        if self._last is None or self._last[0] != key:
+        if key not in self._robots:
             numbers, directions = map(np.asarray, _numbers(self.parameters, x))
             moving = np.any(directions != 0.0, axis=0)
             numbers = with_moving(numbers, moving)
             core, tangents = self._code(numbers, moving)
-            moved = MovedRobot(self._structure, numbers, directions[:, moving], core, tangents)
-            self._last = key, moved
-        return self._last[1]
+            if len(self._robots) == ROBOTS:
+                del self._robots[next(iter(self._robots))]
+            self._robots[key] = MovedRobot(self._structure, numbers, directions[:, moving], core, tangents)
+        return self._robots[key]
 
     def _code(self, numbers: np.ndarray, moving: np.ndarray) -> tuple[Core, TangentCore]:
         """Return the machine code for the zeros among these numbers, and for those that move."""
@@ -184,6 +187,20 @@ class OnlineModel:
             self._columns[output] = np.flatnonzero(depends)
         return tuple(sorted({int(k) for output in outputs for k in self._columns[output]}))
 
+    def simulated(
+        self, x: Float[np.ndarray, " n"], past: StateHistory, controls: Float[np.ndarray, "T c"]
+    ) -> tuple[StateHistory, StepRows] | None:
+        """Return the last history and the rows of a motion; None if it was not solved."""
+        moved, steps = self.moved(x), len(controls)
+        states = StateHistory(*(np.asarray(leaf)[None] for leaf in past))
+        done, after, rows = moved.core.integrate(
+            moved.numbers, controls[None], self._coefficients, states, (0, steps)
+        )
+        if done[0] < steps:
+            return None
+        after = StateHistory(*(leaf[0] for leaf in after))._replace(t0=past.t0 + steps * self.dt)
+        return after, StepRows(*(leaf[0] for leaf in rows))
+
     def rollout(
         self, belief: Belief, controls: Float[np.ndarray, "T c"], d_controls: Float[np.ndarray, "k T c"],
         columns: tuple[int, ...],
@@ -193,38 +210,32 @@ class OnlineModel:
         A tangent is that along a direction of the belief's spread, with the tangents of the controls beside
         it. Those of rows are returned for the numbers `columns` (among N * x) of each record.
         """
-        moved, settings, past, spread = self.moved(belief.x), self.settings, belief.past, belief.spread
-        steps, used = len(controls), spread.rate.shape[1]
-        states = StateHistory(*(np.asarray(leaf)[None] for leaf in past))
-        done, after, rows = moved.core.integrate(
-            moved.numbers, controls[None], self._coefficients, states, (0, steps)
-        )
-        if done[0] < steps:
+        past, spread, settings, steps = belief.past, belief.spread, self.settings, len(controls)
+        moved, solved = self.moved(belief.x), self.simulated(belief.x, past, controls)
+        if solved is None:
             return moved, None
-        after, rows = (type(each)(*(leaf[0] for leaf in each)) for each in (after, rows))
+        (after, rows), used = solved, spread.rate.shape[1]
         own, d_own = (
             at_all_stages(self.robot, settings, each) for each in (controls, np.moveaxis(d_controls, 0, -1))
         )
-        solved = SolvedSteps(
+        data = SolvedSteps(
             moved.numbers, table_of(self._coefficients, steps, float(past.t0)), own, *rows.every_stage,
             np.asarray(past.records)[:, :used], np.asarray(past.rate)[:used],
         )  # fmt: skip
         d_records, d_rate = (np.moveaxis(part, 0, -1) for part in (spread.records, spread.rate))
         last, (d_rows, _) = moved.tangents.solve(
-            solved, (moved.directions, spread.parameters.T), d_own, (d_records, d_rate)
+            data, (moved.directions, spread.parameters.T), d_own, (d_records, d_rate)
         )
         d_rows = d_rows[settings.stages - 1 :: settings.stages]
         d_rows = d_rows[:, *np.divmod(columns, rows.records.shape[-1])]
         spread = Spread(*(np.moveaxis(part, -1, 0) for part in last[2:]), spread.parameters)
-        after = after._replace(t0=past.t0 + steps * self.dt)
         return moved, Motion(after, rows.records, d_rows, spread)
 
     def predicted(
         self, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any], output: Output
     ) -> Predicted | None:
-        """Return a motion under controls, with new columns for their uncertainty and parameters' drift.
+        """Return a motion under controls, with uncertain controls and drift; None if it was not solved.
 
-        None if it was not solved.
         The new columns are T c for the controls (T, c), step by step, and n for the parameters. `measured`
         (T, p) are the measurements after each control; NaN: none. `deviations` are those of each control
         (c,), independent in each step, and of the drift of each parameter (n,).
@@ -246,14 +257,9 @@ class OnlineModel:
         )
         return Predicted(motion.past, motion.records[-1], motion.spread, *map(np.asarray, seen))
 
-    def errors(
-        self, x: Float[Any, " n"], past: StateHistory, controls: Any, measured: Any, output: Output
-    ) -> Float[Any, "T e"]:
-        """Return the errors of the motion with these parameters; infinite after a failure."""
-        system, steps = self.moved(x).system, len(controls)
-        done, _, rows = self.task(steps).solve(system, controls, past, (0, steps))
-        errors = np.asarray(errors_of(system, output, rows.records, measured))
-        return np.where((np.arange(steps) < done)[:, None], errors, np.inf)
+    def errors(self, x: Float[np.ndarray, " n"], records: Any, measured: Any, output: Output) -> np.ndarray:
+        """Return the errors (T, e) of an output in rows of a motion with these parameters."""
+        return np.asarray(errors_of(self.moved(x).system, output, records, measured))
 
 
 @jax.jit
