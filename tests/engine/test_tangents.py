@@ -148,7 +148,7 @@ def test_an_adapted_zero_is_no_constant_of_the_code():
     model = OnlineModel(adapted_model(robot, [Adapted("loads.0.mass", 0.03)])[0].robot, DT)
     cores, still = [], np.zeros(robot.control_layout.size)
     for x in (0.0, 0.5):
-        system, _ = model.moved(np.array([x]))
+        system = model.moved(np.array([x])).system
         cores.append(loops.core_of(Pattern.of(system), model.settings, robots=False))
         assert (
             model.task(1).solve(system, still[None], resting_history(system, model.settings), (0, 1))[0] == 1

@@ -44,11 +44,14 @@ def linear_model(
     # each control's impulse in the first period
     pulses = np.zeros((count, STEPS, count))
     pulses[:, 0] = np.eye(count)
-    system, motion = observer.model.rollout(belief, np.tile(control, (STEPS, 1)), pulses)
-    if not bool(motion.solved):
+    columns = observer.model.columns(output)
+    moved, motion = observer.model.rollout(belief, np.tile(control, (STEPS, 1)), pulses, columns)
+    if motion is None:
         raise RuntimeError("the motion about the equilibrium was not solved")
     zero = np.zeros((STEPS, output.size))
-    values, slopes = errors_along(system, output, motion.records, motion.d_records, zero)
+    values, slopes = errors_along(
+        moved.system, output, motion.records, motion.d_records, zero, columns=columns
+    )
     return *realized(np.moveaxis(np.asarray(slopes), 0, -1)), np.asarray(values[-1])
 
 

@@ -66,7 +66,7 @@ class MPPI(PlanController):
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the errors (k, T, e) of each plan's motion, and True for solved motions."""
         model, belief, steps = self.observer.model, self.observer.belief, len(self._basis)
-        system = model.moved(belief.x)[0]
+        system = model.moved(belief.x).system
         controls = np.einsum("tn,knc->ktc", self._basis, self.with_acting(plans))
         histories = jax.tree.map(
             lambda leaf: np.broadcast_to(leaf, (len(plans), *np.shape(leaf))), belief.past

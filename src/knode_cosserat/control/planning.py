@@ -26,7 +26,7 @@ from knode_cosserat.control.commands import (
 from knode_cosserat.control.qp import QuadraticProgram
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver, ObserverError
-from knode_cosserat.estimation.online import errors_along, split_record
+from knode_cosserat.estimation.online import Structure, errors_along, split_record
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.rods.aspects import Drawing
@@ -133,32 +133,40 @@ class Weights:
     preferred: Any = None
 
 
-class Tracking(NamedTuple):
+class Tracking:
     """Cost and limits of a plan, without the predicted errors.
 
     The cost is the sum of squared errors, each divided by its acceptable size (`noise`), of the changes of
     controls in one period, and of their distances from the preferred ones, both relative to their range.
     """
 
-    knots: Knots
-    limits: ControlLimits
-    weights: Weights
-    noise: Float[np.ndarray, " e"]
-    dt: float
+    def __init__(
+        self, knots: Knots, limits: ControlLimits, weights: Weights, noise: Float[np.ndarray, " e"], dt: float
+    ):  # fmt: skip
+        self.limits, self.weights, self.noise = limits, weights, noise
+        self._spread = np.asarray(limits.high) - np.asarray(limits.low)
+        self._preferred = np.asarray(limits.safe if weights.preferred is None else weights.preferred)
+        self._changes, count = knots.changes, knots.count
+        self._by_plan = np.kron(self._changes, np.eye(len(self._spread)))
+        # a wanted error of one `noise` counts like a change over the whole range
+        scaled = self._by_plan / np.tile(self._spread, count)[:, None]
+        self._by_change = weights.change * scaled.T
+        self._effort = weights.effort * np.tile(1.0 / self._spread, count)
+        self._H = self._by_change @ scaled + np.diag(self._effort * np.tile(1.0 / self._spread, count))
+        self._most = np.tile(np.asarray(limits.rate) * dt, count)
+        self._low, self._high = (np.tile(np.asarray(end), count) for end in (limits.low, limits.high))
 
-    def _moves(self, plan: np.ndarray, control: np.ndarray) -> tuple[Any, Any, Any]:
-        """Return the range of controls, changes from knot to knot, and distances from preferred controls."""
-        limits, preferred = self.limits, self.weights.preferred
-        changes = self.knots.changes @ plan
+    def _moves(self, plan: np.ndarray, control: np.ndarray) -> tuple[Any, Any]:
+        """Return the changes from knot to knot, and the distances from the preferred controls."""
+        changes = self._changes @ plan
         changes[0] -= control
-        away = plan - np.asarray(limits.safe if preferred is None else preferred)
-        return np.asarray(limits.high) - np.asarray(limits.low), changes, away
+        return changes, plan - self._preferred
 
     def cost(self, error: Float[np.ndarray, "T e"], plan: np.ndarray, control: np.ndarray) -> float:
         """Return the cost of a plan with these errors, after a control; free errors are NaN."""
-        spread, changes, away = self._moves(plan, control)
-        cost = np.nansum((error / self.noise) ** 2) + self.weights.change * np.sum((changes / spread) ** 2)
-        return float(cost + self.weights.effort * np.sum((away / spread) ** 2))
+        weights, (changes, away) = self.weights, self._moves(plan, control)
+        cost = np.nansum((error / self.noise) ** 2) + weights.change * np.sum((changes / self._spread) ** 2)
+        return float(cost + weights.effort * np.sum((away / self._spread) ** 2))
 
     def program(
         self, error: Float[np.ndarray, "T e"], by_plan: Float[np.ndarray, "n T e"], plan: np.ndarray,
@@ -172,21 +180,15 @@ class Tracking(NamedTuple):
             plan: (knots, c).
             control: the control that acts before the plan (c,).
         """
-        limits, w, c, count = self.limits, self.weights, len(control), self.knots.count
         scale = np.where(np.isfinite(error), 1.0 / self.noise, 0.0)
         e = np.where(scale > 0.0, error, 0.0) * scale
         S = (np.where(scale > 0.0, by_plan, 0.0) * scale).reshape(len(by_plan), -1)
-        spread, changes, away = self._moves(plan, control)
-        A = np.kron(self.knots.changes, np.eye(c))
-        # a wanted error of one `noise` counts like a change over the whole range
-        D, effort = A / np.tile(spread, count)[:, None], np.tile(1.0 / spread, count)
-        H = S @ S.T + w.change * D.T @ D + w.effort * np.diag(effort**2)
-        g = S @ e.ravel() + w.change * D.T @ (changes / spread).ravel()
-        g = g + w.effort * effort * (away / spread).ravel()
-        most = np.tile(np.asarray(limits.rate) * self.dt, count)
-        below, above = -most - changes.ravel(), most - changes.ravel()
-        low, high = (np.tile(np.asarray(end), count) - plan.ravel() for end in (limits.low, limits.high))
-        return QuadraticProgram(H, g, low, high, A, below, above)
+        changes, away = self._moves(plan, control)
+        g = S @ e.ravel() + self._by_change @ (changes / self._spread).ravel()
+        g = g + self._effort * (away / self._spread).ravel()
+        below, above = -self._most - changes.ravel(), self._most - changes.ravel()
+        low, high = self._low - plan.ravel(), self._high - plan.ravel()
+        return QuadraticProgram(S @ S.T + self._H, g, low, high, self._by_plan, below, above)
 
 
 # predictions
@@ -207,21 +209,18 @@ class Prediction(NamedTuple):
     path: Float[Any, "T 3"]
 
 
-@functools.partial(jax.jit, static_argnames=("target", "limited"))
+@functools.partial(jax.jit, static_argnames=("structure", "target", "limited", "columns"))
 def _outputs(
-    system: System, motion: tuple[Any, Any], reference: Any, target: Output, limited: tuple[Output, ...]
-) -> Any:
-    """Return errors of the target and the limited outputs, with their tangents, and the tip's path.
-
-    `motion` is its records and their tangents.
-    """
-    records, d_records = motion
-    steps, columns = len(records), d_records.shape[-1]
-    error, slopes = errors_along(system, target, records, d_records, reference)
-    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((columns, steps, 0))]
+    structure: Structure, target: Output, limited: tuple[Output, ...], columns: tuple[int, ...],
+    numbers: Any, records: Any, d_records: Any, reference: Any,
+) -> Any:  # fmt: skip
+    """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
+    system, (steps, *_, count) = structure.system(numbers), d_records.shape
+    error, slopes = errors_along(system, target, records, d_records, reference, columns=columns)
+    values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((count, steps, 0))]
     for output in limited:
         zero = jnp.zeros((steps, output.size))
-        value, slope = errors_along(system, output, records, d_records, zero)
+        value, slope = errors_along(system, output, records, d_records, zero, columns=columns)
         values.append(value)
         moved.append(slope)
     path = Drawing.of(system).positions(split_record(system, records[:, -1])[0])
@@ -263,10 +262,12 @@ class PlanController(Controller):
         self.limits, self.knots = limits.of(observer.robot), knots
         count = observer.robot.control_layout.size
         _check_memory(observer.robot, knots.horizon, knots.count * count + observer.columns)
-        self.tracking = Tracking(self.knots, self.limits, weights, target.noise, self.dt)
+        self.tracking = Tracking(knots, self.limits, weights, target.noise, self.dt)
         self._basis = self.knots.basis
         if self.limits.lag:
             self._basis = lag_weights(self._basis, self.limits.lag, self.dt)
+        #: derivatives of the horizon's controls by the plan's numbers, one after the other
+        self._by_plan = np.einsum("tk,ij->kjti", self._basis, np.eye(count)).reshape(-1, knots.horizon, count)
         self.reset(np.asarray(self.limits.safe))
 
     @classmethod
@@ -339,21 +340,23 @@ class PlanController(Controller):
 
         It is linearised by the plan's numbers and by the directions in which the state is uncertain.
         """
-        model, belief, basis = self.observer.model, self.observer.belief, self._basis
-        knots = self.with_acting(plan)
-        (count, c), steps = knots.shape, len(basis)
-        by_plan = np.einsum("tk,ij->kjti", basis, np.eye(c)).reshape(count * c, steps, c)
-        spread = jax.tree.map(
-            lambda part: np.concatenate([np.zeros((count * c, *part.shape[1:])), part]), belief.spread
+        model, belief = self.observer.model, self.observer.belief
+        knots, by_plan = self.with_acting(plan), self._by_plan
+        spread = belief.spread.wider(len(by_plan), 0)
+        none = np.zeros((len(belief.spread.records), *by_plan.shape[1:]))
+        columns = model.columns(self.target, *limited)
+        moved, motion = model.rollout(
+            belief._replace(spread=spread), self._basis @ knots, np.concatenate([by_plan, none]), columns
         )
-        d_controls = np.concatenate([by_plan, np.zeros((len(belief.spread.records), steps, c))])
-        system, motion = model.rollout(belief._replace(spread=spread), basis @ knots, d_controls)
-        if not motion.solved:
+        if motion is None:
             return None
-        outputs = _outputs(system, (motion.records, motion.d_records), wanted, self.target, limited)
+        outputs = _outputs(
+            moved.structure, self.target, limited, columns, moved.numbers, motion.records, motion.d_records,
+            wanted,
+        )  # fmt: skip
         error, slopes, value, slope, path = map(np.asarray, outputs)
         # without the derivatives by the acting controls
-        n, first = plan.size, count * c
+        n, first = plan.size, len(by_plan)
         return Prediction(error, slopes[:n], slopes[first:], value, slope[:n], slope[first:], path)
 
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:

@@ -144,7 +144,7 @@ class KalmanObserver:
             self._spread_start()
         if n:
             self._rollback = Rollback(self.model, self.output, self.belief.x, self.dt)
-            self._rollback.compile(past, len(self.control))
+            self._rollback.compile(self.record)
 
     def _spread_start(self) -> None:
         """Set the columns to those of a robot at rest under controls that varied before the start."""
@@ -196,7 +196,7 @@ class KalmanObserver:
         self._roll_back()
         nothing = np.full((1, self.output.size), np.nan)
         motion = self.model.predicted(self.belief, control[None], nothing, self._deviations(), self.output)
-        if not bool(motion.solved):
+        if motion is None:
             raise ObserverError(f"the model's step at t = {self.time + self.dt:g} s was not solved")
         if self._rollback is not None:
             self._rollback.predicted(control, self.belief.past)
@@ -268,8 +268,9 @@ class KalmanObserver:
                 f"a measurement has shape {measured.shape}; allowed is ({self.output.size},): "
                 f"{', '.join(self.output.labels)}"
             )
+        moved = self.model.moved(self.belief.x)
         error = np.asarray(
-            online.measured_error(self.model, self.belief.x, self.record, measured, self.output)
+            online.measured_error(moved.structure, self.output, moved.numbers, self.record, measured)
         )
         known = np.isfinite(error)
         self._innovation, count = -error, int(known.sum())

@@ -9,20 +9,29 @@ from __future__ import annotations
 import functools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from knode_cosserat.engine.equations import with_moving
+from knode_cosserat.engine.core import Core
+from knode_cosserat.engine.equations import is_moving, with_moving
+from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.pattern import Pattern
+from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.history import StateHistory, StepRows
+from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
+
+#: rows of any numbers by which the numbers are found on which an output depends
+ROWS = 3
+#: robots that are kept: that of the estimate, and earlier ones with which a rollback compares it
+ROBOTS = 8
 
 
 class Spread(NamedTuple):
@@ -31,6 +40,17 @@ class Spread(NamedTuple):
     records: Float[Any, "m 2 used x"]
     rate: Float[Any, "m used x"]
     parameters: Float[Any, "m n"]
+
+    def wider(self, before: int, after: int) -> Spread:
+        """Return these columns with columns of zeros before and after them."""
+        sizes = len(self.records), before, after
+
+        def filled(part: Any) -> np.ndarray:
+            found = np.zeros((sum(sizes), *part.shape[1:]))
+            found[before : before + len(part)] = part
+            return found
+
+        return Spread(*map(filled, self))
 
     def combined(self, matrix: Float[np.ndarray, "m k"]) -> Spread:
         """Return k columns, each a combination of these."""
@@ -64,13 +84,60 @@ class Belief(NamedTuple):
         return Belief(x, self.past._replace(records=all_records, rate=all_rates), self.spread)
 
 
-class OnlineModel(eqx.Module):
-    """A robot with adapted parameters, and the numerical settings of its steps."""
+class Structure(NamedTuple):
+    """Structure of a system without its numbers: a constant of compiled programs."""
 
-    parameters: ParametrisedRobot
-    dt: float = eqx.field(static=True)
-    #: the default schemes: a plant holds its controls, as these do
-    settings: Settings = eqx.field(static=True, default=Settings())
+    tree: Any
+    shapes: tuple[tuple[int, ...], ...]
+
+    @classmethod
+    def of(cls, system: System) -> Structure:
+        """Return the structure of a system."""
+        leaves, tree = jax.tree.flatten(system)
+        return cls(tree, tuple(np.shape(leaf) for leaf in leaves))
+
+    def split(self, numbers: Float[Any, "... p"]) -> list[Any]:
+        """Return the leaves of a system from all their numbers."""
+        ends = np.cumsum([int(np.prod(shape)) for shape in self.shapes])
+        return [
+            numbers[..., end - int(np.prod(shape)) : end].reshape((*numbers.shape[:-1], *shape))
+            for end, shape in zip(ends, self.shapes, strict=True)
+        ]
+
+    def system(self, numbers: Float[Any, " p"]) -> System:
+        """Return the system with these numbers."""
+        system: System = jax.tree.unflatten(self.tree, self.split(numbers))
+        return system
+
+
+class MovedRobot(NamedTuple):
+    """Numbers of a robot at coordinates of its adapted parameters, and the machine code of its steps."""
+
+    structure: Structure
+    numbers: Float[np.ndarray, " p"]
+    #: derivatives of the numbers that move, by each coordinate
+    directions: Float[np.ndarray, "n moving"]
+    core: Core
+    tangents: TangentCore
+
+    @property
+    def system(self) -> System:
+        """The robot."""
+        return self.structure.system(self.numbers)
+
+
+class OnlineModel:
+    """A robot with adapted parameters, and its steps with tangents; what several calls need is kept."""
+
+    def __init__(self, parameters: ParametrisedRobot, dt: float, settings: Settings = Settings()):
+        """Set the time step (s); by default the schemes are those of a simulated plant."""
+        self.parameters, self.dt, self.settings = parameters, dt, settings
+        self._structure = Structure.of(parameters.robot)
+        self._coefficients = self.task(1).coefficients
+        #: robots by their coordinates, the newest last, and machine code by the masks of numbers
+        self._robots: dict[bytes, MovedRobot] = {}
+        self._codes: dict[tuple[bytes, bytes], tuple[Core, TangentCore]] = {}
+        self._columns: dict[Output, np.ndarray] = {}
 
     @property
     def robot(self) -> System:
@@ -81,48 +148,93 @@ class OnlineModel(eqx.Module):
         """Return so many steps from a state with a history."""
         return TimeIntegration(self.settings, self.dt, steps, self.settings.memory)
 
-    def moved(self, x: Any) -> tuple[System, Any]:
-        """Return the robot, and its tangents by each parameter, stacked; None if there are none.
+    def moved(self, x: Float[np.ndarray, " n"]) -> MovedRobot:
+        """Return the robot at coordinates.
 
         Zeros that are adapted are no constants of the machine code, which would be compiled again, in the
         loop, as soon as they move.
         """
-        if not self.parameters.size:
-            return self.robot, None
-        system, directions = jax.tree.map(np.asarray, _moved(self, x))
-        return jax.tree.map(
-            lambda leaf, moves: with_moving(leaf, np.any(moves != 0.0, axis=0)), system, directions
-        ), directions
+        key = np.asarray(x, dtype=float).tobytes()
+        if key not in self._robots:
+            numbers, directions = map(np.asarray, _numbers(self.parameters, x))
+            moving = np.any(directions != 0.0, axis=0)
+            numbers = with_moving(numbers, moving)
+            core, tangents = self._code(numbers, moving)
+            if len(self._robots) == ROBOTS:
+                del self._robots[next(iter(self._robots))]
+            self._robots[key] = MovedRobot(self._structure, numbers, directions[:, moving], core, tangents)
+        return self._robots[key]
+
+    def _code(self, numbers: np.ndarray, moving: np.ndarray) -> tuple[Core, TangentCore]:
+        """Return the machine code for the zeros among these numbers, and for those that move."""
+        key = is_moving(numbers).tobytes(), moving.tobytes()
+        if key not in self._codes:
+            pattern = Pattern.of(self._structure.system(numbers))
+            masks = self._structure.split(moving)
+            self._codes[key] = (
+                core_of(pattern, self.settings, robots=False),
+                tangents_for(TangentCore, pattern, self.settings, masks),
+            )
+        return self._codes[key]
+
+    def columns(self, *outputs: Output) -> tuple[int, ...]:
+        """Return the numbers (among N * x) of a record on which outputs depend."""
+        for output in {*outputs} - {*self._columns}:
+            shape = len(grid_of(self.robot).nodes), no_history(self.robot, self.settings.space).shape[-1]
+            # no derivative is zero by chance
+            records = np.random.default_rng(0).normal(size=(ROWS, *shape))
+            depends = sensitive(self.robot, output, records, np.ones((ROWS, output.size)))
+            self._columns[output] = np.flatnonzero(depends)
+        return tuple(sorted({int(k) for output in outputs for k in self._columns[output]}))
+
+    def simulated(
+        self, x: Float[np.ndarray, " n"], past: StateHistory, controls: Float[np.ndarray, "T c"]
+    ) -> tuple[StateHistory, StepRows] | None:
+        """Return the last history and the rows of a motion; None if it was not solved."""
+        moved, steps = self.moved(x), len(controls)
+        states = StateHistory(*(np.asarray(leaf)[None] for leaf in past))
+        done, after, rows = moved.core.integrate(
+            moved.numbers, controls[None], self._coefficients, states, (0, steps)
+        )
+        if done[0] < steps:
+            return None
+        after = StateHistory(*(leaf[0] for leaf in after))._replace(t0=past.t0 + steps * self.dt)
+        return after, StepRows(*(leaf[0] for leaf in rows))
 
     def rollout(
-        self, belief: Belief, controls: Float[Any, "T c"], d_controls: Float[Any, "k T c"]
-    ) -> tuple[System, Motion]:
-        """Return the robot, and its motion with the tangents of all rows along columns.
+        self, belief: Belief, controls: Float[np.ndarray, "T c"], d_controls: Float[np.ndarray, "k T c"],
+        columns: tuple[int, ...],
+    ) -> tuple[MovedRobot, Motion | None]:  # fmt: skip
+        """Return the robot, and its motion with tangents of all rows; None if it was not solved.
 
-        A column is a direction of the belief's spread, with the tangents of the controls beside it.
+        A tangent is that along a direction of the belief's spread, with the tangents of the controls beside
+        it. Those of rows are returned for the numbers `columns` (among N * x) of each record.
         """
-        system, directions = self.moved(belief.x)
-        settings, steps, past, spread = self.settings, len(controls), belief.past, belief.spread
-        task = self.task(steps)
-        done, after, rows = task.solve(system, controls, past, (0, steps))
-        columns = [np.moveaxis(np.asarray(part), 0, -1) for part in (*spread, d_controls)]
-        last = TangentState.of(system, settings.space, past, *columns[:2])
-        d_rows = np.zeros((*rows.records.shape, columns[0].shape[-1]))
-        if done == steps:
-            changes = Changes(columns[3], directions, columns[2])
-            last, (d_solves, _) = tangent_time_loop(
-                task.coefficients, rows.every_stage, (system, controls), changes, last
-            )
-            d_rows = d_solves[settings.stages - 1 :: settings.stages]
-        d_records, d_rate = (np.moveaxis(part, -1, 0) for part in (last.d_records, last.d_rate))
-        moved = Spread(d_records, d_rate, spread.parameters)
-        after = after._replace(t0=past.t0 + steps * self.dt)
-        return system, Motion(after, rows.records, d_rows, moved, bool(done == steps))
+        past, spread, settings, steps = belief.past, belief.spread, self.settings, len(controls)
+        moved, solved = self.moved(belief.x), self.simulated(belief.x, past, controls)
+        if solved is None:
+            return moved, None
+        (after, rows), used = solved, spread.rate.shape[1]
+        own, d_own = (
+            at_all_stages(self.robot, settings, each) for each in (controls, np.moveaxis(d_controls, 0, -1))
+        )
+        data = SolvedSteps(
+            moved.numbers, table_of(self._coefficients, steps, float(past.t0)), own, *rows.every_stage,
+            np.asarray(past.records)[:, :used], np.asarray(past.rate)[:used],
+        )  # fmt: skip
+        d_records, d_rate = (np.moveaxis(part, 0, -1) for part in (spread.records, spread.rate))
+        last, (d_rows, _) = moved.tangents.solve(
+            data, (moved.directions, spread.parameters.T), d_own, (d_records, d_rate)
+        )
+        d_rows = d_rows[settings.stages - 1 :: settings.stages]
+        d_rows = d_rows[:, *np.divmod(columns, rows.records.shape[-1])]
+        spread = Spread(*(np.moveaxis(part, -1, 0) for part in last[2:]), spread.parameters)
+        return moved, Motion(after, rows.records, d_rows, spread)
 
     def predicted(
         self, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any], output: Output
-    ) -> Predicted:
-        """Return a motion under controls, with new columns for their uncertainty and parameters' drift.
+    ) -> Predicted | None:
+        """Return a motion under controls, with uncertain controls and drift; None if it was not solved.
 
         The new columns are T c for the controls (T, c), step by step, and n for the parameters. `measured`
         (T, p) are the measurements after each control; NaN: none. `deviations` are those of each control
@@ -132,34 +244,32 @@ class OnlineModel(eqx.Module):
         spread = belief.spread
         (steps, c), m, n = controls.shape, len(spread.records), len(of_drift)
         count = steps * c
+        wide = spread.wider(0, count + n)
+        wide.parameters[m + count :] = np.diag(of_drift)
+        d_controls = np.zeros((m + count + n, steps, c))
+        d_controls[m : m + count].reshape(count, count)[...] = np.diag(np.tile(of_control, steps))
+        columns = self.columns(output)
+        moved, motion = self.rollout(belief._replace(spread=wide), controls, d_controls, columns)
+        if motion is None:
+            return None
+        seen = _measured(
+            moved.structure, output, columns, moved.numbers, motion.records, motion.d_records, measured
+        )
+        return Predicted(motion.past, motion.records[-1], motion.spread, *map(np.asarray, seen))
 
-        def more(part: Any) -> Any:
-            return np.concatenate([part, np.zeros((count + n, *part.shape[1:]))])
-
-        drifts = np.concatenate([spread.parameters, np.zeros((count, n)), np.diag(of_drift)])
-        wide = Spread(more(spread.records), more(spread.rate), drifts)
-        noise = np.diag(np.tile(of_control, steps)).reshape(count, steps, c)
-        d_controls = np.concatenate([np.zeros((m, steps, c)), noise, np.zeros((n, steps, c))])
-        system, motion = self.rollout(belief._replace(spread=wide), controls, d_controls)
-        outputs = _measured(system, output, motion.records, motion.d_records, measured)
-        values, errors, slopes = map(np.asarray, outputs)
-        record = motion.records[-1]
-        return Predicted(motion.past, record, motion.spread, values, errors, slopes, motion.solved)
-
-    def errors(
-        self, x: Float[Any, " n"], past: StateHistory, controls: Any, measured: Any, output: Output
-    ) -> Float[Any, "T e"]:
-        """Return the errors of the motion with these parameters; infinite after a failure."""
-        system, steps = self.moved(x)[0], len(controls)
-        done, _, rows = self.task(steps).solve(system, controls, past, (0, steps))
-        errors = np.asarray(errors_of(system, output, rows.records, measured))
-        return np.where((np.arange(steps) < done)[:, None], errors, np.inf)
+    def errors(self, x: Float[np.ndarray, " n"], records: Any, measured: Any, output: Output) -> np.ndarray:
+        """Return the errors (T, e) of an output in rows of a motion with these parameters."""
+        return np.asarray(errors_of(self.moved(x).system, output, records, measured))
 
 
 @jax.jit
-def _moved(model: OnlineModel, x: Any) -> tuple[System, Any]:
-    robot = model.parameters
-    return robot(x), jax.vmap(lambda d: jax.jvp(robot, (x,), (d,))[1])(jnp.eye(robot.size))
+def _numbers(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
+    """Return all numbers of a robot at coordinates, and their derivatives by each coordinate."""
+
+    def numbers(x: Any) -> Any:
+        return jnp.concatenate([jnp.ravel(jnp.asarray(leaf, float)) for leaf in jax.tree.leaves(robot(x))])
+
+    return numbers(x), jax.vmap(lambda d: jax.jvp(numbers, (x,), (d,))[1])(jnp.eye(robot.size))
 
 
 class Motion(NamedTuple):
@@ -167,10 +277,9 @@ class Motion(NamedTuple):
 
     past: StateHistory
     records: Float[Any, "T N x"]
-    d_records: Float[Any, "T N x k"]
+    d_records: Float[Any, "T q k"]
     #: history after the last step, along the columns
     spread: Spread
-    solved: Any
 
 
 def split_record(system: System, record: Any) -> tuple[Any, Any]:
@@ -228,21 +337,35 @@ class Predicted(NamedTuple):
     values: Float[Any, "T p"]
     errors: Float[Any, "T e"]
     by_column: Float[Any, "m T e"]
-    solved: Any
 
 
-@functools.partial(jax.jit, static_argnames="output")
-def _measured(system: System, output: Output, records: Any, d_records: Any, measured: Any) -> Any:
+@functools.partial(jax.jit, static_argnames=("structure", "output", "columns"))
+def _measured(
+    structure: Structure, output: Output, columns: tuple[int, ...], numbers: Any, records: Any,
+    d_records: Any, measured: Any,
+) -> Any:  # fmt: skip
     """Return values of the output in every row, their errors, and the errors' tangents."""
+    system = structure.system(numbers)
     values = jax.vmap(lambda record: output.value(system, *split_record(system, record)))(records)
     errors = errors_of(system, output, records, measured)
     # where nothing was measured the derivatives are those at the prediction
     known = jnp.where(jnp.isnan(measured), values, measured)
-    return values, errors, errors_along(system, output, records, d_records, known)[1]
+    return values, errors, errors_along(system, output, records, d_records, known, columns=columns)[1]
+
+
+@functools.partial(jax.jit, static_argnames=("structure", "output"))
+def measured_error(structure: Structure, output: Output, numbers: Any, record: Any, measured: Any) -> Any:
+    """Return the error of a state's output from a measurement."""
+    system = structure.system(numbers)
+    return output.error(system, *split_record(system, record), measured)
 
 
 @functools.partial(jax.jit, static_argnames="output")
-def measured_error(model: OnlineModel, x: Any, record: Any, measured: Any, output: Output) -> Any:
-    """Return the error of a state's output from a measurement."""
-    system = model.parameters(x)
-    return output.error(system, *split_record(system, record), measured)
+def sensitive(
+    system: System, output: Output, records: Float[Any, "T N x"], measured: Float[Any, "T p"]
+) -> Bool[Any, " numbers"]:
+    """Return true for the numbers of a record (N * x) on which the errors depend in any row."""
+    errors, pull = jax.vjp(lambda rows: errors_of(system, output, rows, measured), records)
+    # numbers without a pattern do not cancel
+    weights = jnp.sin(1.0 + jnp.arange(errors.size) ** 1.5).reshape(errors.shape)
+    return jnp.any(pull(weights)[0] != 0.0, axis=0).ravel()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import deque
+from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,101 +15,129 @@ from knode_cosserat.estimation.outputs import Output
 
 #: seconds between comparisons, and number of earlier parameters that are kept
 WINDOW, KEPT = 1.0, 4
+#: most steps that are simulated in one period; each period adds one for each of the kept parameters
+BUDGET = 10
 #: earlier parameters come back if the mean square of their errors is less than this part of the present one
 BETTER = 0.5
 #: largest error that counts, in units of the noise: one wrong measurement decides nothing
 LARGEST = 30.0
 
 
-class _Comparison(NamedTuple):
-    """Comparison of parameters by a past second: candidates (k, n), the newest last, and errors so far."""
+class _Candidate(NamedTuple):
+    """Parameters, and their motion so far: rows and the last history."""
 
-    past: Any
-    controls: Float[np.ndarray, "T c"]
-    measured: Float[np.ndarray, "T p"]
-    candidates: Float[np.ndarray, "k n"]
-    errors: tuple[float, ...] = ()
+    x: Float[np.ndarray, " n"]
+    state: Any
+    rows: tuple[np.ndarray, ...] = ()
+    failed: bool = False
+
+    @property
+    def steps(self) -> float:
+        """Number of simulated steps; a motion that failed has no more."""
+        return np.inf if self.failed else sum(map(len, self.rows))
+
+
+class _Window(NamedTuple):
+    """Controls and measurements of a second, the history before it, and the parameters that are compared."""
+
+    past: Any = None
+    controls: tuple[np.ndarray, ...] = ()
+    measured: tuple[np.ndarray, ...] = ()
+    candidates: tuple[_Candidate, ...] = ()
+
+    def begun(self, kept: Iterable[np.ndarray]) -> _Window:
+        """Return the window with candidates, of kept parameters if it has none."""
+        made = self.candidates or tuple(_Candidate(x, self.past) for x in kept)
+        return self._replace(candidates=made)
+
+    def continued(self, model: OnlineModel) -> _Window:
+        """Return the window after some more steps of the candidate that is furthest behind."""
+        k = int(np.argmin([it.steps for it in self.candidates]))
+        old = self.candidates[k]
+        if old.steps >= len(self.controls):
+            return self
+        part = np.array(self.controls[int(old.steps) :][:BUDGET])
+        solved = model.simulated(old.x, old.state, part)
+        new = old._replace(failed=True)
+        if solved is not None:
+            new = old._replace(state=solved[0], rows=(*old.rows, solved[1].records))
+        return self._replace(candidates=(*self.candidates[:k], new, *self.candidates[k + 1 :]))
 
 
 class Rollback:
     """Compares the present parameters with earlier ones, by simulations of a past second.
 
     Without it, parameters that were adapted to wrong measurements have to be learned anew afterwards. The
-    simulations of a comparison are spread over the periods that follow, so that none takes much longer.
+    simulations of a comparison are spread over the periods, so that none takes much longer.
     """
-
-    _past: Any
-    _controls: list[Any]
-    _measured: list[Any]
 
     def __init__(self, model: OnlineModel, output: Output, x: Float[np.ndarray, " n"], dt: float):
         """Keep the first parameters."""
         self._model, self._output = model, output
         self._steps = max(2, round(WINDOW / dt))
-        #: simulations in one period
-        self._quota = -(-(KEPT + 1) // self._steps)
         self._kept = deque([np.array(x)] * KEPT, maxlen=KEPT)
-        self._comparison: _Comparison | None = None
-        self.forget()
+        #: a complete window whose comparison is not complete, and the window of the present time
+        self._compared: _Window | None = None
+        self._window = _Window()
 
     def copied(self) -> Rollback:
         """Return a copy that moves independently."""
         twin = copy.copy(self)
         twin._kept = self._kept.copy()
-        twin._controls, twin._measured = list(self._controls), list(self._measured)
         return twin
 
-    def compile(self, past: Any, controls: int) -> None:
-        """Compile the comparison for a history and a number of controls."""
-        shape = (self._steps, controls), (self._steps, self._output.size)
-        self._error(_Comparison(past, np.zeros(shape[0]), np.zeros(shape[1]), np.array(self._kept)), 0)
+    def compile(self, record: Float[np.ndarray, "N x"]) -> None:
+        """Compile the comparison by rows of any record."""
+        rows, unseen = [record] * self._steps, np.full((self._steps, self._output.size), np.nan)
+        self._error(_Candidate(self._kept[0], None, (np.array(rows),)), unseen)
 
     def predicted(self, control: Float[np.ndarray, " c"], past: Any) -> None:
         """Note a control, and the history before it."""
-        if self._past is None:
-            self._past = past
-        self._controls.append(np.asarray(control))
+        window = self._window
+        past = window.past if window.controls else past
+        self._window = window._replace(past=past, controls=(*window.controls, np.asarray(control)))
 
     def measured(
         self, measured: Float[np.ndarray, " p"], x: Float[np.ndarray, " n"]
     ) -> Float[np.ndarray, " n"] | None:
         """Note a measurement; return earlier parameters once a comparison has shown that they were better."""
-        if len(self._measured) < len(self._controls):
-            unseen = len(self._controls) - 1 - len(self._measured)
-            self._measured += [np.full(len(measured), np.nan)] * unseen
-            self._measured.append(np.asarray(measured, dtype=float))
-        earlier = self._compared()
-        if len(self._controls) >= self._steps and len(self._measured) == len(self._controls):
-            controls, rows = (np.array(it[: self._steps]) for it in (self._controls, self._measured))
-            self._comparison = _Comparison(self._past, controls, rows, np.array([*self._kept, x]))
-            self.forget()
+        window = self._window
+        if len(window.measured) < len(window.controls):
+            unseen = [np.full(len(measured), np.nan)] * (len(window.controls) - 1 - len(window.measured))
+            window = window._replace(measured=(*window.measured, *unseen, np.asarray(measured, dtype=float)))
+        earlier = None
+        if self._compared is not None:
+            self._compared = self._compared.continued(self._model)
+            if min(it.steps for it in self._compared.candidates) >= len(self._compared.controls):
+                earlier, self._compared = self._better(self._compared), None
+        elif window.controls:
+            window = window.begun(self._kept).continued(self._model)
+        if len(window.measured) == len(window.controls) >= self._steps:
+            window = window.begun(self._kept)
+            self._compared = window._replace(candidates=(*window.candidates, _Candidate(x, window.past)))
+            window = _Window()
+        self._window = window
         return earlier
 
     def forget(self) -> None:
         """Begin a new window."""
-        self._past, self._controls, self._measured = None, [], []
+        self._window = _Window()
 
-    def _compared(self) -> Float[np.ndarray, " n"] | None:
-        """Simulate some candidates of the comparison; return the best earlier one after the last of them."""
-        comparison = self._comparison
-        if comparison is None:
-            return None
-        first, candidates = len(comparison.errors), comparison.candidates
-        last = min(first + self._quota, len(candidates))
-        errors = (*comparison.errors, *(self._error(comparison, k) for k in range(first, last)))
-        self._comparison = comparison._replace(errors=errors)
-        if last < len(candidates):
-            return None
-        self._comparison = None
+    def _better(self, window: _Window) -> Float[np.ndarray, " n"] | None:
+        """Return the best earlier parameters if the last candidate's motion is much worse, and keep them."""
+        errors = [self._error(it, np.array(window.measured)) for it in window.candidates]
         best = int(np.argmin(errors[:-1]))
         better = errors[best] < BETTER * errors[-1]
-        self._kept.append(candidates[best if better else -1])
-        return candidates[best] if better else None
+        x = window.candidates[best if better else -1].x
+        self._kept.append(x)
+        return x if better else None
 
-    def _error(self, comparison: _Comparison, k: int) -> float:
+    def _error(self, candidate: _Candidate, measured: Float[np.ndarray, "T p"]) -> float:
         """Return the mean squared error of a candidate, in units of the noise and at least 1."""
-        past, controls, measured, candidates, _ = comparison
-        errors = self._model.errors(candidates[k], past, controls, measured, self._output)
+        if candidate.failed:
+            return np.inf
+        rows = np.concatenate(candidate.rows)[: self._steps]
+        errors = self._model.errors(candidate.x, rows, measured[: self._steps], self._output)
         square = np.minimum((errors / self._output.noise) ** 2, LARGEST**2)
         known = np.isfinite(square)
         return 1.0 + float(np.sum(square[known])) / max(int(known.sum()), 1)

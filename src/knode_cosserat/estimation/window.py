@@ -138,7 +138,7 @@ class MovingHorizonObserver(KalmanObserver):
             motion = self.model.predicted(
                 belief, controls + of_controls * deviations[0], measured, deviations, self.output
             )
-            if not bool(motion.solved):
+            if motion is None:
                 raise ObserverError(f"the motion until t = {self.time + self.dt:g} s was not solved")
             H, e = self._rows(motion)
             # the prior belongs to the whole way from the arrival

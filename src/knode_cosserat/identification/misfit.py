@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat.engine.equations import with_moving
-from knode_cosserat.estimation.online import errors_along, errors_of
+from knode_cosserat.estimation.online import errors_along, errors_of, sensitive
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
@@ -254,7 +254,7 @@ class Misfit:
     ) -> tuple[int, ...]:
         """Return the numbers of a record (N * x) on which an output depends, now or before."""
         known = self._known_columns.get(output, ())
-        found = np.flatnonzero(_sensitive(system, output, records, measured))
+        found = np.flatnonzero(sensitive(system, output, records, measured))
         # another thread may replace what is kept
         columns = tuple(np.union1d(found, known).astype(int).tolist())
         self._known_columns[output] = columns
@@ -325,15 +325,6 @@ def _acting(system: Any, data: Experiment) -> tuple[np.ndarray, np.ndarray | Non
         for shift in (0.5 * dt, -0.5 * dt, 0.0)
     )
     return acting, (late - early) / dt
-
-
-@functools.partial(jax.jit, static_argnames="output")
-def _sensitive(system: Any, output: Output, records: Any, measured: Any) -> Any:
-    """Return true for the numbers of a record (N * x) on which the errors depend in any row."""
-    errors, pull = jax.vjp(lambda rows: errors_of(system, output, rows, measured), records)
-    # numbers without a pattern do not cancel
-    weights = jnp.sin(1.0 + jnp.arange(errors.size) ** 1.5).reshape(errors.shape)
-    return jnp.any(pull(weights)[0] != 0.0, axis=0).ravel()
 
 
 @jax.jit
