@@ -164,6 +164,11 @@ class Values(dict[int, Any]):
         value = super().__getitem__(node)
         return value() if callable(value) else value
 
+    def get(self, node: int, default: Any = None) -> Any:
+        """Return the value of a node, or the default."""
+        value = super().get(node, default)
+        return value() if callable(value) else value
+
 
 class Module:
     """Functions that are compiled together."""
