@@ -14,6 +14,8 @@ import dataclasses
 import functools
 import hashlib
 import itertools
+import operator
+import os
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
@@ -24,8 +26,6 @@ from knode_cosserat.engine import elementary
 from knode_cosserat.engine.arrays import ArrayCode, summands
 from knode_cosserat.engine.program import EngineError, Program
 
-#: rounding may change, NaN and infinity are kept
-MATH = "contract nsz arcp"
 #: functions of one number that LLVM provides, then those of the C library, a call for every lane
 INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
               "max": "maximum", "min": "minimum", "pow": "pow", "floor": "floor"}  # fmt: skip
@@ -70,7 +70,7 @@ def _comparison(operation: str) -> Operator:
     return lambda value, other: value.function.compare(operation, value, other)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(eq=False, slots=True)
 class Value:
     """A number ("double"), truth ("i1") or whole number ("i64"), or a vector of `lanes` of them."""
 
@@ -78,6 +78,8 @@ class Value:
     name: str
     kind: str = "double"
     lanes: int = 1
+    #: of a product: its factors, and the block of code in which it is
+    product: tuple[Value, Value, int] | None = None
 
     @property
     def type(self) -> str:
@@ -208,12 +210,14 @@ class Module:
         functions = (function.text for function in self._functions)
         return "\n".join([*sorted(self.declarations), *tables, *functions])
 
-    def compile(self, optimisation: int = 1) -> dict[str, Any]:
+    def compile(self) -> dict[str, Any]:
         """Return the exported functions as machine code for this computer, by their names.
 
         Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
-        three times as long and make steps no faster. Variables are turned into registers.
+        three times as long and make steps no faster. Variables are turned into registers. The code generator
+        at level 0 takes a third of the time of level 1; its code takes twice as long, and computes the same.
         """
+        optimisation = 0 if os.environ.get("KNODE_COSSERAT_CODE") == "quick" else 1
         import llvmlite.binding as llvm  # later than the package, which is to be imported fast
 
         llvm.initialize_native_target()
@@ -261,6 +265,7 @@ class Function:
         self.module, self.name, self._count, self.exported = module, name, 0, exported
         self._lines: list[Any] = []
         self._stack: list[str] = []
+        self._blocks = 0
         #: addresses of places that have been written
         self.addresses: dict[Any, Value] = {}
         self.returned: Any = None
@@ -358,12 +363,26 @@ class Function:
         return [self.splat(each, lanes) for each in found], lanes
 
     def binary(self, operation: str, a: Any, b: Any) -> Value:
-        """Return a sum, difference, product or quotient."""
+        """Return a sum, difference, product or quotient.
+
+        A product that is added in the same block of code is rounded with the sum. That is written here, not
+        left to the code generator: all machine code of a program computes the same bits.
+        """
         whole = any(isinstance(each, Value) and each.kind == "i64" for each in (a, b))
         (a, b), lanes = self._same(a, b, kind="i64" if whole else "double")
         if whole:
             return self.result(f"{operation} i64 {a.name}, {b.name}", "i64")
-        return self.result(f"f{operation} {MATH} {a.type} {a.name}, {b.name}", lanes=lanes)
+        if operation in ("add", "sub") and a is not b:
+            for product, other in ((a, b), (b, a)):
+                if product.product and product.product[2] == self._blocks:
+                    x, y, _ = product.product
+                    if operation == "sub":
+                        x, other = (x, -other) if product is a else (-x, other)
+                    return self.intrinsic("fma", x, y, other)
+        found = self.result(f"f{operation} {a.type} {a.name}, {b.name}", lanes=lanes)
+        if operation == "mul":
+            found.product = a, b, self._blocks
+        return found
 
     def compare(self, operation: str, a: Any, b: Any) -> Value:
         """Return the truth of a comparison; false for NaN, except for `ne`."""
@@ -411,7 +430,7 @@ class Function:
         values, lanes = self._same(*arguments)
         kind = values[0].type
         if operation == "neg":
-            return self.result(f"fneg {MATH} {kind} {values[0].name}", lanes=lanes)
+            return self.result(f"fneg {kind} {values[0].name}", lanes=lanes)
         if operation == "sign":
             x = values[0]
             return self.select(x > 0.0, 1.0, self.select(x < 0.0, -1.0, 0.0))
@@ -442,7 +461,7 @@ class Function:
 
     def _called(self, name: str, values: Sequence[Value]) -> Value:
         given = ", ".join(f"{each.type} {each.name}" for each in values)
-        return self.result(f"call {MATH} {values[0].type} @{name}({given})", lanes=values[0].lanes)
+        return self.result(f"call {values[0].type} @{name}({given})", lanes=values[0].lanes)
 
     def lane(self, value: Value, k: int) -> Value:
         """Return the number in lane k."""
@@ -464,26 +483,33 @@ class Function:
 
     def largest(self, value: Value) -> Value:
         """Return the largest number of all lanes."""
-        return self._reduce(value, "fmax")
+        return self._folded(value, lambda a, b: self.select(a > b, a, b))
 
     def total(self, value: Value) -> Value:
         """Return the sum of all lanes."""
-        return self._reduce(value, "fadd")
+        return self._folded(value, operator.add)
 
     def any(self, value: Value) -> Value:
         """Return true if a lane is true."""
-        return self._reduce(value, "or")
-
-    def _reduce(self, value: Value, operation: str) -> Value:
         if value.lanes == 1:
             return value
-        suffix = f"v{value.lanes}{'i1' if value.kind == 'i1' else 'f64'}"
-        name = f"llvm.vector.reduce.{operation}.{suffix}"
-        start = f"{value.kind}, " if operation == "fadd" else ""
-        self.module.declarations.add(f"declare {value.kind} @{name}({start}{value.type})")
-        flags = "" if operation == "or" else f"reassoc {MATH} "
-        start = f"{value.kind} {literal(0.0)}, " if operation == "fadd" else ""
-        return self.result(f"call {flags}{value.kind} @{name}({start}{value.type} {value.name})", value.kind)
+        name = f"llvm.vector.reduce.or.v{value.lanes}i1"
+        self.module.declarations.add(f"declare i1 @{name}({value.type})")
+        return self.result(f"call i1 @{name}({value.type} {value.name})", "i1")
+
+    def _folded(self, value: Value, operation: Operator) -> Value:
+        """Return an operation of all lanes, in pairs."""
+        if value.lanes <= 2:
+            return functools.reduce(operation, [self.lane(value, k) for k in range(value.lanes)])
+        half, kind = value.lanes // 2, value.type
+        indices = (", ".join(f"i32 {first + k}" for k in range(half)) for first in (0, half))
+        halves = [
+            self.result(
+                f"shufflevector {kind} {value.name}, {kind} poison, <{half} x i32> <{each}>", lanes=half
+            )
+            for each in indices
+        ]
+        return self._folded(operation(*halves), operation)
 
     # memory
 
@@ -508,6 +534,7 @@ class Function:
     # control flow
 
     def _label(self, name: str) -> None:
+        self._blocks += 1
         self._lines.append(f"{name}:")
 
     @contextlib.contextmanager
