@@ -9,22 +9,20 @@ code by `Function.evaluate`.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import dataclasses
 import functools
-import hashlib
 import itertools
 import operator
-import os
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from knode_cosserat._jax import cache_directory
-from knode_cosserat._program_cache import ProgramCache
 from knode_cosserat.engine import elementary
 from knode_cosserat.engine.arrays import ArrayCode, summands
 from knode_cosserat.engine.program import EngineError, Program
+
+if TYPE_CHECKING:
+    from knode_cosserat.engine.machine_code import MachineCode
 
 #: functions of one number that LLVM provides, then those of the C library, a call for every lane
 INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
@@ -210,49 +208,16 @@ class Module:
         functions = (function.text for function in self._functions)
         return "\n".join([*sorted(self.declarations), *tables, *functions])
 
-    def compile(self) -> dict[str, Any]:
-        """Return the exported functions as machine code for this computer, by their names.
+    def compile(self) -> MachineCode:
+        """Return the exported functions as machine code for this computer."""
+        from knode_cosserat.engine.machine_code import MachineCode  # LLVM is imported when it is needed
 
-        Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
-        three times as long and make steps no faster. Variables are turned into registers. The code generator
-        at level 0 takes a third of the time of level 1; its code takes twice as long, and computes the same.
-        """
-        optimisation = 0 if os.environ.get("KNODE_COSSERAT_CODE") == "quick" else 1
-        import llvmlite.binding as llvm  # later than the package, which is to be imported fast
-
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-        machine = llvm.Target.from_default_triple().create_target_machine(
-            cpu=cpu, features=features, opt=optimisation
-        )
-        version = ".".join(map(str, llvm.llvm_version_info))
-        described = "\n".join([self.text, machine.triple, cpu, features, version, str(optimisation)])
-        name = f"engine-{hashlib.sha256(described.encode()).hexdigest()}"
-        directory, code = cache_directory(), None
-        with contextlib.suppress(OSError):
-            code = ProgramCache(directory).get(name) if directory else None
-        if code is None:
-            module = llvm.parse_assembly(self.text)
-            passes = llvm.create_new_module_pass_manager()
-            passes.add_sroa_pass()
-            passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
-            code = machine.emit_object(module)
-            # without an error, if the folder is full or read-only
-            with contextlib.suppress(OSError):
-                if directory:
-                    ProgramCache(directory).put(name, code)
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-        engine.finalize_object()
-        functions = {}
-        for each in self._functions:
-            if each.exported:
-                kinds = [ctypes.c_void_p if own.kind == "ptr" else ctypes.c_long for own in each.arguments]
-                function: Any = ctypes.CFUNCTYPE(None, *kinds)(engine.get_function_address(each.name))
-                # machine code is valid while its engine lives
-                function.engine, functions[each.name] = engine, function
-        return functions
+        kinds = {
+            each.name: "".join("p" if own.kind == "ptr" else "n" for own in each.arguments)
+            for each in self._functions
+            if each.exported
+        }
+        return MachineCode.of(self.text, kinds)
 
 
 class Function:
