@@ -30,26 +30,27 @@ class ProgramCache:
         self._path = Path(path)
         self._path.mkdir(parents=True, exist_ok=True)
 
-    def _file(self, key: str) -> Path:
+    def path(self, key: str) -> Path:
+        """Return the path of a program's file."""
         return self._path / f"{key}{SUFFIX}"
 
     def get(self, key: str) -> bytes | None:
         """Return a stored program; None if there is none, or a damaged one, which is removed."""
         try:
-            content = self._file(key).read_bytes()
+            content = self.path(key).read_bytes()
         except FileNotFoundError:
             return None
         size = hashlib.sha256().digest_size
         program, digest = content[:-size], content[-size:]
         if hashlib.sha256(program).digest() != digest:
-            self._file(key).unlink(missing_ok=True)
+            self.path(key).unlink(missing_ok=True)
             return None
         return program
 
     def put(self, key: str, value: bytes) -> None:
         """Store a program, whole or not at all. One that is already there is kept."""
-        if not self._file(key).exists():
-            with replacing(self._file(key)) as temporary:
+        if not self.path(key).exists():
+            with replacing(self.path(key)) as temporary:
                 temporary.write_bytes(value + hashlib.sha256(value).digest())
 
 

@@ -102,30 +102,3 @@ def test_functions_of_vectors_are_right_to_two_units_in_the_last_place(name, num
     finite = np.isfinite(wanted)
     np.testing.assert_array_equal(found[~finite], wanted[~finite])
     assert np.all(np.abs(found - wanted)[finite] <= 2.0 * unit[finite]), (found, wanted)
-
-
-def answer():
-    """Return what a compiled module writes, 42."""
-    module = Module()
-    f = module.function("run", ["out"], exported=True)
-    f.store(42.0, f.arguments[0], 0)
-    out = np.zeros(1)
-    module.compile()["run"](out.ctypes.data)
-    return out[0]
-
-
-@pytest.mark.parametrize("damage", [lambda code: code, lambda code: code[:100], lambda code: b""])
-def test_machine_code_is_kept_on_disk(tmp_path, monkeypatch, damage):
-    monkeypatch.setenv("KNODE_COSSERAT_CACHE", str(tmp_path))
-    assert answer() == 42.0
-    [file] = tmp_path.rglob("engine-*")
-    content = file.read_bytes()
-    file.write_bytes(damage(content))
-    assert answer() == 42.0
-    assert file.read_bytes() == content
-
-
-def test_a_cache_that_cannot_be_written_is_not_needed(tmp_path, monkeypatch):
-    (tmp_path / "file").write_text("no folder")
-    monkeypatch.setenv("KNODE_COSSERAT_CACHE", str(tmp_path / "file"))
-    assert answer() == 42.0

@@ -9,23 +9,21 @@ code by `Function.evaluate`.
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import dataclasses
 import functools
-import hashlib
 import itertools
+import operator
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from knode_cosserat._jax import cache_directory
-from knode_cosserat._program_cache import ProgramCache
 from knode_cosserat.engine import elementary
 from knode_cosserat.engine.arrays import ArrayCode, summands
 from knode_cosserat.engine.program import EngineError, Program
 
-#: rounding may change, NaN and infinity are kept
-MATH = "contract nsz arcp"
+if TYPE_CHECKING:
+    from knode_cosserat.engine.machine_code import MachineCode
+
 #: functions of one number that LLVM provides, then those of the C library, a call for every lane
 INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
               "max": "maximum", "min": "minimum", "pow": "pow", "floor": "floor"}  # fmt: skip
@@ -70,7 +68,7 @@ def _comparison(operation: str) -> Operator:
     return lambda value, other: value.function.compare(operation, value, other)
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(eq=False, slots=True)
 class Value:
     """A number ("double"), truth ("i1") or whole number ("i64"), or a vector of `lanes` of them."""
 
@@ -78,6 +76,8 @@ class Value:
     name: str
     kind: str = "double"
     lanes: int = 1
+    #: of a product: its factors, and the block of code in which it is
+    product: tuple[Value, Value, int] | None = None
 
     @property
     def type(self) -> str:
@@ -213,47 +213,16 @@ class Module:
         functions = (function.text for function in self._functions)
         return "\n".join([*sorted(self.declarations), *tables, *functions])
 
-    def compile(self, optimisation: int = 1) -> dict[str, Any]:
-        """Return the exported functions as machine code for this computer, by their names.
+    def compile(self) -> MachineCode:
+        """Return the exported functions as machine code for this computer."""
+        from knode_cosserat.engine.machine_code import MachineCode  # LLVM is imported when it is needed
 
-        Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
-        three times as long and make steps no faster. Variables are turned into registers.
-        """
-        import llvmlite.binding as llvm  # later than the package, which is to be imported fast
-
-        llvm.initialize_native_target()
-        llvm.initialize_native_asmprinter()
-        cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-        machine = llvm.Target.from_default_triple().create_target_machine(
-            cpu=cpu, features=features, opt=optimisation
-        )
-        version = ".".join(map(str, llvm.llvm_version_info))
-        described = "\n".join([self.text, machine.triple, cpu, features, version, str(optimisation)])
-        name = f"engine-{hashlib.sha256(described.encode()).hexdigest()}"
-        directory, code = cache_directory(), None
-        with contextlib.suppress(OSError):
-            code = ProgramCache(directory).get(name) if directory else None
-        if code is None:
-            module = llvm.parse_assembly(self.text)
-            passes = llvm.create_new_module_pass_manager()
-            passes.add_sroa_pass()
-            passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))
-            code = machine.emit_object(module)
-            # without an error, if the folder is full or read-only
-            with contextlib.suppress(OSError):
-                if directory:
-                    ProgramCache(directory).put(name, code)
-        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
-        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-        engine.finalize_object()
-        functions = {}
-        for each in self._functions:
-            if each.exported:
-                kinds = [ctypes.c_void_p if own.kind == "ptr" else ctypes.c_long for own in each.arguments]
-                function: Any = ctypes.CFUNCTYPE(None, *kinds)(engine.get_function_address(each.name))
-                # machine code is valid while its engine lives
-                function.engine, functions[each.name] = engine, function
-        return functions
+        kinds = {
+            each.name: "".join("p" if own.kind == "ptr" else "n" for own in each.arguments)
+            for each in self._functions
+            if each.exported
+        }
+        return MachineCode.of(self.text, kinds)
 
 
 class Function:
@@ -266,6 +235,7 @@ class Function:
         self.module, self.name, self._count, self.exported = module, name, 0, exported
         self._lines: list[Any] = []
         self._stack: list[str] = []
+        self._blocks = 0
         #: addresses of places that have been written
         self.addresses: dict[Any, Value] = {}
         self.returned: Any = None
@@ -363,12 +333,26 @@ class Function:
         return [self.splat(each, lanes) for each in found], lanes
 
     def binary(self, operation: str, a: Any, b: Any) -> Value:
-        """Return a sum, difference, product or quotient."""
+        """Return a sum, difference, product or quotient.
+
+        A product that is added in the same block of code is rounded with the sum. That is written here, not
+        left to the code generator: all machine code of a program computes the same bits.
+        """
         whole = any(isinstance(each, Value) and each.kind == "i64" for each in (a, b))
         (a, b), lanes = self._same(a, b, kind="i64" if whole else "double")
         if whole:
             return self.result(f"{operation} i64 {a.name}, {b.name}", "i64")
-        return self.result(f"f{operation} {MATH} {a.type} {a.name}, {b.name}", lanes=lanes)
+        if operation in ("add", "sub") and a is not b:
+            for product, other in ((a, b), (b, a)):
+                if product.product and product.product[2] == self._blocks:
+                    x, y, _ = product.product
+                    if operation == "sub":
+                        x, other = (x, -other) if product is a else (-x, other)
+                    return self.intrinsic("fma", x, y, other)
+        found = self.result(f"f{operation} {a.type} {a.name}, {b.name}", lanes=lanes)
+        if operation == "mul":
+            found.product = a, b, self._blocks
+        return found
 
     def compare(self, operation: str, a: Any, b: Any) -> Value:
         """Return the truth of a comparison; false for NaN, except for `ne`."""
@@ -416,7 +400,7 @@ class Function:
         values, lanes = self._same(*arguments)
         kind = values[0].type
         if operation == "neg":
-            return self.result(f"fneg {MATH} {kind} {values[0].name}", lanes=lanes)
+            return self.result(f"fneg {kind} {values[0].name}", lanes=lanes)
         if operation == "sign":
             x = values[0]
             return self.select(x > 0.0, 1.0, self.select(x < 0.0, -1.0, 0.0))
@@ -447,7 +431,7 @@ class Function:
 
     def _called(self, name: str, values: Sequence[Value]) -> Value:
         given = ", ".join(f"{each.type} {each.name}" for each in values)
-        return self.result(f"call {MATH} {values[0].type} @{name}({given})", lanes=values[0].lanes)
+        return self.result(f"call {values[0].type} @{name}({given})", lanes=values[0].lanes)
 
     def lane(self, value: Value, k: int) -> Value:
         """Return the number in lane k."""
@@ -469,26 +453,33 @@ class Function:
 
     def largest(self, value: Value) -> Value:
         """Return the largest number of all lanes."""
-        return self._reduce(value, "fmax")
+        return self._folded(value, lambda a, b: self.select(a > b, a, b))
 
     def total(self, value: Value) -> Value:
         """Return the sum of all lanes."""
-        return self._reduce(value, "fadd")
+        return self._folded(value, operator.add)
 
     def any(self, value: Value) -> Value:
         """Return true if a lane is true."""
-        return self._reduce(value, "or")
-
-    def _reduce(self, value: Value, operation: str) -> Value:
         if value.lanes == 1:
             return value
-        suffix = f"v{value.lanes}{'i1' if value.kind == 'i1' else 'f64'}"
-        name = f"llvm.vector.reduce.{operation}.{suffix}"
-        start = f"{value.kind}, " if operation == "fadd" else ""
-        self.module.declarations.add(f"declare {value.kind} @{name}({start}{value.type})")
-        flags = "" if operation == "or" else f"reassoc {MATH} "
-        start = f"{value.kind} {literal(0.0)}, " if operation == "fadd" else ""
-        return self.result(f"call {flags}{value.kind} @{name}({start}{value.type} {value.name})", value.kind)
+        name = f"llvm.vector.reduce.or.v{value.lanes}i1"
+        self.module.declarations.add(f"declare i1 @{name}({value.type})")
+        return self.result(f"call i1 @{name}({value.type} {value.name})", "i1")
+
+    def _folded(self, value: Value, operation: Operator) -> Value:
+        """Return an operation of all lanes, in pairs."""
+        if value.lanes <= 2:
+            return functools.reduce(operation, [self.lane(value, k) for k in range(value.lanes)])
+        half, kind = value.lanes // 2, value.type
+        indices = (", ".join(f"i32 {first + k}" for k in range(half)) for first in (0, half))
+        halves = [
+            self.result(
+                f"shufflevector {kind} {value.name}, {kind} poison, <{half} x i32> <{each}>", lanes=half
+            )
+            for each in indices
+        ]
+        return self._folded(operation(*halves), operation)
 
     # memory
 
@@ -513,6 +504,7 @@ class Function:
     # control flow
 
     def _label(self, name: str) -> None:
+        self._blocks += 1
         self._lines.append(f"{name}:")
 
     @contextlib.contextmanager

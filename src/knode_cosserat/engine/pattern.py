@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 import threading
 from collections.abc import Callable, Iterable
 from typing import Any, TypeVar
@@ -21,6 +22,8 @@ from knode_cosserat.rods.system import System, is_traced
 _CODES: dict[Any, Any] = {}
 #: number of codes that a process keeps: that of a time loop takes about 5 MB
 MOST_CODES = 100
+#: time (s) from which a terminal says that code is compiled
+PATIENCE = 2.0
 _COMPILING = threading.Lock()
 
 Code = TypeVar("Code")
@@ -57,6 +60,11 @@ class Pattern:
         return jax.tree.unflatten(self.structure, leaves)
 
 
+def _say() -> None:
+    if sys.stderr is not None and sys.stderr.isatty():
+        print("knode_cosserat: compiling …", file=sys.stderr, flush=True)
+
+
 def masks_of(masks: Iterable[np.ndarray]) -> Any:
     """Return shapes and bits of masks, which can be compared."""
     return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
@@ -71,6 +79,9 @@ def compiled(key: Any, build: Callable[[], Code]) -> Code:
     with _COMPILING:
         code: Any = _CODES.pop(key, None)
         if code is None:
+            patience = threading.Timer(PATIENCE, _say)
+            patience.daemon = True
+            patience.start()
             try:
                 # also while JAX traces a caller: equations are traced by themselves
                 with jax.core.eval_context():
@@ -78,6 +89,8 @@ def compiled(key: Any, build: Callable[[], Code]) -> Code:
             except EngineError as error:
                 # without the frames that a traceback keeps alive
                 code = error.with_traceback(None)
+            finally:
+                patience.cancel()
         _CODES[key] = code
         if len(_CODES) > MOST_CODES:
             del _CODES[next(iter(_CODES))]
@@ -120,13 +133,14 @@ class _PlaceCode:
             values, target = f.evaluate(program, nodes, here, self.lanes), f.pointer(results, j.value)
             for k, node in enumerate(nodes):
                 f.store(values[node], target, count * k, self.lanes)
-        self._run = module.compile()["run"]
+        self._functions = module.compile()
 
     def evaluate(self, data: np.ndarray, s: Float[np.ndarray, " n"]) -> Any:
         """Return results at places (n, ...), of parameters and control in one vector."""
         places = np.pad(s, (0, -len(s) % self.lanes), mode="edge")
         found = np.empty((self.size, len(places)))
-        self._run(data.ctypes.data, places.ctypes.data, found.ctypes.data, len(places))
+        arrays = data, places, found
+        self._functions["run"](*(each.ctypes.data for each in arrays), len(places))
         shapes, structure = jax.tree.flatten(self.result)
         ends = np.cumsum([int(np.prod(each.shape)) for each in shapes])[:-1]
         parts = np.split(found[:, : len(s)].T, ends, axis=1)

@@ -124,7 +124,7 @@ class _TangentCode(EliminationCode):
         self.shared = list[tuple[Array, Any]]()
         self._reserve_products()
         self._write()
-        self._run = self.module.compile()["run"]
+        self._functions = self.module.compile()
 
     def _reserve_state(self) -> None:
         """Reserve arrays that last from step to step, for each column."""
@@ -700,7 +700,7 @@ class TangentCore(_TangentCode):
         shapes = (nodes, self.packed.size), (e.k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
         arrays = *begun, moved, tangents, filled(weights), filled(d_controls), d_rows, d_unknowns
-        self._run(*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
+        self._functions["run"](*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
         after, moved_after = (
             [self._joined(each, self._numbers(numbers, each), places) for each in arrays]
             for numbers, arrays in ((memory[None], (*self.records, self.rate)), (tangents, parts))
@@ -907,7 +907,7 @@ class CotangentCore(_TangentCode):
         d_controls = np.empty((count, self.equations.nc, m))
         kept = np.empty((count, self._kept_size))
         arrays = *begun, kept, state, d_controls, d_rows, d_unknowns
-        self._run(*(each.ctypes.data for each in arrays), count, m)
+        self._functions["run"](*(each.ctypes.data for each in arrays), count, m)
         joined = [self._joined(each, self._numbers(state, each)[:, 0], len(d_rate)) for each in parts]
         before = [np.moveaxis(each, 0, -1) for each in joined]
         return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:-1]), before[-1]

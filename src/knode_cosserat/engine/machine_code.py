@@ -1,0 +1,121 @@
+"""Machine code of a process: quick code at once, and final code from another process; both kept on disk."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import functools
+import hashlib
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from collections.abc import Mapping
+from typing import Any
+
+import llvmlite.binding as llvm
+
+from knode_cosserat._jax import cache_directory
+from knode_cosserat._program_cache import ProgramCache
+from knode_cosserat.engine import generation
+
+#: size of a text from which another process is started: smaller ones take less time than that
+LARGE = 200_000
+
+
+def stored(name: str) -> bytes | None:
+    """Return what is stored on disk under a name; None if there is nothing, or no folder."""
+    directory = cache_directory()
+    with contextlib.suppress(OSError):
+        return ProgramCache(directory).get(name) if directory else None
+    return None
+
+
+def store(name: str, content: bytes) -> None:
+    """Store content on disk; not if the folder is full or read-only."""
+    directory = cache_directory()
+    with contextlib.suppress(OSError):
+        if directory:
+            ProgramCache(directory).put(name, content)
+
+
+@functools.cache
+def computer() -> str:
+    """Return a description of this computer and its code generator."""
+    features, version = llvm.get_host_cpu_features().flatten(), llvm.llvm_version_info
+    return f"{llvm.get_default_triple()} {llvm.get_host_cpu_name()} {features} {version}"
+
+
+class MachineCode:
+    """Exported functions of a module: pointers and whole numbers in, results in memory.
+
+    Code of a large module is quick code first. Another process generates the final code meanwhile, which
+    takes over between two calls; both compute the same bits, and know the same memory.
+    """
+
+    def __init__(self, name: str, kinds: Mapping[str, str], code: bytes, later: Any = None):
+        """Link code that is stored under a name; the kinds of arguments are "p" and "n" (see `of`)."""
+        self.name, self.kinds, self._later = name, kinds, later
+        self._link(code)
+
+    @classmethod
+    def of(cls, text: str, kinds: Mapping[str, str]) -> MachineCode:
+        """Return the code of a module."""
+        level = generation.QUICK if os.environ.get("KNODE_COSSERAT_CODE") == "quick" else generation.FINAL
+        name = f"engine-{hashlib.sha256(f'{text}{computer()}{level}'.encode()).hexdigest()}"
+        code, later = stored(name), None
+        if code is None:
+            if level == generation.FINAL and len(text) > LARGE:
+                later = _generated_beside(text, name)
+            code = generation.generate(text, generation.QUICK if later else level)
+            if later is None:
+                store(name, code)
+        return cls(name, kinds, code, later)
+
+    def _link(self, code: bytes) -> None:
+        engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), generation.machine_of(generation.FINAL))
+        engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+        engine.finalize_object()
+        functions = {}
+        for name, kinds in self.kinds.items():
+            types = [ctypes.c_void_p if kind == "p" else ctypes.c_long for kind in kinds]
+            function: Any = ctypes.CFUNCTYPE(None, *types)(engine.get_function_address(name))
+            # machine code is valid while its engine lives
+            function.engine, functions[name] = engine, function
+        self._functions = functions
+
+    def __getitem__(self, name: str) -> Any:
+        """Return a function, for one call."""
+        if self._later is not None and self._later.returncode is not None:
+            self._later = None
+            # none if the process was killed
+            if (code := stored(self.name)) is not None:
+                self._link(code)
+        return self._functions[name]
+
+
+def _generated_beside(text: str, name: str) -> Any:
+    """Return a process that generates and stores the final code; None where there can be none."""
+    directory, program = cache_directory(), sys.executable or ""
+    if (
+        directory is None
+        or getattr(sys, "frozen", False)
+        or "python" not in os.path.basename(program).lower()
+    ):
+        return None
+    try:
+        path = ProgramCache(directory).path(name)
+        with tempfile.TemporaryFile("w+", dir=directory) as file:
+            file.write(text)
+            file.seek(0)
+            process = subprocess.Popen(
+                [program, "-P", generation.__file__, str(path)],
+                stdin=file, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
+            )  # fmt: skip
+        # waited for, or its entry would stay in the system's table
+        threading.Thread(target=process.wait, daemon=True).start()
+    except (OSError, RuntimeError):
+        return None
+    return process
