@@ -451,6 +451,24 @@ class Function:
             found = one.name
         return one
 
+    def transposed(self, rows: Sequence[Value]) -> list[Value]:
+        """Return the transpose of as many vectors as each has lanes."""
+        found, n = list(rows), len(rows)
+        for size in itertools.takewhile(lambda size: size < n, (1, 2, 4, 8)):
+            low = [k + (n - size if k & size else 0) for k in range(n)]
+            for i in (i for i in range(n) if not i & size):
+                pair = found[i], found[i + size]
+                found[i], found[i + size] = (
+                    self._shuffled(*pair, [k + shift for k in low]) for shift in (0, size)
+                )
+        return found
+
+    def _shuffled(self, a: Value, b: Value, lanes: Sequence[int]) -> Value:
+        """Return the vector of these lanes of two vectors."""
+        picked = ", ".join(f"i32 {k}" for k in lanes)
+        vector = f"shufflevector {a.type} {a.name}, {b.type} {b.name}, <{len(lanes)} x i32> <{picked}>"
+        return self.result(vector, a.kind, len(lanes))
+
     def largest(self, value: Value) -> Value:
         """Return the largest number of all lanes."""
         return self._folded(value, lambda a, b: self.select(a > b, a, b))
@@ -576,26 +594,40 @@ class Function:
             order = program.depth_first(outputs, values)
         for node in order:
             operation, *arguments = program.operations[node]
-            if node in values:
+            if node in values or operation == "result":
                 pass
-            elif operation == "constant":
-                value = program.values[node]
-                values[node] = self.value(value if isinstance(value, bool) else float(value))
-            elif operation in ("input", "inputs"):
-                raise KeyError(f"input {arguments[0]} has no value")
             elif operation == "loop":
                 self._loop(program, node, values, lanes)
             elif operation == "entry":
                 values[node] = arrays.load(*arguments)
             elif node in program.shapes:
                 arrays.write(node)
-            elif operation != "result":
-                values[node] = self.apply(operation, *(values[each] for each in arguments))
+            else:
+                values[node] = self._scalar(program, node, values)
             if stores and node in stores:
                 values[node] = stores[node](values[node])
         for node, target in added:
             arrays.add(node, target, inside)
         return values
+
+    def side_by_side(
+        self, program: Program, outputs: Sequence[int], every: Sequence[Mapping[int, Any]]
+    ) -> list[Values]:
+        """Write the operations of scalars that outputs need, each for all known values before the next one."""
+        found = [Values(known) for known in every]
+        for node, values in itertools.product(program.needed(outputs, found[0]), found):
+            if node not in values:
+                values[node] = self._scalar(program, node, values)
+        return found
+
+    def _scalar(self, program: Program, node: int, values: Values) -> Value:
+        operation, *arguments = program.operations[node]
+        if operation == "constant":
+            value = program.values[node]
+            return self.value(value if isinstance(value, bool) else float(value))
+        if operation in ("input", "inputs"):
+            raise KeyError(f"input {arguments[0]} has no value")
+        return self.apply(operation, *(values[each] for each in arguments))
 
     def _loop(self, program: Program, node: int, values: dict[int, Any], lanes: int) -> None:
         loop = program.loops[program.operations[node][1]]

@@ -86,7 +86,7 @@ class Core(EliminationCode):
         self.tangents = StateArrays(
             a(ny, self.ends), a(ny, self.used - self.ends), a(nz, self.used), a(ny, self.used)
         )
-        self.dfe = a(ny, self.pieces)
+        self.dfe = a(ny, self.pieces) if self.near else self.tangents.f
         self._write()
         self._functions = self.module.compile()
         guesses = EXTRAPOLATIONS[None]
@@ -131,7 +131,6 @@ class Core(EliminationCode):
             self._write_wide(0.0, self.direction, i, j)
         for i in range(e.k):
             self._put(0.0, self.direction_unknowns, i)
-        f.call(self.weigh, memory)
 
         def active() -> Value:
             count = linearisations.get() + f.select(renew.get(), 1.0, 0.0)
@@ -168,7 +167,7 @@ class Core(EliminationCode):
             with f.if_(anew.get()):
                 for i in range(e.k):
                     self._put(self._get(self.unknowns, i), self.trial_unknowns, i)
-            now_error = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
+            now_error = f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
             # by the same factors, the correction shrinks as the residual does: a tiny one is not computed
             expected = left.get() * now_error
             enough = expected <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
@@ -176,8 +175,9 @@ class Core(EliminationCode):
             lengths = plain(0.0), plain(0.0)
             with f.if_(f.any(going & ~sure)):
                 f.call(self.correct, memory)
-                lengths[0].set(self._norm(self.dy, self.points))
-                lengths[1].set(self._norm(self.dy, self.points, self.weights_of_y))
+                norms = self._norms(self.dy, self.points, self.weights_of_y)
+                for length, norm in zip(lengths, norms, strict=True):
+                    length.set(norm)
             now_size, now_left = (each.get() for each in lengths)
             was_first, was_fresh, was_old = first.get(), fresh.get(), old.get()
             was_damping, was_size, was_error = damping.get(), size.get(), error.get()
@@ -249,7 +249,7 @@ class Core(EliminationCode):
         memory, numbers, coefficients = f.arguments
         f.call(self.recorded, memory, coefficients)
         f.call(self.weigh, memory)
-        largest = f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
+        largest = f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
         # the residual of the solution is no part of its errors
         self._copy_wide(self.r, self.rest, self.pieces)
@@ -301,7 +301,7 @@ class Core(EliminationCode):
                 self._write_wide(value, self.r, i, j)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
-            return f.apply("max", self._norm(self.r, self.pieces), self._tip_norm())
+            return f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
 
         alive = f.load(numbers, ALIVE * self.P, self.P) > 0.0
         largest = Variable(f, f.splat(f.value(0.0), self.P))
@@ -328,7 +328,7 @@ class Core(EliminationCode):
             for i in range(e.k):
                 value = self._get(self.better_unknowns, i) + self._get(self.step_unknowns, i)
                 self._put(value, self.better_unknowns, i)
-            size = self._norm(self.dy, self.points, self.weights_of_y)
+            _, size = self._norms(self.dy, self.points, self.weights_of_y)
             before = largest.get()
             largest.set(evaluated())
             left.set(size * largest.get() / before)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import itertools
+import math
 import operator
 from collections.abc import Sequence
 from typing import Any
@@ -66,7 +67,7 @@ class EliminationCode(RodCode):
             self.nonzero_M[i, c % ny] = True
         self.factor = a(len(self.elimination.factors), self.pieces)
         #: entries of A
-        if robots or self.has_entries:
+        if self.has_entries:
             self.entries = a(len(self.elimination.entries), self.pieces)
         if robots:
             # the recursion along the rod solves by B in every piece
@@ -123,21 +124,11 @@ class EliminationCode(RodCode):
         j, component = f.index(piece), self.r.component
         n = len(el.r)
         rows = rows or range(n)
-        used = set(el.program.needed([el.solved[i] for i in rows]))
-        known = {
-            int(node): self._get(self.factor, k, j, self.L)
-            for k, node in enumerate(el.stored)
-            if node in used
-        }
-        every = []
+        factors, every = self._factors_at(j), list[dict[int, Any]]()
         for c in range(columns):
-            r = {int(el.r[i]): f.load(source, (c * n + i) * component, self.L) for i in rows}
-            every.append(known | r)
-        # one operation of each column in turn
-        for node in el.program.needed([el.solved[i] for i in rows], frozenset(every[0])):
-            for values in every:
-                values |= f.evaluate(el.program, [node], values, self.L)
-        for c, values in enumerate(every):
+            own = {int(el.r[i]): f.load(source, (c * n + i) * component, self.L) for i in rows}
+            every.append(factors | own)
+        for c, values in enumerate(f.side_by_side(el.program, [el.solved[i] for i in rows], every)):
             for i in rows:
                 f.store(values[el.solved[i]], target, (c * n + i) * component, self.L)
         return f
@@ -175,27 +166,20 @@ class EliminationCode(RodCode):
         with f.loop(n) as c:
             source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
             target = c.value * self._padded(n) + self.matrix.offset
-            with f.loop(self.pieces) as j:
-                self._copy(
-                    n, (f.pointer(memory, source + j.value), self.wide_matrix.component),
-                    (f.pointer(memory, target + j.value * self.matrix.place), 1),
-                )  # fmt: skip
+            wide = f.pointer(memory, source), self.wide_matrix.component
+            self._transpose(n, self.pieces, wide, (f.pointer(memory, target), self.matrix.place))
 
     def _write_factor_of(self, name: str, block: range) -> Function:
         """Factors and A of all pieces, in a block of rows and columns."""
         f, el, n = self._function(name), self.elimination, self.equations.ny
         factors = [k for k, (i, _) in enumerate(el.places) if i in block]
         entries = [k for k, (i, _) in enumerate(el.entries) if i in block]
-        outputs = [int(node) for node in el.matrix[block][:, block].flat] + [el.factors[k] for k in factors]
-        used = set(el.program.needed(outputs))
+        outputs = [] if self.batch else [int(node) for node in el.matrix[block][:, block].flat]
+        outputs += [el.factors[k] for k in factors]
         with self._places(self.pieces) as j:
-            known = {el.h: self._wide(self.h, 0, j)}
-            slopes = (self.slope, j), (self.slope_end, j), *((self.slope, j + k) for k in self.stages)
-            for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
-                reads = (functools.partial(self._wide, array, k, at) for k in range(len(nodes)))
-                known |= {int(node): read for node, read in zip(nodes, reads, strict=True) if node in used}
+            known = self._slopes_at(j)
             results = [(self.factor, [(k, el.factors[k]) for k in factors])]
-            if self.batch or self.has_entries:
+            if self.has_entries:
                 results += [(self.entries, [(k, el.matrix[el.entries[k]]) for k in entries])]
             if not self.batch:
                 inside = itertools.product(block, block)
@@ -203,29 +187,47 @@ class EliminationCode(RodCode):
             f.evaluate(el.program, outputs, known, self.L, stores=self._stores(results, j))
         return f
 
-    def _copy(self, count: int, source: tuple[Value, int], target: tuple[Value, int]) -> None:
-        """Write numbers from an address to another, each with the distance between numbers."""
-        f = self._now
-        for i in range(count):
-            f.store(f.load(source[0], i * source[1]), target[0], i * target[1])
+    def _slopes_at(self, j: Index) -> dict[int, Any]:
+        """Return functions that read the slopes, jumps and length of a piece."""
+        el = self.elimination
+        slopes = self._places_of((self.slope, self.slope_end), j)[: len(el.slopes)]
+        known: dict[int, Any] = {el.h: functools.partial(self._wide, self.h, 0, j)}
+        for (array, at), nodes in zip((*slopes, (self.jump, j)), (*el.slopes, el.jump), strict=True):
+            known |= {int(node): functools.partial(self._wide, array, k, at) for k, node in enumerate(nodes)}
+        return known
+
+    def _factors_at(self, j: Index) -> dict[int, Any]:
+        """Return functions that read the factors of a piece."""
+        stored = enumerate(self.elimination.stored)
+        return {int(node): functools.partial(self._wide, self.factor, k, j) for k, node in stored}
+
+    def _write_advance_of(self, name: str, columns: int, has_added: bool) -> Function:
+        """Columns of all robots at a piece's start to its end, side by side, perhaps with an added column."""
+        el, n = self.elimination, self.equations.ny
+        f = self._function(name, "from", *["added"] * has_added, "to", "n_piece")
+        _, source, *added, target, piece = f.arguments
+        j = f.index(piece)
+        zero = f.splat(f.value(0.0), self.L)
+        known, every = self._slopes_at(j) | self._factors_at(j), list[dict[int, Any]]()
+        for c in range(columns):
+            own = {int(node): f.load(source, (c * n + i) * self.L, self.L) for i, node in enumerate(el.x)}
+            for i, node in enumerate(el.r):
+                own[int(node)] = f.load(added[0], i * self.L, self.L) if has_added else zero
+            every.append(known | own)
+        for c, values in enumerate(f.side_by_side(el.program, el.advanced, every)):
+            for i, node in enumerate(el.advanced):
+                f.store(values[node], target, (c * n + i) * self.L, self.L)
+        return f
 
     def _write_advance(self) -> Function:
         """A column at a piece's start to its end: B⁻¹ A x plus an added column."""
+        if self.batch:
+            return self._write_advance_of("advance", 1, True)
         el, n = self.elimination, self.equations.ny
         f = self._function("advance", "from", "added", "to", "n_piece")
         _, source, added, target, piece = f.arguments
-        width, j, lanes = self._rows_at_once, f.index(piece), self.P
-        component = 1 if width > 1 else self.L
-        x = [f.load(source, c * component, lanes) for c in range(n)]
-        if self.batch:
-            known = {int(node): self._get(self.factor, k, j) for k, node in enumerate(el.stored)}
-            known |= {int(node): self._get(self.entries, k, j) for k, node in enumerate(el.start_entries)}
-            known |= {int(node): f.load(added, i * self.L, self.L) for i, node in enumerate(el.r)}
-            known |= {int(node): value for node, value in zip(el.x, x, strict=True)}
-            values = f.evaluate(el.program, el.advanced, known, self.L)
-            for i, node in enumerate(el.advanced):
-                f.store(values[node], target, i * self.L, self.L)
-            return f
+        width, j, component = self._rows_at_once, f.index(piece), 1
+        x = [f.load(source, c) for c in range(n)]
         for row in self._blocks(n):
             # two sums, because each addition waits for the one before
             sums = [f.load(added, row * component, self.L), f.splat(f.value(0.0), self.L)]
@@ -262,16 +264,21 @@ class EliminationCode(RodCode):
     def _write_along(self) -> None:
         """X along the strands from their bases; at the tips the inverse of M X."""
         ny, k, own = self.equations.ny, self.equations.k, self.own
+        width, advance = 1, self.advance
+        if self.batch:
+            # two share their factors where there are 32 registers; 16 are too few
+            width = math.gcd(own, self.L // 4)
+            advance = self._write_advance_of("advance_columns", width, False)
         self.along = f = self._function("along")
         memory = f.arguments[0]
-        zero = self._pointer(self.zeros, 0)
+        zero = [] if self.batch else [self._pointer(self.zeros, 0)]
         size, count = self.groups
 
         def piece(j: Index) -> None:
-            for c in range(own):
+            for c in range(0, own, width):
                 first = c * self._padded(ny)
                 source, target = (f.pointer(*self._at(self.X, first, point)) for point in (j, j + 1))
-                f.call(self.advance, memory, source, zero, target, j.value)
+                f.call(advance, memory, source, *zero, target, j.value)
 
         with f.loop(self.strands) as strand:
             base = strand.value * self.strand_points
@@ -395,14 +402,13 @@ class EliminationCode(RodCode):
             with self._places(self.pieces) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
                 f.call(self.solved, memory, *points, j.value)
-            with f.loop(self.pieces) as j:
-                source = self._pointer(self.wide_added, j), self.wide_added.component
-                self._copy(ny, source, (self._pointer(self.added, j), 1))
+            wide = self._pointer(self.wide_added, 0), self.wide_added.component
+            self._transpose(ny, self.pieces, wide, (self._pointer(self.added, 0), self.added.place))
         self._write_correction()
         if not self.batch:
-            with f.loop(self.points) as j:
-                source = self._pointer(self.column_dy, j), 1
-                self._copy(ny, source, (self._pointer(self.dy, j), self.dy.component))
+            wide = self._pointer(self.dy, 0), self.dy.component
+            columns = self._pointer(self.column_dy, 0), self.column_dy.place
+            self._transpose(ny, self.points, wide, columns, back=True)
         for k in range(self.equations.k):
             strand, i = divmod(k, self.own)
             self._put(self._get(self.alpha, i, strand), self.step_unknowns, k)

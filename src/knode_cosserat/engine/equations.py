@@ -459,16 +459,33 @@ class Elimination:
         self.r, self.x = program.inputs("r", (n,), 1), program.inputs("x", (n,), 1)
         #: B⁻¹ r
         self.solved = solve([int(node) for node in self.r])
-        #: entries of A that are not constant, and B⁻¹ (A x + r)
+        #: entries of A that are not constant
         self.entries = [(i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))]
-        self.start_entries = program.inputs("entry", (len(self.entries),), 1)
-        known = A.copy()
-        for node, (i, j) in zip(self.start_entries, self.entries, strict=True):
-            known[i, j] = node
-        right = [int(node) for node in self.r]
-        for i, j in np.ndindex(A.shape):
-            right[i] = apply("add", right[i], apply("mul", int(known[i, j]), int(self.x[j])))
-        self.advanced = solve(right)
+
+        def moved(slopes: np.ndarray, by: Sequence[int]) -> list[int]:
+            """Return the change of rates by a change of y."""
+            found = [zero] * n
+            for node, (i, k) in zip(slopes, equations.pattern, strict=True):
+                found[i] = apply("add", found[i], apply("mul", int(node), by[k]))
+            return found
+
+        def added(to: list[int], factors: Sequence[float], rates: Sequence[list[int]]) -> list[int]:
+            """Return numbers plus h Σ factor rate."""
+            for factor, rate in zip(factors, rates, strict=False):
+                scaled = apply("mul", self.h, program.constant(factor))
+                to = [apply("add", a, apply("mul", scaled, b)) for a, b in zip(to, rate, strict=True)]
+            return to
+
+        start = [int(node) for node in self.x]
+        for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
+            start[i] = apply("add", start[i], apply("mul", int(node), int(self.x[j])))
+        rates = [moved(self.slopes[0], start), [zero] * n]
+        for slopes, stage in zip(self.slopes[2:], stages, strict=True):
+            part = program.constant(1.0 - stage.end)
+            rates.append(moved(slopes, added([apply("mul", part, x) for x in start], stage.rates, rates)))
+        right = [apply("add", int(r), x) for r, x in zip(self.r, start, strict=True)]
+        #: B⁻¹ (A x + r), with A x by slopes: less to store than A
+        self.advanced = solve(added(right, weights, rates))
 
 
 def _least_fill(nonzero: np.ndarray) -> list[int]:

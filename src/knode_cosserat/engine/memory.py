@@ -66,7 +66,8 @@ class Memory:
         if self.batch:
             return self._array(size, count)
         found = Array(self._size, size, count, 1, size)
-        self._size += size * count
+        # a transpose writes as many columns as there are lanes
+        self._size += size * -(-count // self.L) * self.L
         return found
 
     def _tangent_array(self, size: int, count: int, memory: int = 0) -> Array:
@@ -186,6 +187,26 @@ class Memory:
         with self._places(count) as j:
             for i in range(size):
                 yield i, j
+
+    def _transpose(
+        self, rows: int, places: int, wide: tuple[Value, int], by_rows: tuple[Value, int], back: bool = False
+    ) -> None:
+        """Copy numbers with places in lanes to columns with rows in lanes, or back.
+
+        Both have the address of the first number, and the distance between components or between columns.
+        """
+        f, L = self._now, self.L
+        zero = f.splat(f.value(0.0), L)
+        with f.loop(places, 0, L) as j:
+            source, target = f.pointer(wide[0], j.value), f.pointer(by_rows[0], j.value * by_rows[1])
+            for row in range(0, rows, L):
+                inside = [(source, (row + k) * wide[1]) for k in range(min(L, rows - row))]
+                columns = [(target, k * by_rows[1] + row) for k in range(L)]
+                first, then = (columns, inside) if back else (inside, columns)
+                values = [f.load(*at, L) for at in first]
+                values += [zero] * (L - len(values))
+                for value, at in zip(f.transposed(values), then, strict=False):
+                    f.store(value, *at)
 
     def _copy_wide(self, source: Array, target: Array, count: int, shift: int = 0) -> None:
         """Copy values at places, to places that are earlier by a shift."""

@@ -81,8 +81,12 @@ class RodCode(Memory):
             (self.length, length[None]),
         ]
         self.place_terms = a(e.size(e.place_terms), self.count)
-        self.f, self.z, self.fe = a(ny, self.count), a(nz, self.count), a(ny, self.pieces)
-        self.slope, self.slope_end = a(len(e.pattern), self.used), a(len(e.pattern), self.pieces)
+        self.f, self.z = a(ny, self.count), a(nz, self.count)
+        self.slope = a(len(e.pattern), self.used)
+        # at the ends of pieces; without near sides these are the starts of the next ones
+        self.fe, self.slope_end = (
+            a(each.size, self.pieces) if self.near else each for each in (self.f, self.slope)
+        )
         self.acting, self.jump = a(e.acting.size, self.pieces), a(len(e.jumping), self.pieces)
         #: y at the places of the ends; with jumps it differs from y at the points
         self.far = a(ny, self.ends) if system.discontinuities.jump is not None else None
@@ -286,7 +290,9 @@ class RodCode(Memory):
         return far
 
     def _write_ends(self, source: Array, target: Array) -> None:
-        """Copy values at places to the ends of pieces."""
+        """Copy values at places to the ends of pieces, if these are other places."""
+        if target is source:
+            return
         self._copy_wide(source, target, self.pieces, shift=1)
         for k, point in enumerate(self.near):
             for i in range(source.size):
@@ -339,11 +345,14 @@ class RodCode(Memory):
 
     def _increment(self, weights: Sequence[float], rates: tuple[Array, Array], i: int, j: Index) -> Value:
         """Return h times the weighted sum of a piece's rates: at its start, its end and its stages."""
-        at, end = rates
-        places = [(at, j), (end, j)]
-        places += [(at, j + first) for first in self.check_stages]
+        places = self._places_of(rates, j)
         values = [self._wide(array, i, place) for array, place in places[: len(weights)]]
         return self._weighted(weights, values, self._wide(self.h, 0, j))
+
+    def _places_of(self, rates: tuple[Array, Array], j: Index) -> list[tuple[Array, Index]]:
+        """Return where a piece's rates are: at its start, its end and its stages."""
+        at, end = rates
+        return [(at, j), (end, j + int(end is at)), *((at, j + first) for first in self.check_stages)]
 
     def _weighted(self, weights: Sequence[float], values: Sequence[Value], unit: Any = 1.0) -> Value:
         """Return a weighted sum times a unit, by one product for each size of a weight."""
@@ -421,25 +430,27 @@ class RodCode(Memory):
         state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
         return state | self._history_of_strands(history, self.bases)
 
-    def _norm(self, array: Array, count: int, weights: Array | None = None) -> Value:
-        """Return the largest weighted component, by default in natural units; infinite for NaN."""
-        f = self._now
-        weights = weights or self.scale_y
-        found = Variable(f, f.splat(f.value(0.0), self.L))
-        finite = Variable(f, f.splat(f.value(0.0), self.L))
+    def _norms(self, array: Array, count: int, *weights: Array) -> list[Value]:
+        """Return the largest component in natural units, and by further weights; infinite for NaN."""
+        f, zero = self._now, self._now.splat(self._now.value(0.0), self.L)
+        every = self.scale_y, *weights
+        found, finite = [Variable(f, zero) for _ in every], Variable(f, zero)
         with self._places(count) as j:
-            largest, total = found.get(), finite.get()
-            inside = self._inside(j, count)
+            largest, totals = [zero for _ in every], [zero, zero]
             for i in range(array.size):
-                weight = self._wide(weights, i, j if weights.count else 0)
-                x = f.apply("abs", self._wide(array, i, j)) * weight
-                x = x if self.batch else f.select(inside, x, 0.0)
-                largest, total = f.select(x > largest, x, largest), total + x
-            found.set(largest)
-            finite.set(total)
+                size = f.apply("abs", self._wide(array, i, j))
+                totals[i % 2] = totals[i % 2] + size
+                for k, each in enumerate(every):
+                    x = size * self._wide(each, i, j if each.count else 0)
+                    largest[k] = f.select(x > largest[k], x, largest[k])
+            inside = self._inside(j, count)
+            for variable, value in zip(found, largest, strict=True):
+                value = f.select(inside, value, 0.0)
+                variable.set(f.select(value > variable.get(), value, variable.get()))
+            finite.set(finite.get() + f.select(inside, totals[0] + totals[1], 0.0))
         # a comparison drops NaN; a sum keeps it
         known = f.compare("lt", finite.get(), float("inf"))
-        return self._largest(f.select(known, found.get(), float("inf")))
+        return [self._largest(f.select(known, each.get(), float("inf"))) for each in found]
 
     def _unit(self, i: int, j: Index) -> Value:
         """Return 1 over the natural unit of a component of y at a point."""

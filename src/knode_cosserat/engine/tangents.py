@@ -326,7 +326,7 @@ class _TangentCode(EliminationCode):
 
         def by_length(weights: Sequence[float], target: Any, j: Index) -> list[Operation]:
             """Add the weighted sum of a piece's rates times the tangent of its length."""
-            places = (self.f, j), (self.fe, j), *((self.f, j + first) for first in self.stages)
+            places = self._places_of((self.f, self.fe), j)
             found = list[Operation]()
             for i in range(e.ny):
                 parts = [
