@@ -49,7 +49,7 @@ class PredictiveController(PlanController):
 
     def __init__(
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, weights: Weights = Weights(), soft: Sequence[SoftLimit] = (),
+        knots: int = 8, stride: int = 1, weights: Weights = Weights(), soft: Sequence[SoftLimit] = (),
     ):  # fmt: skip
         """Set up the controller around an observer of the model; `reset` compiles it.
 
@@ -57,8 +57,9 @@ class PredictiveController(PlanController):
             observer: estimates the state of the model, which is also the model of the predictions.
             target: the tracked output; references are its values.
             limits: hard limits of the controls and their rates.
-            horizon: number of predicted periods.
+            horizon: number of predicted steps.
             knots: number of controls in the plan; between them it is linear.
+            stride: number of periods in a predicted step.
             weights: of the cost.
             soft: limits of outputs.
 
@@ -68,7 +69,7 @@ class PredictiveController(PlanController):
         """
         qp.require_daqp()
         self.soft = tuple(soft)
-        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots, stride), weights)
         ends = np.concatenate([
             np.zeros((2, 0)),
             *([np.full(limit.output.size, end) for end in (limit.low, limit.high)] for limit in self.soft),
