@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.equations import is_moving, with_moving
 from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.motions import Motions
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.estimation.outputs import Output
@@ -149,7 +150,7 @@ class OnlineModel:
         return TimeIntegration(self.settings, self.dt, steps, self.settings.memory)
 
     def coefficients(self, stride: int) -> StepCoefficients:
-        """Return the coefficients of steps of `stride` dt; longer ones than dt start from the newest state."""
+        """Return the coefficients of steps of `stride` dt; longer ones start from the newest state."""
         if stride not in self._coefficients:
             known = self.settings.memory if stride == 1 else 1
             self._coefficients[stride] = StepCoefficients.of(self.settings, stride * self.dt, known)
@@ -203,12 +204,11 @@ class OnlineModel:
         if stride > 1:  # the states before the newest one are not at the distance of a step
             past = past._replace(weights=EXTRAPOLATIONS[0])
         states = StateHistory(*(np.asarray(leaf)[None] for leaf in past))
-        done, after, rows = moved.core.integrate(
-            moved.numbers, controls[None], self.coefficients(stride), states, (0, steps)
-        )
+        motions = Motions(moved.core, moved.numbers, states, self.coefficients(stride))
+        done, rows = motions.solve(controls[None], (0, steps))
         if done[0] < steps:
             return None
-        after = StateHistory(*(leaf[0] for leaf in after))._replace(t0=past.t0 + steps * stride * self.dt)
+        after = StateHistory(*(leaf[0] for leaf in motions.states))._replace(t0=past.t0 + steps * stride * self.dt)
         return after, StepRows(*(leaf[0] for leaf in rows))
 
     def rollout(
