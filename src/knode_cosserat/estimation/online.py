@@ -208,7 +208,8 @@ class OnlineModel:
         done, rows = motions.solve(controls[None], (0, steps))
         if done[0] < steps:
             return None
-        after = StateHistory(*(leaf[0] for leaf in motions.states))._replace(t0=past.t0 + steps * stride * self.dt)
+        after = StateHistory(*(leaf[0] for leaf in motions.states))
+        after = after._replace(t0=past.t0 + steps * stride * self.dt)
         return after, StepRows(*(leaf[0] for leaf in rows))
 
     def rollout(
