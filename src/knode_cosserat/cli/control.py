@@ -85,6 +85,13 @@ class _Method(NamedTuple):
 
     method: Method = "predictive"
     dt: Annotated[float, option("S", "Period of the control (s).")] = 0.05
+    realtime: Annotated[
+        bool,
+        typer.Option(
+            "--realtime",
+            help="Choose the longest prediction that this computer computes in 60 % of a period.",
+        ),
+    ] = False
     low: Annotated[str, option("NUMBERS", "Least control: one number, or one for each.")] = "0"
     high: Annotated[str, option("NUMBERS", "Greatest control: one number, or one for each.")] = "10"
     rate: Annotated[float, option("PER_S", "Greatest change of a control in 1 s.")] = 40.0
@@ -100,6 +107,15 @@ class _Method(NamedTuple):
             "--tip-deviation",
         ),
     ] = 2e-4
+
+    @property
+    def name(self) -> str:
+        """Controller with its options."""
+        if not self.realtime:
+            return self.method
+        from knode_cosserat.control.realtime import SHARE
+
+        return f"{self.method}{',' if ':' in self.method else ':'}realtime={SHARE}"
 
     def limits(self, size: int) -> ControlLimits:
         """Return the limits of `size` controls."""
@@ -169,8 +185,12 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
     model = nominal.load()
     length, limits = float(nominal_model(model).length), method.limits(model.control_layout.size)
     controller = kcc.controller_named(
-        method.method, model, method.dt, limits, method.adapt or (), TipPosition(sigma=method.deviation)
+        method.name, model, method.dt, limits, method.adapt or (), TipPosition(sigma=method.deviation)
     )
+    choice = getattr(controller, "choice", None)
+    if choice is not None:
+        again = ",".join(f"{name}={value}" for name, value in controller.settings.items())
+        typer.echo(f"{choice} (again with --method predictive:{again})", err=True)
     plant = task.plant_of(model, method.dt)
     beyond = None  # with --live, the target moves
     if task.reference is not None:

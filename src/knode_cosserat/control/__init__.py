@@ -16,6 +16,7 @@ from knode_cosserat.control.commands import (
 from knode_cosserat.control.loop import LoopLog, run_loop
 from knode_cosserat.control.plants import Plant, Sensor, SimulatedPlant
 from knode_cosserat.control.predictive import PredictiveController, SoftLimit
+from knode_cosserat.control.realtime import RealtimeError
 from knode_cosserat.control.references import Reference, circle, constant, figure_eight, steps, table
 
 __all__ = [
@@ -25,6 +26,7 @@ __all__ = [
     "LoopLog",
     "Plant",
     "PredictiveController",
+    "RealtimeError",
     "Reference",
     "Sensor",
     "SimulatedPlant",

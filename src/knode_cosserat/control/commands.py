@@ -129,6 +129,11 @@ class Controller(abc.ABC):
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Start from a control that acts now; compile everything that the loop needs."""
 
+    @property
+    def settings(self) -> dict[str, int]:
+        """Settings as plain numbers by name, for the log: arguments that make such a controller again."""
+        return {}
+
     def copied(self) -> Self:
         """Return a copy that moves independently of this controller."""
         return copy.copy(self)

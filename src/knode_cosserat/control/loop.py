@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
-import gc
 import time as clock
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +17,7 @@ from jaxtyping import Float
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.control.commands import Command, Controller, ControlLimits
 from knode_cosserat.control.plants import Plant
+from knode_cosserat.control.realtime import no_garbage_collection
 from knode_cosserat.control.references import Reference, ReferenceFormatError
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
@@ -149,6 +148,7 @@ class LoopLog:
             the next period began late. Simulations count it too, although their time waits.
         compiled: number of programs that were compiled during the loop; each may have delayed a period.
         initial_control: (c,) control before the first row, if the log begins at the start.
+        settings: settings of the controller that were chosen or given, as plain numbers by name.
         estimated: estimated states, a trajectory that can be saved, drawn and viewed; None without an
             observer. Its robot has the parameters that the model had at first.
     """
@@ -167,6 +167,7 @@ class LoopLog:
     missed: int
     compiled: int = 0
     initial_control: Float[np.ndarray, " c"] | None = None
+    settings: dict[str, int] = dataclasses.field(default_factory=dict)
     estimated: Trajectory | None = None
 
     @property
@@ -200,6 +201,7 @@ class LoopLog:
             "feedback_p99_ms": 1e3 * float(np.percentile(self.feedback, 99)),
             "preparation_ms": 1e3 * float(np.median(self.preparation)),
             "cycle_p99_ms": 1e3 * float(np.percentile(self.feedback + self.preparation, 99)),
+            "settings": self.settings,
             "parameters": {name: float(values[-1]) for name, values in self.parameters.items()},
         }
 
@@ -305,21 +307,6 @@ class _Compilations:
 #: JAX's event of a compilation, also of one that is read from the cache on disk
 COMPILED = "/jax/core/compile/backend_compile_duration"
 _COMPILATIONS = _Compilations()
-
-
-@contextlib.contextmanager
-def _no_garbage_collection() -> Iterator[None]:
-    """Suspend Python's garbage collector, which interrupts a period for some milliseconds."""
-    gc.collect()
-    gc.freeze()
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-        gc.unfreeze()
 
 
 class Period(NamedTuple):
@@ -436,6 +423,7 @@ class Loop:
             missed=max(self.missed + self.plant.missed, self._overrun),
             compiled=_COMPILATIONS.count - self._compiled_before,
             initial_control=self._initial if rows[0].time == 0.0 else None,
+            settings=self.controller.settings,
             estimated=joined(states, columns.time) if states else None,
         )
 
@@ -468,7 +456,7 @@ def run_loop(
     check_reference(controller, reference, seconds)
     loop = Loop(controller, plant, reference)
     try:
-        with _no_garbage_collection():
+        with no_garbage_collection():
             due = clock.perf_counter()
             for k in range(steps):
                 if paced:

@@ -45,28 +45,35 @@ SHARE = 0.5
 class Knots:
     """Knots of a plan: the samples at which controls are chosen; in between they change linearly.
 
+    A sample is a period of control. The prediction may take longer steps, of several periods.
+
     Attributes:
-        samples: indices of the knots, from 0 to horizon - 1.
-        horizon: number of samples of a plan.
+        samples: indices of the knots, from 0 to the last step's first sample.
+        steps: number of predicted steps.
+        stride: number of samples in a step.
     """
 
     samples: tuple[int, ...]
-    horizon: int
+    steps: int
+    stride: int = 1
 
     @classmethod
-    def spaced(cls, horizon: int, count: int) -> Knots:
-        """Return knots that are dense at the beginning and sparse at the end.
+    def spaced(cls, steps: int, count: int, stride: int = 1) -> Knots:
+        """Return knots that are dense at the beginning and sparse at the end, at beginnings of steps.
 
         Raises:
-            ValueError: more knots than samples, or fewer than two.
+            ValueError: more knots than steps, fewer than two, or steps shorter than a sample.
         """
-        if not 2 <= count <= horizon:
-            raise ValueError(f"knots is {count}; allowed are 2 to the horizon, {horizon}")
-        power = 1.0 if count == horizon else 1.6
-        wanted = np.round((horizon - 1) * (np.arange(count) / (count - 1)) ** power).astype(int)
+        if not 2 <= count <= steps:
+            raise ValueError(f"knots is {count}; allowed are 2 to the horizon, {steps}")
+        if stride < 1:
+            raise ValueError(f"stride is {stride}; allowed is at least 1")
+        power = 1.0 if count == steps else 1.6
+        wanted = np.round((steps - 1) * (np.arange(count) / (count - 1)) ** power).astype(int)
         for k in range(1, count):  # no two at one sample
             wanted[k] = max(wanted[k], wanted[k - 1] + 1)
-        return cls(tuple(np.minimum(wanted, horizon - count + np.arange(count)).tolist()), horizon)
+        samples = stride * np.minimum(wanted, steps - count + np.arange(count))
+        return cls(tuple(samples.tolist()), steps, stride)
 
     @property
     def count(self) -> int:
@@ -74,10 +81,19 @@ class Knots:
         return len(self.samples)
 
     @property
-    def basis(self) -> Float[np.ndarray, "T knots"]:
+    def horizon(self) -> int:
+        """Number of samples."""
+        return self.steps * self.stride
+
+    @property
+    def basis(self) -> Float[np.ndarray, "samples knots"]:
         """Weights of the knots' values in every sample's control."""
         rows = np.arange(self.horizon)
         return np.stack([np.interp(rows, self.samples, one) for one in np.eye(self.count)], axis=1)
+
+    def means(self, of_samples: Float[np.ndarray, "samples ..."]) -> Float[np.ndarray, "T ..."]:
+        """Return the means of samples over the steps: a step holds its control."""
+        return of_samples.reshape(self.steps, self.stride, *of_samples.shape[1:]).mean(axis=1)
 
     @property
     def changes(self) -> Float[np.ndarray, "knots knots"]:
@@ -95,7 +111,7 @@ class Knots:
         later: Int[np.ndarray, " knots"] = np.minimum(np.array(self.samples) + 1, self.horizon - 1)
         return self.controls(plan)[later]
 
-    def controls(self, plan: Any) -> Float[np.ndarray, "T c"]:
+    def controls(self, plan: Any) -> Float[np.ndarray, "samples c"]:
         """Return the controls of all samples."""
         return self.basis @ np.asarray(plan)
 
@@ -143,7 +159,8 @@ class Tracking:
     def __init__(
         self, knots: Knots, limits: ControlLimits, weights: Weights, noise: Float[np.ndarray, " e"], dt: float
     ):  # fmt: skip
-        self.limits, self.weights, self.noise = limits, weights, noise
+        #: an error counts in each sample of its step
+        self.limits, self.weights, self.noise = limits, weights, noise / np.sqrt(knots.stride)
         self._spread = np.asarray(limits.high) - np.asarray(limits.low)
         self._preferred = np.asarray(limits.safe if weights.preferred is None else weights.preferred)
         self._changes, count = knots.changes, knots.count
@@ -261,13 +278,15 @@ class PlanController(Controller):
         self.observer, self.target, self.dt = observer, target, observer.dt
         self.limits, self.knots = limits.of(observer.robot), knots
         count = observer.robot.control_layout.size
-        _check_memory(observer.robot, knots.horizon, knots.count * count + observer.columns)
+        _check_memory(observer.robot, knots.steps, knots.count * count + observer.columns)
         self.tracking = Tracking(knots, self.limits, weights, target.noise, self.dt)
-        self._basis = self.knots.basis
+        basis = knots.basis
         if self.limits.lag:
-            self._basis = lag_weights(self._basis, self.limits.lag, self.dt)
+            basis = lag_weights(basis, self.limits.lag, self.dt)
+        #: weights of the knots in the controls of the predicted steps
+        self._basis = knots.means(basis)
         #: derivatives of the horizon's controls by the plan's numbers, one after the other
-        self._by_plan = np.einsum("tk,ij->kjti", self._basis, np.eye(count)).reshape(-1, knots.horizon, count)
+        self._by_plan = np.einsum("tk,ij->kjti", self._basis, np.eye(count)).reshape(-1, knots.steps, count)
         self.reset(np.asarray(self.limits.safe))
 
     @classmethod
@@ -346,7 +365,11 @@ class PlanController(Controller):
         none = np.zeros((len(belief.spread.records), *by_plan.shape[1:]))
         columns = model.columns(self.target, *limited)
         moved, motion = model.rollout(
-            belief._replace(spread=spread), self._basis @ knots, np.concatenate([by_plan, none]), columns
+            belief._replace(spread=spread),
+            self._basis @ knots,
+            np.concatenate([by_plan, none]),
+            columns,
+            self.knots.stride,
         )
         if motion is None:
             return None
@@ -360,12 +383,13 @@ class PlanController(Controller):
         return Prediction(error, slopes[:n], slopes[first:], value, slope[:n], slope[first:], path)
 
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:
-        """Return the reference at the ends of the periods of the horizon that begins at `time` (s).
+        """Return the reference at the ends of the predicted steps, the first of which begins at `time` (s).
 
         Raises:
             ValueError: a reference of another size than the target.
         """
-        rows = reference.expected(time, self.dt * (1.0 + np.arange(self.knots.horizon)))
+        steps = 1.0 + np.arange(self.knots.steps)
+        rows = reference.expected(time, self.knots.stride * self.dt * steps)
         if rows.shape[1] != self.target.size:
             raise ValueError(
                 f"the reference has {rows.shape[1]} numbers; the target has {self.target.size}: "

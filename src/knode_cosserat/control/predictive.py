@@ -8,7 +8,9 @@ takes less than a millisecond.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
+import logging
 from collections.abc import Sequence
 from typing import Any
 
@@ -18,9 +20,12 @@ from jaxtyping import Float
 from knode_cosserat.control import qp
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
 from knode_cosserat.control.planning import Knots, PlanController, Prediction, Weights
+from knode_cosserat.control.realtime import SHARE, Choice, Size, chosen, seconds_in_period
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
+
+log = logging.getLogger(__name__)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -49,32 +54,63 @@ class PredictiveController(PlanController):
 
     def __init__(
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, weights: Weights = Weights(), soft: Sequence[SoftLimit] = (),
+        knots: int = 8, stride: int = 1, realtime: float = 0.0, weights: Weights = Weights(),
+        soft: Sequence[SoftLimit] = (),
     ):  # fmt: skip
-        """Set up the controller around an observer of the model; `reset` compiles it.
+        """Set up the controller around an observer of the model; `realtime` compiles and measures, too.
 
         Args:
             observer: estimates the state of the model, which is also the model of the predictions.
             target: the tracked output; references are its values.
             limits: hard limits of the controls and their rates.
-            horizon: number of predicted periods.
+            horizon: number of predicted steps.
             knots: number of controls in the plan; between them it is linear.
+            stride: number of periods in a predicted step.
+            realtime: part of a period that the computations may take, or True for 0.6. `horizon`, `knots`
+                and `stride` are then chosen by the time that they take on this computer. `settings` has
+                them: give these to use them again. 0: nothing is chosen.
             weights: of the cost.
             soft: limits of outputs.
 
         Raises:
             ValueError: limits or sizes that are not allowed.
+            RealtimeError: no prediction is fast enough.
             ImportError: DAQP is not installed.
         """
         qp.require_daqp()
         self.soft = tuple(soft)
-        super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
+        #: the choice by the time of the computations; None if the sizes were given
+        self.choice: Choice | None = None
+        if realtime:
+            if (horizon, knots, stride) != (20, 8, 1):
+                raise ValueError(
+                    "realtime chooses horizon, knots and stride; give either realtime or these numbers"
+                )
+
+            def seconds(size: Size) -> float:
+                sizes, how = size._asdict(), {"weights": weights, "soft": soft}
+                return seconds_in_period(type(self)(copy.copy(observer), target, limits, **sizes, **how))
+
+            share = SHARE if realtime is True else float(realtime)
+            self.choice = chosen(seconds, observer.dt, share)
+            horizon, knots, stride = self.choice.size
+            log.info("%s", self.choice)
+        super().__init__(observer, target, limits, Knots.spaced(horizon, knots, stride), weights)
         ends = np.concatenate([
             np.zeros((2, 0)),
             *([np.full(limit.output.size, end) for end in (limit.low, limit.high)] for limit in self.soft),
         ], axis=1)  # fmt: skip
         # at every sample of the horizon, one sample after the other
         self._low, self._high = np.tile(ends, horizon)
+
+    @property
+    def settings(self) -> dict[str, int]:
+        """Size of the prediction: arguments that make such a controller again."""
+        return {"horizon": self.knots.steps, "knots": self.knots.count, "stride": self.knots.stride}
+
+    def __repr__(self) -> str:
+        said = Size(**self.settings).described(self.dt) if self.choice is None else str(self.choice)
+        return f"{type(self).__name__}: {said}"
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Forget the plan; the control acts now. The observer keeps its state."""

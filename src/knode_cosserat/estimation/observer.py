@@ -226,7 +226,9 @@ class KalmanObserver:
         records = np.asarray(spread.records)[..., : len(self._scale)] / self._scale
         flat = np.concatenate([records.reshape(len(records), -1), np.asarray(spread.parameters)], axis=1)
         matrix = np.linalg.eigh(flat @ flat.T)[1][:, ::-1][:, : self.columns]
-        value = np.asarray(motion.values[-1])[: len(self.output.noise)] / self.output.noise
+        #: the output that is predicted for this time
+        self.expected = np.asarray(motion.values[-1])
+        value = self.expected[: len(self.output.noise)] / self.output.noise
         self._values = np.concatenate([self._values, value[None]])[-max(2, round(BIASED / self.dt)) :]
         self.record = np.asarray(motion.record)
         self.belief = online.Belief(x, motion.past, spread.combined(matrix))

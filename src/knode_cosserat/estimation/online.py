@@ -17,13 +17,14 @@ from jaxtyping import Bool, Float
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.equations import is_moving, with_moving
 from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
+from knode_cosserat.engine.motions import Motions
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import StateHistory, StepRows
+from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, StepCoefficients, StepRows
 from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.settings import Settings
@@ -133,7 +134,7 @@ class OnlineModel:
         """Set the time step (s); by default the schemes are those of a simulated plant."""
         self.parameters, self.dt, self.settings = parameters, dt, settings
         self._structure = Structure.of(parameters.robot)
-        self._coefficients = self.task(1).coefficients
+        self._coefficients: dict[int, StepCoefficients] = {}
         #: robots by their coordinates, the newest last, and machine code by the masks of numbers
         self._robots: dict[bytes, MovedRobot] = {}
         self._codes: dict[tuple[bytes, bytes], tuple[Core, TangentCore]] = {}
@@ -147,6 +148,13 @@ class OnlineModel:
     def task(self, steps: int) -> TimeIntegration:
         """Return so many steps from a state with a history."""
         return TimeIntegration(self.settings, self.dt, steps, self.settings.memory)
+
+    def coefficients(self, stride: int) -> StepCoefficients:
+        """Return the coefficients of steps of `stride` dt; longer ones start from the newest state."""
+        if stride not in self._coefficients:
+            known = self.settings.memory if stride == 1 else 1
+            self._coefficients[stride] = StepCoefficients.of(self.settings, stride * self.dt, known)
+        return self._coefficients[stride]
 
     def moved(self, x: Float[np.ndarray, " n"]) -> MovedRobot:
         """Return the robot at coordinates.
@@ -188,30 +196,34 @@ class OnlineModel:
         return tuple(sorted({int(k) for output in outputs for k in self._columns[output]}))
 
     def simulated(
-        self, x: Float[np.ndarray, " n"], past: StateHistory, controls: Float[np.ndarray, "T c"]
-    ) -> tuple[StateHistory, StepRows] | None:
-        """Return the last history and the rows of a motion; None if it was not solved."""
+        self, x: Float[np.ndarray, " n"], past: StateHistory, controls: Float[np.ndarray, "T c"],
+        stride: int = 1,
+    ) -> tuple[StateHistory, StepRows] | None:  # fmt: skip
+        """Return the last history and the rows of a motion in steps of `stride` dt; None if not solved."""
         moved, steps = self.moved(x), len(controls)
+        if stride > 1:  # the states before the newest one are not at the distance of a step
+            past = past._replace(weights=EXTRAPOLATIONS[0])
         states = StateHistory(*(np.asarray(leaf)[None] for leaf in past))
-        done, after, rows = moved.core.integrate(
-            moved.numbers, controls[None], self._coefficients, states, (0, steps)
-        )
+        motions = Motions(moved.core, moved.numbers, states, self.coefficients(stride))
+        done, rows = motions.solve(controls[None], (0, steps))
         if done[0] < steps:
             return None
-        after = StateHistory(*(leaf[0] for leaf in after))._replace(t0=past.t0 + steps * self.dt)
+        after = StateHistory(*(leaf[0] for leaf in motions.states))
+        after = after._replace(t0=past.t0 + steps * stride * self.dt)
         return after, StepRows(*(leaf[0] for leaf in rows))
 
     def rollout(
         self, belief: Belief, controls: Float[np.ndarray, "T c"], d_controls: Float[np.ndarray, "k T c"],
-        columns: tuple[int, ...],
+        columns: tuple[int, ...], stride: int = 1,
     ) -> tuple[MovedRobot, Motion | None]:  # fmt: skip
         """Return the robot, and its motion with tangents of all rows; None if it was not solved.
 
         A tangent is that along a direction of the belief's spread, with the tangents of the controls beside
-        it. Those of rows are returned for the numbers `columns` (among N * x) of each record.
+        it. Those of rows are returned for the numbers `columns` (among N * x) of each record. Steps take
+        `stride` dt.
         """
         past, spread, settings, steps = belief.past, belief.spread, self.settings, len(controls)
-        moved, solved = self.moved(belief.x), self.simulated(belief.x, past, controls)
+        moved, solved = self.moved(belief.x), self.simulated(belief.x, past, controls, stride)
         if solved is None:
             return moved, None
         (after, rows), used = solved, spread.rate.shape[1]
@@ -219,7 +231,7 @@ class OnlineModel:
             at_all_stages(self.robot, settings, each) for each in (controls, np.moveaxis(d_controls, 0, -1))
         )
         data = SolvedSteps(
-            moved.numbers, table_of(self._coefficients, steps, float(past.t0)), own, *rows.every_stage,
+            moved.numbers, table_of(self.coefficients(stride), steps, float(past.t0)), own, *rows.every_stage,
             np.asarray(past.records)[:, :used], np.asarray(past.rate)[:used],
         )  # fmt: skip
         d_records, d_rate = (np.moveaxis(part, 0, -1) for part in (spread.records, spread.rate))

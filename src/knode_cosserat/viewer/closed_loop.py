@@ -86,7 +86,7 @@ class LoopFacts(NamedTuple):
         sizes = {
             "status": 1, "feedback": 1, "preparation": 1, "violation": 1, "missed": 1, "target": 3,
             "control": len(controls), "parameters": len(parameters), "deviations": len(parameters),
-            "path": 0 if knots is None else 3 * knots.horizon,
+            "path": 0 if knots is None else 3 * knots.steps,
         }  # fmt: skip
         ends = np.cumsum([0, *sizes.values()])
         columns = {name: (int(ends[k]), size) for k, (name, size) in enumerate(sizes.items())}
