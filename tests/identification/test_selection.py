@@ -35,7 +35,7 @@ def test_rows_that_depend_on_everything_are_not_used(search):
 def test_the_next_experiment_tells_what_it_promises(search):
     """One tendon's gain is known only after an experiment in which that tendon pulls."""
     model, names = search.misfit.model, ["stiffness", "damping", "load cell gains"]
-    point = search.run(np.zeros(model.size), model.mask(names), effort=(0, 0.0), every=True)
+    point = search.run(np.zeros(model.size), model.mask(names), effort=(0, 0.0), equations="all")
     posterior = Posterior.of(model, point, names)
     found = next_experiment(search, posterior, point.x, ["load cell gains"])
     assert found.control.min() >= ROWS.tension.min() and found.control.max() <= ROWS.tension.max()
@@ -46,7 +46,7 @@ def test_the_next_experiment_tells_what_it_promises(search):
     more = measured(NOMINAL, found.control, "two")
     both = Search(Misfit(model, [each.rough() for each in experiments_of([ROWS, more], model)]))
     scale = np.tile(point.scale, (2, 1))
-    again = both.run(point.x, model.mask(names), effort=(0, 0.0), scale=scale, every=True)
+    again = both.run(point.x, model.mask(names), effort=(0, 0.0), scale=scale, equations="all")
     share = point.problem.amount[0] / again.problem.amount[0]
     known = share * again.problem.matrix.sum(axis=0) + np.diag(point.prior)
     after = np.sqrt(np.diag(np.linalg.inv(known)))

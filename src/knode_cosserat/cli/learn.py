@@ -220,6 +220,9 @@ class _Search(NamedTuple):
     checkpoint: Annotated[
         Path | None, option("DIR", "Keep finished searches here; an interrupted run resumes.")
     ] = None
+    minutes: Annotated[
+        float, option("MINUTES", "End after this time with the best robot so far.", show_default="no limit")
+    ] = math.inf
 
 
 @app.command(
@@ -239,7 +242,7 @@ def identify(
 
     ROBOT is the nominal robot, from measured dimensions, masses and data sheets. An effect is kept if it
     lowers the error on recordings left out of the search. The result must pass trial simulations with larger
-    and with random tensions.
+    and with random tensions. When --minutes are over, or at Ctrl-C, the best robot so far is written.
     """
     require_writable(search.out)
     import knode_cosserat as kc
@@ -252,10 +255,15 @@ def identify(
     ]
     began = perf_counter()
     progress = functools.partial(print, file=sys.stderr, flush=True) if report.shows_progress else None
-    identified = find(
-        system, samples, search.effects or None, space=sampling.space, progress=progress,
-        checkpoint=search.checkpoint,
-    )  # fmt: skip
+    try:
+        identified = find(
+            system, samples, search.effects or None, space=sampling.space, progress=progress,
+            checkpoint=search.checkpoint, minutes=search.minutes,
+        )  # fmt: skip
+    except KeyboardInterrupt as stop:
+        if not hasattr(stop, "best"):
+            raise
+        identified = stop.best
     kc.save_robot(identified.robot, search.out)
     facts = identified.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
     write_output(report.as_json, facts, str(identified).splitlines(), out=search.out)

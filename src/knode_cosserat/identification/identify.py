@@ -22,8 +22,15 @@ from knode_cosserat.identification.next_experiment import next_experiment
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.result import Identified, estimates_of
 from knode_cosserat.identification.samples import sampled
-from knode_cosserat.identification.search import Point, Search, SearchError
-from knode_cosserat.identification.selection import WORSE, Selection, best_predicting, from_far, selected
+from knode_cosserat.identification.search import OutOfTime, Point, Search, SearchError, clock
+from knode_cosserat.identification.selection import (
+    WORSE,
+    Selection,
+    best_predicting,
+    first_answer,
+    from_far,
+    selected,
+)
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.identification.undetermined import gap_of, unexplained
 from knode_cosserat.learning.training.checkpoint import Checkpoints
@@ -64,6 +71,7 @@ def identify(
     space: str | SpaceScheme = "lobatto4",
     progress: Tell | None = None,
     checkpoint: str | Path | None = None,
+    minutes: float = np.inf,
 ) -> Identified:
     """Find physical effects and parameters of a robot from recordings or trajectories, by least squares.
 
@@ -80,6 +88,11 @@ def identify(
     extrapolation. If the grid is too coarse, its nodes are doubled: the result may have more nodes than the
     nominal robot.
 
+    The first answer, with all effects, is found from the first quarter of the motions and predicts the other
+    rows, which are held out. Where the time is over, the best robot so far is returned, `complete` is
+    false, and `steps` say what was not done. Such a result depends on the machine's speed; any other is the
+    same in every run. An interruption by Ctrl-C is a `KeyboardInterrupt`, whose `best` is this robot.
+
     Args:
         robot: nominal robot, where the search begins; effects need a robot with tendons.
         data: recordings (`load_recording`, or rows of them, `Recording.sampled(0.0125, mean=True)`), each
@@ -91,7 +104,8 @@ def identify(
         space: scheme along the rod of recordings, for which the result is valid; trajectories have their own.
         progress: called with a line for each step.
         checkpoint: folder in which finished searches are kept; an interrupted run with the same arguments
-            resumes from there.
+            resumes from there, also one whose time was over.
+        minutes: time that it may take, but for the last simulations of the best robot, some seconds.
 
     Returns:
         The `Identified` robot, with estimates, 95 % intervals, parameters that the data do not determine, and
@@ -112,57 +126,171 @@ def identify(
             f"robot is a {type(robot).__name__}; allowed is a robot with tendons (TendonRobot, "
             'RoutedTendonRobot), or name `parameters`, such as parameters="all"'
         )
-    tell, journal = progress or log.info, None if checkpoint is None else Checkpoints(checkpoint)
+    if not minutes > 0.0:
+        raise IdentificationError(f"minutes is {minutes}; allowed is a number above zero")
+    course = _Course(progress or log.info, clock() + 60.0 * minutes)
+    journal = None if checkpoint is None else Checkpoints(checkpoint)
     data = listed_rows(data)
     plain = [] if parameters is None else parameter_effects(robot, parameters)
     rows = [it for it in data if isinstance(it, Measurements)]
     plain += place_effects(rows, flat=named)
+
+    def searched(model: Model, data: Sequence[Experiment]) -> Search:
+        return Search(Misfit(model, data), course.tell_left, journal=journal, deadline=course.deadline)
+
     if named:
         model = Model(robot, plain)
-        search = Search(Misfit(model, experiments_of(data, model, space)), tell, journal=journal)
-        return _with_parameters(search)
+        search = searched(model, experiments_of(data, model, space))
+        return course.followed(search, lambda: _with_parameters(search))
     measured = measured_rows(data)
     tension = np.concatenate([rows.tension for rows in measured])
 
-    def searched(robot: Any) -> Search:
+    def with_library(robot: Any) -> Search:
         model = library_model(robot, tension, measured[0].fractions, plain)
-        data = [it.rough() for it in experiments_of(measured, model, space)]
-        return Search(Misfit(model, data), tell, journal=journal)
+        return searched(model, [it.rough() for it in experiments_of(measured, model, space)])
 
-    search = searched(robot)
+    search = with_library(robot)
+    return course.followed(
+        search, lambda: _with_effects(search, course, effects and [*effects, *(it.name for it in plain)],
+                                      space, with_library)
+    )  # fmt: skip
+
+
+#: stages of an identification by effects
+STAGES = (
+    "first answer", "all effects", "selection of effects", "held-out recordings", "trials", "next experiment",
+    "band of predictions",
+)  # fmt: skip
+
+
+@dataclasses.dataclass
+class _Course:
+    """Course of an identification: its stages, its selections in words, and the best robot so far."""
+
+    tell: Tell
+    deadline: float
+    steps: list[str] = dataclasses.field(default_factory=list)
+    stage: str = ""
+    best: Callable[[], Identified] | None = None
+
+    def tell_left(self, line: str) -> None:
+        """Tell a line, with the time left."""
+        left = self.deadline - clock()
+        self.tell(f"{line}, {max(left, 0.0):.0f} s left" if left < np.inf else line)
+
+    def step(self, line: str) -> None:
+        """Tell a line that belongs to the result."""
+        self.steps.append(line)
+        self.tell_left(line)
+
+    def begin(self, stage: str) -> None:
+        """Begin a stage, if there is time."""
+        self.stage = stage
+        self.tell_left(f"stage {STAGES.index(stage) + 1} of {len(STAGES)}, {stage}")
+        if clock() > self.deadline:
+            raise OutOfTime
+
+    def followed(self, search: Search, whole: Callable[[], Identified]) -> Identified:
+        """Return the whole result, or the best one when the time is over."""
+        try:
+            return whole()
+        except OutOfTime:
+            return self._so_far(search, "the time is over")
+        except KeyboardInterrupt as stop:
+            if self.best or search.last:
+                stop.best = self._so_far(search, "interrupted")  # type: ignore[attr-defined]
+            raise
+
+    def _so_far(self, search: Search, reason: str) -> Identified:
+        model = search.misfit.model
+        if self.best is not None:
+            found = self.best()
+        elif search.last is not None:
+            names = [it.name for it in model.effects if search.last.free[model.slice(it.name)].any()]
+            found = _untried(search, names, search.last.x)
+        else:
+            found = Identified(model.nominal)
+        missing = STAGES[STAGES.index(self.stage) :] if self.stage else ("the search",)
+        self.step(f"not complete, {reason}; not done: {', '.join(missing)}")
+        return dataclasses.replace(found, steps=tuple(self.steps), complete=False)
+
+
+def _with_effects(
+    search: Search, course: _Course, effects: Sequence[str] | None, space: str | SpaceScheme,
+    with_library: Callable[[Any], Search],
+) -> Identified:  # fmt: skip
+    """Return the robot with the named effects, or with selected ones."""
+
+    def kept(names: Sequence[str], point: Point) -> None:
+        course.best = lambda: _untried(search, names, point.x)
+
     model = search.misfit.model
-    steps = list[str]()
-
-    def step(line: str) -> None:
-        steps.append(line)
-        tell(line)
-
     try:
-        names = model.names
         if effects is not None:
-            names = _known([*effects, *(effect.name for effect in plain)], model)
+            names = _known(effects, model)
             point = search.from_far(model.mask(names))
         else:
-            point = from_far(search)
+            first = _first_answer(search, course)
+            course.begin("all effects")
+            point = from_far(search, first)
         for refinements in range(REFINEMENTS + 1):
             if effects is None:
-                names, point = selected(search, point, step)
+                course.begin("selection of effects")
+                names, point = selected(search, point, course.step, kept)
             elif refinements:
                 point = search.run(point.x, model.mask(names))
             if not has_coarse_rows(search.misfit.system(point.x), search.misfit.data, space):
                 break
             nodes = 2 * model.nominal.nodes
-            step(f"{nodes} nodes, for the grid was too coarse")
-            search = searched(model.nominal.replace(nodes=nodes))
+            course.step(f"{nodes} nodes, for the grid was too coarse")
+            search = with_library(model.nominal.replace(nodes=nodes))
             model = search.misfit.model
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
+    kept(names, point)
+    course.begin("held-out recordings")
     selection = Selection.of(search, names, point)
     if effects is None and selection.folds:
-        selection = best_predicting(search, selection, step)
-    return dataclasses.replace(
-        _accepted(search, selection, effects is not None, space, step), steps=tuple(steps)
-    )
+        selection = best_predicting(search, selection, course.step, kept)
+    found = _accepted(search, selection, effects is not None, space, course)
+    return dataclasses.replace(found, steps=tuple(course.steps))
+
+
+def _first_answer(search: Search, course: _Course) -> Point | None:
+    """Tell and keep the robot of the first rows, and how well it predicts the held-out rows after them."""
+    course.begin("first answer")
+    model = search.misfit.model
+    try:
+        point, rows = first_answer(search)
+    except SearchError as error:
+        search.tell(f"no first answer: {error}")
+        return None
+    errors = _errors(search, point.x, rows=rows)
+    known = [error for error in errors if error is not None]
+    if known:
+        posterior = Posterior.of(model, point, model.names)
+        words = ", ".join(f"{it.label} {it.value:.3g} ± {it.error:.2g} {it.unit}".rstrip()
+                          for it in estimates_of(posterior, point.x, model.names)
+                          if model.effect(it.effect).basic)  # fmt: skip
+        course.step(f"first answer, tip error in held-out rows {1e3 * np.mean(known):.3g} mm: {words}")
+        held_out = dict(zip((it.name for it in search.misfit.data), errors, strict=True))
+
+        def found() -> Identified:
+            robot = model.reduced(point.x, model.names)
+            result = _result(search, robot, (point.x, model.names), posterior)
+            return dataclasses.replace(result, held_out_error=held_out)
+
+        course.best = found
+    return point
+
+
+def _untried(search: Search, names: Sequence[str], x: np.ndarray) -> Identified:
+    """Return the robot with some effects, which was neither tried nor compared with other sets of effects."""
+    model = search.misfit.model
+    free = model.mask(names)
+    search.deadline = np.inf
+    point = search.run(x, free, effort=(0, 0.0))
+    return _result(search, model.reduced(x, names), (x, names), Posterior.of(model, point, names))
 
 
 # plain parameters
@@ -265,7 +393,7 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
 
 
 def _accepted(
-    search: Search, selection: Selection, known: bool, space: str | SpaceScheme, step: Tell
+    search: Search, selection: Selection, known: bool, space: str | SpaceScheme, course: _Course
 ) -> Identified:
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails.
 
@@ -273,21 +401,23 @@ def _accepted(
     """
     model, data = search.misfit.model, search.misfit.data
     while True:
+        course.begin("trials")
         names, point, folds, *_ = selection
         x, kept, posterior = _averaged(search, selection, selection.posterior(model, known))
-        reason = failed_trial(search.misfit.system(x), data, space)
+        system, motions = search.misfit.system(x), list[Trajectory]()
+        reason = failed_trial(system, data, space, motions)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
         search.tell(f"not accepted: {reason}")
         if not added:
-            step(f"the nominal robot is returned: {reason}")
+            course.step(f"the nominal robot is returned: {reason}")
             return _nominal(search)
         fewer = {
             name: tuple(it for it in names if name not in (it, *model.effect(it).needs)) for name in added
         }
         weakest = max(added, key=lambda name: posterior.evidence(fewer[name]))
-        step(f"without {weakest}: {reason}")
+        course.step(f"without {weakest}: {reason}")
         names, known = fewer[weakest], True
         free = model.mask(names)
         selection = Selection.of(search, names, search.run(np.where(free, point.x, 0.0), free))
@@ -297,18 +427,21 @@ def _accepted(
         nominal = _errors(search, np.zeros(model.size), tip=False)
         unseen, before = ([np.inf if it is None else it for it in values] for values in (errors, nominal))
         if np.mean(unseen) >= np.mean(before):
-            step("the nominal robot is returned: it predicts held-out recordings as well")
+            course.step("the nominal robot is returned: it predicts held-out recordings as well")
             return _nominal(search)
     robot = model.reduced(x, kept)
-    robot = robot.replace(trained=trained_range(robot, data, space))
+    robot = robot.replace(trained=trained_range(robot, system, motions))
     result = _result(search, robot, (x, kept), posterior)
-    undecided = tuple(result.undecided)
-    return dataclasses.replace(
-        result,
-        held_out_error={it.name: _places(it) and error for it, error in zip(data, errors, strict=True)},
-        next_experiment=next_experiment(search, posterior, x, undecided) if undecided else None,
-        ensemble=sampled(search, (x, kept), posterior, selection.held_out, robot.trained),
-    )
+    held_out = {it.name: _places(it) and error for it, error in zip(data, errors, strict=True)}
+    result = dataclasses.replace(result, held_out_error=held_out)
+    course.best = lambda: result
+    if result.undecided:
+        course.begin("next experiment")
+        experiment = next_experiment(search, posterior, x, tuple(result.undecided))
+        result = dataclasses.replace(result, next_experiment=experiment)
+    course.begin("band of predictions")
+    ensemble = sampled(search, (x, kept), posterior, selection.held_out, robot.trained)
+    return dataclasses.replace(result, ensemble=ensemble)
 
 
 def _averaged(
@@ -365,11 +498,13 @@ def _positions(rollout: Rollout, data: Experiment) -> np.ndarray:
 
 
 def _errors(
-    search: Search, x: np.ndarray, which: Sequence[int] | None = None, tip: bool = True
-) -> list[float | None]:
+    search: Search, x: np.ndarray, which: Sequence[int] | None = None, tip: bool = True,
+    rows: int | None = None,
+) -> list[float | None]:  # fmt: skip
     """Return the root mean square error of the last body's position (m), by experiment.
 
-    Without positions it is None if `tip`, or else that of all differences.
+    Without positions it is None if `tip`, or else that of all differences. It is that after some `rows` in
+    motion, or in all.
     """
     chosen = [search.misfit.data[k] for k in (range(len(search.misfit.data)) if which is None else which)]
     errors: list[float | None] = []
@@ -379,7 +514,8 @@ def _errors(
             errors.append(None)
             continue
         squares = np.sum(_positions(rollout, data)[:, -1] ** 2, axis=-1) if seen else rollout.values**2
-        errors.append(float(np.sqrt(np.nanmean(squares))))
+        squares = squares[0 if rows is None else data.moves + rows + 1 :]
+        errors.append(float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else None)
     return errors
 
 

@@ -41,8 +41,8 @@ from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tan
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
 
-#: number of points whose accurate differences are kept
-KEPT = 8
+#: number of points whose accurate differences are kept, and of those whose derivatives are
+KEPT, DIFFERENTIATED = 8, 2
 #: seconds that recovery of one simulation may take
 RECOVERY = 0.5
 
@@ -50,19 +50,23 @@ RECOVERY = 0.5
 class Rollout:
     """A simulated experiment: differences from its data in units of the noise; NaN where there are none.
 
-    `offset` is what finer time steps add to the differences; it is part of the values.
+    `offset` is what finer time steps add to the differences; it is part of the values. The `key` is that of a
+    `Misfit`.
     """
+
+    key: Any = None
 
     def __init__(
         self, values: Float[np.ndarray, "rows e"], tangents: Callable[[Any], np.ndarray], offset: Any = 0.0
     ):
-        self.values, self.offset, self._tangents = values + offset, offset, tangents
-        self._last: tuple[bytes, np.ndarray] = b"", np.zeros(0)
+        self.plain, self.values, self.offset, self._tangents = values, values + offset, offset, tangents
+        #: derivatives by some coordinates (a mask, or a slice of all), shared by copies
+        self._known: list[Any] = []
 
     def moved(self, offset: Any) -> Rollout:
         """Return it with another offset."""
         copied = copy.copy(self)
-        copied.values, copied.offset = self.values - self.offset + offset, offset
+        copied.values, copied.offset = self.plain + offset, offset
         return copied
 
     def only(self, used: Bool[np.ndarray, "rows e"]) -> Rollout:
@@ -71,18 +75,19 @@ class Rollout:
         copied.values = np.where(used, self.values, np.nan)
         return copied
 
-    @functools.cached_property
+    @property
     def derivatives(self) -> Float[np.ndarray, "n rows e"]:
         """Derivatives of the differences by all coordinates."""
-        return self._tangents(slice(None))
+        return self.derivatives_by(slice(None))
 
-    def derivatives_by(self, which: Bool[np.ndarray, " n"]) -> Float[np.ndarray, "m rows e"]:
+    def derivatives_by(self, which: Any) -> Float[np.ndarray, "m rows e"]:
         """Return the derivatives by some coordinates, which take less time than all; the last are kept."""
-        if "derivatives" in vars(self):
-            return self.derivatives[which]
-        if self._last[0] != which.tobytes():
-            self._last = which.tobytes(), self._tangents(which)
-        return self._last[1]
+        if self._known and isinstance(self._known[0], slice):
+            return self._known[1][which]
+        if not self._known or isinstance(which, slice) or np.any(which & ~self._known[0]):
+            self._known[:] = which, self._tangents(which)
+            return self._known[1]
+        return self._known[1][which[self._known[0]]]
 
 
 class _Start(NamedTuple):
@@ -109,6 +114,8 @@ class Misfit:
         self._known_columns: dict[Output, tuple[int, ...]] = {}
         #: accurate differences of the last points, by coordinates and number of the experiment
         self._accurate: dict[tuple[bytes, int], np.ndarray] = {}
+        #: the last rollouts with derivatives, by coordinates, number of the experiment and rows
+        self._differentiated: dict[tuple[bytes, int, int | None], Rollout] = {}
         # no value of a number, such as an effect that a robot lacks, needs machine code of its own
         directions, _ = _directions(model.robot, np.where(model.begin == 0.0, 0.1, model.begin))
         self._moving = jax.tree.map(lambda leaf: np.any(np.asarray(leaf) != 0.0, axis=0), directions)
@@ -129,8 +136,14 @@ class Misfit:
             which: numbers of experiments.
             offsets: of the differences of each rollout; None: zero.
         """
-        chosen = self._chosen(which)
-        found = self._parallel(lambda data: self._of_one(np.asarray(x, dtype=float), data, rows), chosen)
+        at, chosen = np.asarray(x, dtype=float), range(len(self.data)) if which is None else which
+        keys = [(at.tobytes(), k, rows) for k in chosen]
+        found = self._parallel(
+            lambda key: self._differentiated.get(key) or self._of_one(at, self.data[key[1]], rows), keys
+        )
+        for key, rollout in zip(keys, found, strict=True):
+            if rollout is not None:
+                rollout.key = key
         pairs = zip(found, offsets or [0.0] * len(found), strict=True)
         return [None if each is None else each.moved(offset) for each, offset in pairs]
 
@@ -148,40 +161,44 @@ class Misfit:
         order two. Derivatives are not refined. Held controls belong to the steps of their scheme.
         """
         at, chosen = np.asarray(x, dtype=float), range(len(self.data)) if which is None else which
+        targets = {
+            k: self.data[k].accurate or self.data[k]
+            for k, rollout in zip(chosen, rollouts, strict=True)
+            if rollout is not None and (at.tobytes(), k) not in self._accurate
+        }
+        resolved = [k for k, target in targets.items() if target.is_resolved]
+        # the longest ones first
+        wanted = [(k, 2) for k in resolved]
+        wanted += [(k, 1) for k, target in targets.items() if k in resolved or target is not self.data[k]]
 
-        def of_one(pair: tuple[int, Rollout | None]) -> Rollout | None:
-            k, rollout = pair
-            values = self._accurate.get((at.tobytes(), k))
-            if rollout is None:
-                return None
-            if values is None:
-                data = self.data[k]
-                target = data.accurate or data
-                solved = rollout if target is data else self._of_one(at, target, None)
-                if solved is None:
-                    return rollout
-                values = solved.values - (rollout.offset if solved is rollout else 0.0)
-                if target.is_resolved:
-                    finer = self._of_one(at, target.replace(steps=2 * target.steps), None)
-                    if finer is None:
-                        return rollout
-                    values = (4.0 * finer.values - values) / 3.0
-                self._accurate[at.tobytes(), k] = values
-            return rollout.moved(values - rollout.values + rollout.offset)
+        def solved(part: tuple[int, int]) -> np.ndarray | None:
+            target = targets[part[0]]
+            rollout = self._of_one(at, target.replace(steps=part[1] * target.steps), None)
+            return None if rollout is None else rollout.values
 
-        refined = self._parallel(of_one, list(zip(chosen, rollouts, strict=True)))
+        found = dict(zip(wanted, self._parallel(solved, wanted), strict=True))
+        refined = list[Any]()
+        for k, rollout in zip(chosen, rollouts, strict=True):
+            if k in targets:
+                values, finer = found.get((k, 1), rollout.plain), found.get((k, 2))
+                if values is not None and finer is not None:
+                    values = (4.0 * finer - values) / 3.0
+                if values is not None and (finer is not None or k not in resolved):
+                    self._accurate[at.tobytes(), k] = values
+            values = None if rollout is None else self._accurate.get((at.tobytes(), k))
+            refined.append(rollout if values is None else rollout.moved(values - rollout.plain))
         self._accurate = dict([*self._accurate.items()][-KEPT * len(self.data) :])
         return refined
-
-    def _chosen(self, which: Sequence[int] | None) -> list[Experiment]:
-        return [self.data[k] for k in (range(len(self.data)) if which is None else which)]
 
     def differentiated(
         self, rollouts: Sequence[Rollout], which: Bool[np.ndarray, " n"] | None = None
     ) -> None:
         """Compute the derivatives of all rollouts, by some coordinates or by all."""
-        self._parallel(lambda it: it.derivatives if which is None else it.derivatives_by(which), rollouts)
+        self._parallel(lambda it: it.derivatives_by(slice(None) if which is None else which), rollouts)
         self._first = False
+        new = {it.key: it.moved(0.0) for it in rollouts}
+        kept = {key: it for key, it in self._differentiated.items() if key not in new} | new
+        self._differentiated = dict([*kept.items()][-DIFFERENTIATED * len(self.data) :])
 
     def _parallel(self, work: Any, items: Sequence[Any]) -> list[Any]:
         if self._first:  # programs are compiled one by one
@@ -202,7 +219,7 @@ class Misfit:
             task = dataclasses.replace(task, settings=dataclasses.replace(data.settings, time=None), dt=0.0)
         else:
             acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
-        solved_rows, _, cause = run_one(task, system, acting, (start.state, start.before))
+        solved_rows, _, cause = run_one(task, system, acting, (start.state, start.before), watch=None)
         if cause:
             return None
         size = system.y_layout.size + system.z_layout.size

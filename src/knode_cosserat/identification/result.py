@@ -62,6 +62,7 @@ class Identified:
         undetermined: parameters that were not changed, because the data do not determine them.
         unexplained: fields whose remaining differences are not noise, so that the intervals are too narrow.
         steps: selection and rejection of effects, in words.
+        complete: false if the time was over, or it was interrupted; the steps say what was not done.
     """
 
     robot: System
@@ -77,6 +78,7 @@ class Identified:
     undecided: Mapping[str, float] = dataclasses.field(default_factory=dict)
     next_experiment: NextExperiment | None = None
     ensemble: Ensemble | None = None
+    complete: bool = True
 
     def __getitem__(self, label: str) -> Estimate:
         """Return the estimate of a number by its label, such as "youngs_modulus" or "gravity[2]".
@@ -104,6 +106,7 @@ class Identified:
             "undetermined": list(self.undetermined),
             "unexplained": list(self.unexplained),
             "steps": list(self.steps),
+            "complete": self.complete,
         }
 
     def __repr__(self) -> str:

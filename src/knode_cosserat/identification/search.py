@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-import logging
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
@@ -24,7 +24,7 @@ from knode_cosserat.identification.information import ROBUST, Problem, dispersio
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, hashed
 
-log = logging.getLogger(__name__)
+clock = time.monotonic
 
 #: parts of the longest motion over which preliminary searches go; with all rows at once, a search from a poor
 #: nominal robot may fail
@@ -38,13 +38,17 @@ BODIES = 2.0
 LEAST_SCALE, LEAST = 5e-4, 1e-9
 #: the scale is at least this part of the root mean square: fields may be zero in most rows
 OF_ALL = 0.2
+#: evaluations with one scale and without new derivatives where there are priors, and the relative change of
+#: the scale at the end
+PASS, SETTLED = 5, 0.05
 #: evaluations of a search at one horizon, and of the last one; parts by which the cost falls at their end
-ROUGH, FINE = (6, 2e-2), (25, 1e-3)
+ROUGH, FINE = (PASS, 2e-2), (25, 1e-3)
 #: the same without priors, where a start may be far
 FIRST, EXACT = (50, 1e-5), (100, 1e-10)
-#: evaluations with one scale where there are priors, most updates of the scale, and its relative change at
-#: the end
-PASS, PASSES, SETTLED = 5, 8, 0.05
+#: with priors a search ends where a Gauss-Newton step promises less than this part of its last fall
+PROMISE = 0.3
+#: no coordinate moves by less, in units of a first step
+NO_STEP = 1e-9
 METHOD: Literal["trf"] = "trf"
 #: a number is not seen if its variance stays above this part of its prior's
 UNSEEN = 0.8
@@ -53,10 +57,18 @@ UNSEEN = 0.8
 LARGEST = 10.0
 
 
+class OutOfTime(Exception):  # noqa: N818
+    """The time of an identification is over."""
+
+
 class SearchError(KnodeCosseratError, RuntimeError):
     """A search cannot go on; one line says why."""
 
     code = "search"
+
+
+#: coordinates of the normal equations at the end of a search
+Equations = Literal["free", "all", "none"]
 
 
 class Subset(NamedTuple):
@@ -116,14 +128,18 @@ class Search:
         misfit: the recordings and the model.
         tell: called with a line of progress.
         prior: precision of each coordinate's prior, about zero; by default 1.
+        deadline: time of `clock` after which nothing is solved.
         journal: keeps the ends of finished searches, so that an interrupted identification resumes.
     """
 
     def __init__(
         self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
         prior: Float[np.ndarray, " n"] | None = None, journal: Checkpoints | None = None,
+        deadline: float = np.inf,
     ):  # fmt: skip
-        self.misfit, self.tell, self.journal = misfit, tell, journal
+        self.misfit, self.tell, self.journal, self.deadline = misfit, tell, journal, deadline
+        #: the end of the last search
+        self.last: Point | None = None
         self.prior = np.asarray(misfit.model.prior if prior is None else prior)
         #: True if no number has a prior: the equations are taken to be exact, and noise to be white
         self.exact = not np.any(self.prior)
@@ -174,7 +190,7 @@ class Search:
             SearchError: the nominal robot cannot be simulated, not even at rest.
         """
         x = self.over(np.where(free, self.misfit.model.begin, 0.0), free, HORIZONS, skipped)
-        point = self.run(x, free, effort=effort or (EXACT if self.exact else FINE), every=True)
+        point = self.run(x, free, effort=effort or (EXACT if self.exact else FINE), equations="all")
         return self._beyond_kinks(point) if self.separate_rows else point
 
     @property
@@ -199,7 +215,7 @@ class Search:
             if all(np.nanmax(np.abs(new.values - old.values) / unit) < 1.0 for new, old, unit in changed):
                 continue
             try:
-                found = self.run(x, point.free, every=True)
+                found = self.run(x, point.free, equations="all")
             except SearchError:
                 continue
             if np.sum(np.log(found.scale)) < np.sum(np.log(point.scale)):
@@ -211,16 +227,17 @@ class Search:
         skipped: int = 0,
     ) -> Float[np.ndarray, " n"]:  # fmt: skip
         """Return coordinates after searches over parts of the longest motion, without the first ones."""
-        data = self.misfit.data
-        longest = max(len(it.control) - it.moves for it in data)
-        if self.separate_rows:
-            longest = 0
-        counts = [max(2, round(part * longest)) if part else 0 for part in parts if part or not self.exact]
-        for horizon in [*dict.fromkeys(counts)][skipped:]:
-            if horizon < 0.8 * longest:
-                rows = max(self._rows_until(horizon, it) for it in data)
-                x = self.run(x, free, Subset(rows), FIRST if self.exact else ROUGH).x
+        used = [] if self.separate_rows else [part for part in parts if part or not self.exact]
+        for rows in [*dict.fromkeys(map(self.rows_of, used))][skipped:]:
+            if rows < 0.8 * self.rows_of(1.0):
+                x = self.run(x, free, Subset(rows), FIRST if self.exact else ROUGH, equations="none").x
         return x
+
+    def rows_of(self, part: float) -> int:
+        """Return the number of rows after the first in motion that are this part of the longest motion."""
+        longest = max(len(it.control) - it.moves for it in self.misfit.data)
+        count = max(2, round(part * longest)) if part else 0
+        return max(self._rows_until(count, it) for it in self.misfit.data)
 
     def _rows_until(self, count: int, data: Experiment) -> int:
         """Return the number of rows after the first in motion with so many rows that were measured."""
@@ -229,9 +246,10 @@ class Search:
 
     def run(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset = ALL,
-        effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None, every: bool = False,
+        effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None,
+        equations: Equations = "free", near: Float[np.ndarray, " n"] | None = None,
     ) -> Point:  # fmt: skip
-        """Return the end of a search (Levenberg-Marquardt) from a point.
+        """Return the end of a search (Levenberg-Marquardt) from a point, which is `last` from then on.
 
         Args:
             x: the point.
@@ -239,74 +257,89 @@ class Search:
             subset: recordings and rows.
             effort: most evaluations, and the relative fall of the cost at which the search ends.
             scale: fixed scales of the differences; None: they follow the differences.
-            every: compute the normal equations of all coordinates, also of those that are not searched.
+            equations: coordinates of the normal equations at the end; none: there are no equations.
+            near: coordinates whose accurate differences are good enough to begin with; None: those of `x`.
 
         Raises:
             SearchError: the robot at that point cannot be simulated.
         """
         if self.journal is None:
-            return self._searched(x, free, subset, effort, scale, every)
-        options = repr((subset.rows, subset.which and tuple(subset.which), effort, scale is None, every))
-        key = hashed(self._identity, options, x, free, np.zeros(0) if scale is None else scale)
+            self.last = self._searched(x, free, subset, effort, scale, equations, near)
+            return self.last
+        options = repr((subset.rows, subset.which and tuple(subset.which), effort, scale is None, equations))
+        begins = (np.zeros(0) if it is None else it for it in (scale, near))
+        key = hashed(self._identity, options, x, free, *begins)
         try:
             kept = self.journal.load(key)
         except CheckpointError:  # a damaged file counts as missing
             kept = None
         if kept is None:
             try:
-                kept = self._searched(x, free, subset, effort, scale, every).facts()
+                kept = self._searched(x, free, subset, effort, scale, equations, near).facts()
             except SearchError as error:
                 kept = {"failed": str(error)}
             self.journal.save(key, kept)
         if "failed" in kept:
             raise SearchError(kept["failed"])
-        return Point.of(kept)
+        self.last = Point.of(kept)
+        return self.last
 
-    def without(self, point: Point, k: int, effort: tuple[int, float]) -> Point | None:
+    def without(
+        self, point: Point, k: int, effort: tuple[int, float], equations: Equations = "free"
+    ) -> Point | None:
         """Return the end of a search from a point without recording k; None if it fails.
 
         A single recording is not left out.
         """
         others = [j for j in range(len(self.misfit.data)) if j != k] or [k]
         try:
-            return self.run(point.x, point.free, Subset(None, others), effort, point.scale[others])
+            return self.run(point.x, point.free, Subset(None, others), effort, point.scale[others], equations)
         except SearchError:
             return None
 
     def _searched(
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset,
-        effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None, every: bool,
+        effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None, equations: Equations,
+        near: Float[np.ndarray, " n"] | None,
     ) -> Point:  # fmt: skip
         (most, fall), which = effort, subset.which
-        rollouts = self.solved(x, subset)
+        begun = None if near is None else self.solved(near, subset)
+        rollouts = self.solved(x, subset, begun and [it.offset for it in begun])
         if rollouts is None:
             raise SearchError("the robot that the search begins from cannot be simulated")
-        remaining, converged = most, False
-        for _ in range(PASSES if most else 0):
-            sizes = self.scales_of(rollouts, which) if scale is None else scale
-            budget = remaining if scale is not None else min(PASS if not self.exact else most, remaining)
-            descent = _Descent(self, subset, x, free, rollouts, sizes)
-            used, converged = descent.run(budget, fall)
+        columns = np.ones(len(x), dtype=bool) if equations == "all" else free
+        rough, remaining, converged = equations == "none", most, False
+        #: true if nothing finer is to be known of these rollouts
+        fine = begun is None or rough
+        while remaining > 0 and not converged:
+            sizes, known = self.scales_of(rollouts, which) if scale is None else scale, fine
+            descent = _Descent(self, subset, x, free, columns, rollouts, sizes)
+            budget = remaining if self.exact or scale is not None else min(PASS, remaining)
+            used, ended = descent.run(budget, fall, rough)
             x, rollouts, remaining = descent.x, descent.rollouts, remaining - used
-            if subset.rows is None:
-                rollouts = self.misfit.refined(rollouts, x, which)
+            fine = rough or (fine and not used)
+            if not fine and (not used or self.exact or remaining <= 0):
+                fine = True
+                if subset.rows is None:
+                    rollouts = self.misfit.refined(rollouts, x, which)
             after = self.scales_of(rollouts, which)
             horizon = "all rows" if subset.rows is None else f"{subset.rows} rows"
             text = ", ".join(f"{1e3 * size:.2f}" for size in after[:, 0])
             self.tell(f"{horizon}, {most - remaining} evaluations: {text} mm")
-            settled = np.all(np.abs(after - sizes) <= SETTLED * sizes)
-            if scale is not None or (converged and settled) or remaining <= 0:
-                break
+            settled = scale is not None or np.all(np.abs(after - sizes) <= SETTLED * sizes)
+            converged = bool(ended and (rough or (settled and (known or self.exact))))
         sizes = self.scales_of(rollouts, which) if scale is None else scale
+        if rough:
+            empty = (np.zeros((0, *[len(x)] * dimensions)) for dimensions in (0, 0, 1, 2))
+            return Point(x, sizes, Problem(*empty), free, self.prior, converged)
         units = self.units(sizes, which)
-        which_free = np.ones(len(x), dtype=bool) if every else free
-        self.misfit.differentiated(rollouts, None if every else free)
-        rollouts = [it.only(used) for it, used in zip(rollouts, self.used(rollouts, which_free), strict=True)]
+        self.misfit.differentiated(rollouts, columns)
+        rollouts = [it.only(used) for it, used in zip(rollouts, self.used(rollouts, columns), strict=True)]
         thinned = self.thinned()
         if not self.exact:
             data = [self.misfit.data[k] for k in (range(len(self.misfit.data)) if which is None else which)]
             thinned = dispersion(rollouts, units, [0.0 if it.static else it.dt for it in data], free)
-        problem = normal_equations(rollouts, units, thinned, which_free)
+        problem = normal_equations(rollouts, units, thinned, columns)
         return Point(x, sizes, problem, free, self.prior, converged)
 
     def scales_of(self, rollouts: Sequence[Rollout], which: Sequence[int] | None = None) -> np.ndarray:
@@ -348,7 +381,13 @@ class Search:
     def solved(
         self, x: np.ndarray, subset: Subset = ALL, offsets: Sequence[Any] | None = None
     ) -> list[Rollout] | None:
-        """Return the rollouts at a point; None if one failed. Whole ones are refined without `offsets`."""
+        """Return the rollouts at a point; None if one failed. Whole ones are refined without `offsets`.
+
+        Raises:
+            OutOfTime: the deadline is over.
+        """
+        if clock() > self.deadline:
+            raise OutOfTime
         if offsets is None and subset.rows is None:
             rollouts = self.misfit.whole(x, subset.which)
         else:
@@ -358,12 +397,17 @@ class Search:
 
 @dataclasses.dataclass
 class _Descent:
-    """One run of least squares with fixed sizes of the differences, from a point whose rollouts are known."""
+    """One run of least squares with fixed sizes of the differences, from a point whose rollouts are known.
+
+    The derivatives are those at the begin; where numbers have priors, each step updates them (Broyden 1965).
+    """
 
     search: Search
     subset: Subset
     x: Float[np.ndarray, " n"]
     free: Bool[np.ndarray, " n"]
+    #: coordinates whose derivatives are computed at the begin
+    columns: Bool[np.ndarray, " n"]
     rollouts: list[Rollout]
     sizes: Float[np.ndarray, "R G"]
 
@@ -371,38 +415,55 @@ class _Descent:
         search, free = self.search, self.free
         self.begin, self.low, self.high = self.x, search.low[free], search.high[free]
         self.units, self.thinned = search.units(self.sizes, self.subset.which), np.sqrt(search.thinned())
-        search.misfit.differentiated(self.rollouts, free)
+        search.misfit.differentiated(self.rollouts, self.columns)
         self.known = search.used(self.rollouts, free)
+        #: the derivatives, and where they belong
+        self.derivatives = [it.derivatives_by(free).copy() for it in self.rollouts]
+        self.at, self.about = self.x[free], self.rollouts
         #: the last rollouts, and those of least cost, with their coordinates
         self.last: tuple[bytes, list[Rollout] | None] = (self.x[free].tobytes(), self.rollouts)
         self.best, self.lowest = self.last, np.inf
         self.prior, self.offsets = np.sqrt(search.prior[free]), [it.offset for it in self.rollouts]
 
-    def run(self, most: int, fall: float) -> tuple[int, bool]:
-        """Minimise; return the number of evaluations and a flag of convergence."""
+    def run(self, most: int, fall: float, rough: bool) -> tuple[int, bool]:
+        """Minimise; return the number of evaluations and a flag of convergence.
+
+        With priors and updated derivatives it has converged if the first step promises too little to be made.
+        A `rough` end is where a step was too little.
+        """
         from scipy.optimize import least_squares  # imported here: it takes a third of a second
 
         begin, exact = self.x[self.free], self.search.exact
-        unit = 1.0 / np.sqrt(len(begin))
-        self.origin, self.reach = begin, np.ones(len(begin))
+        # numbers of length one: the first step is at most that long, and tolerances are relative to it
+        self.unit, self.reach = 1.0 / np.sqrt(len(begin)), np.ones(len(begin))
         if exact:
             self.reach = self._reach(begin)
-        # numbers of length one: the first step is at most that long, and tolerances are relative to it
-        self.origin = begin - self.reach * unit
-        low, high = ((end - self.origin) / self.reach for end in (self.low, self.high))
+        low, high = ((end - begin) / self.reach + self.unit for end in (self.low, self.high))
+        start = np.clip(self.unit, low, high)
+        if not exact and not rough and self._promise(start, low, high) < PROMISE * fall:
+            return 0, True
         ended = least_squares(
-            self.values, np.clip(unit, low, high), self.slopes, (low, high), method=METHOD,
-            ftol=fall, xtol=1e-9 if exact else 1e-4, gtol=1e-15, max_nfev=most,
+            self.values, start, self.slopes, (low, high), method=METHOD,
+            ftol=fall, xtol=1e-9 if exact else 1e-4, gtol=1e-15, max_nfev=most + 1,
         )  # fmt: skip
         solved = self._at(ended.x)
         assert solved is not None
         self.x, self.rollouts = self._whole(ended.x), solved
-        return int(ended.nfev), bool(ended.status > 0)
+        return max(int(ended.nfev) - 1, 1), bool(ended.status > 0) and (exact or rough)
+
+    def _promise(self, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
+        """Return the part by which the cost falls in a Gauss-Newton step from a start within bounds."""
+        values, slopes = self.values(start), self.slopes(start)
+        pull = slopes.T @ values
+        inside = ~((start <= low) & (pull > 0.0) | (start >= high) & (pull < 0.0))
+        slopes, pull = slopes[:, inside], pull[inside]
+        return float(pull @ np.linalg.solve(slopes.T @ slopes, pull) / (values @ values))
 
     def _reach(self, begin: np.ndarray) -> np.ndarray:
         """Return steps of length one: a factor of e, a number's size, or its own Gauss-Newton step."""
         numbers = [it for it, on in zip(self.search.misfit.model.numbers, self.free, strict=True) if on]
-        values, slopes = self.values(np.zeros(len(begin))), self.slopes(np.zeros(len(begin)))
+        at = np.full(len(begin), self.unit)
+        values, slopes = self.values(at), self.slopes(at)
         lengths = np.linalg.norm(slopes, axis=0)
         alone = np.linalg.norm(values) / np.where(lengths > 0.0, lengths, np.inf)
         zero = np.array([not number.logarithmic and number.value(at) == 0.0
@@ -410,8 +471,9 @@ class _Descent:
         return np.where(zero & (alone > 0.0), alone, 1.0)
 
     def _whole(self, step: np.ndarray) -> np.ndarray:
-        x = self.begin.copy()
-        x[self.free] = np.clip(self.origin + self.reach * step, self.low, self.high)
+        x, moved = self.begin.copy(), step - self.unit
+        if np.max(np.abs(moved)) > NO_STEP:
+            x[self.free] = np.clip(x[self.free] + self.reach * moved, self.low, self.high)
         return x
 
     def _at(self, step: np.ndarray) -> list[Rollout] | None:
@@ -440,17 +502,31 @@ class _Descent:
         rollouts = self._at(step)
         if rollouts is None:  # a begin at a bound, from which it was moved
             raise SearchError("the robot that the search begins from cannot be simulated")
-        self.search.misfit.differentiated(rollouts, self.free)
+        self._renew(self._whole(step)[self.free], rollouts)
         scaled = self._scaled(rollouts)
         size = np.abs(scaled)
         # of the square root of the cost
         factor = np.where(size <= ROBUST, 1.0, ROBUST / np.sqrt(np.maximum(huber(scaled)[0], 1.0)))
-        parts = zip(rollouts, self.units, self.known, strict=True)
-        rows = [(rollout.derivatives_by(self.free) / unit)[:, known].T for rollout, unit, known in parts]
+        parts = zip(self.derivatives, self.units, self.known, strict=True)
+        rows = [(derivatives / unit)[:, known].T for derivatives, unit, known in parts]
         scaled_rows = np.concatenate(rows) * (factor / self.thinned)[:, None]
         if not np.isfinite(scaled_rows).all():
             raise SearchError("the search left the range of robots whose motion has derivatives")
         return np.concatenate([scaled_rows, np.diag(self.prior)]) * self.reach
+
+    def _renew(self, x: np.ndarray, rollouts: list[Rollout]) -> None:
+        """Compute the derivatives at other coordinates, or update them by the step there."""
+        step = x - self.at
+        if not step.any():
+            return
+        if self.search.exact:
+            self.search.misfit.differentiated(rollouts, self.free)
+            self.derivatives = [it.derivatives_by(self.free) for it in rollouts]
+        else:
+            for derivatives, new, old in zip(self.derivatives, rollouts, self.about, strict=True):
+                more = new.values - old.values - np.tensordot(step, derivatives, 1)
+                derivatives += step[:, None, None] * np.nan_to_num(more) / (step @ step)
+        self.at, self.about = x, rollouts
 
     def _scaled(self, rollouts: list[Rollout]) -> np.ndarray:
         parts = zip(rollouts, self.units, self.known, strict=True)

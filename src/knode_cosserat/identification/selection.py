@@ -11,7 +11,7 @@ from jaxtyping import Float
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.result import variance_ratio
-from knode_cosserat.identification.search import HORIZONS, Point, Search, SearchError, Subset
+from knode_cosserat.identification.search import HORIZONS, ROUGH, Point, Search, SearchError, Subset
 from knode_cosserat.identification.undetermined import unexplained
 
 #: most searches with other effects
@@ -20,6 +20,8 @@ MOST = 4
 TRIED = (15, 2e-3)
 #: the same of the first search, with all effects, and of searches without one recording
 FIRST, FOLD = (6, 1e-2), (8, 5e-3)
+#: part of the motion that the first answer is searched in
+SEEN = 0.25
 #: most selections by what recordings disagree about
 SELECTIONS = 3
 #: a set of effects, or their average, is not used if the logarithm of the differences' size is larger by this
@@ -41,7 +43,7 @@ class Selection(NamedTuple):
     def of(cls, search: Search, names: tuple[str, ...], point: Point) -> Selection:
         """Return the selection after searches without one recording each."""
         count = len(search.misfit.data)
-        folds = [search.without(point, k, FOLD) for k in range(count)] if count > 1 else []
+        folds = [search.without(point, k, FOLD, "none") for k in range(count)] if count > 1 else []
         unseen, held_out = np.full(len(folds), np.inf), [np.zeros((0, 0))] * len(folds)
         for k, fold in enumerate(folds):
             rollouts = None if fold is None else search.solved(fold.x, Subset(None, [k]))
@@ -56,16 +58,32 @@ class Selection(NamedTuple):
         return Posterior.of(model, self.point.scattered(scatter), self.names if known else None)
 
 
-def from_far(search: Search) -> Point:
+def first_answer(search: Search) -> tuple[Point, int]:
+    """Return the end of a search with all effects over the first rows, and the number of these rows.
+
+    Shapes stay over short horizons, where noise makes motions unstable.
+
+    Raises:
+        SearchError: the nominal robot cannot be simulated.
+    """
+    model, rows = search.misfit.model, search.rows_of(SEEN)
+    every = np.ones(model.size, dtype=bool)
+    x = search.over(model.begin, every & ~model.shapes, [part for part in HORIZONS if part < SEEN])
+    return search.run(x, every, Subset(rows), ROUGH, equations="all"), rows
+
+
+def from_far(search: Search, first: Point | None) -> Point:
     """Return the end of the first search that explains the data, or of the best search.
+
+    `first` is the end of a search over some rows, if there is one.
 
     Raises:
         SearchError: the nominal robot cannot be simulated.
     """
     points, errors = list[Point](), list[SearchError]()
-    for begun in (_with_all, _with_few_first):
+    for begin in (None,) if first is None else (first, None):
         try:
-            points.append(begun(search))
+            points.append(_with_few_first(search) if begin is None else _with_all(search, begin))
         except SearchError as error:
             search.tell(f"all effects: {error}")
             errors.append(error)
@@ -77,12 +95,10 @@ def from_far(search: Search) -> Point:
     return min(points, key=lambda point: float(np.sum(np.log(point.scale))))
 
 
-def _with_all(search: Search) -> Point:
-    """Search with all effects; shapes stay over short horizons, where noise makes motions unstable."""
-    model = search.misfit.model
-    every = np.ones(model.size, dtype=bool)
-    x = search.over(model.begin, every & ~model.shapes, HORIZONS[:-2])
-    return search.run(search.over(x, every, HORIZONS[-2:]), every, effort=FIRST, every=True)
+def _with_all(search: Search, first: Point) -> Point:
+    """Search with all effects, over more rows and then all."""
+    x = search.over(first.x, first.free, [part for part in HORIZONS if part > SEEN])
+    return search.run(x, first.free, effort=FIRST, equations="all")
 
 
 def _with_few_first(search: Search) -> Point:
@@ -92,17 +108,20 @@ def _with_few_first(search: Search) -> Point:
     point = search.from_far(few)
     try:
         start = np.where(few, point.x, 0.1 * model.begin)
-        return search.run(start, np.ones(model.size, dtype=bool), effort=FIRST, every=True)
+        return search.run(start, np.ones(model.size, dtype=bool), effort=FIRST, equations="all")
     except SearchError as error:
         search.tell(f"all effects: {error}")
         return point
 
 
-def selected(search: Search, point: Point, tell: Callable[[str], None]) -> tuple[tuple[str, ...], Point]:
+def selected(
+    search: Search, point: Point, tell: Callable[[str], None],
+    kept: Callable[[tuple[str, ...], Point], None],
+) -> tuple[tuple[str, ...], Point]:  # fmt: skip
     """Return the effects that are more probable than not, and the end of their search.
 
     The probabilities belong to equations that are linear about a point (`Posterior`), so the search with the
-    selected effects gives new ones, until no other set is selected.
+    selected effects gives new ones, until no other set is selected. Each end is `kept`.
 
     Raises:
         SearchError: no set of effects can be searched.
@@ -114,6 +133,7 @@ def selected(search: Search, point: Point, tell: Callable[[str], None]) -> tuple
         if end is None:
             break
         searched.append(posterior.names())
+        kept(searched[-1], end)
         tell(f"with {', '.join(searched[-1])}: {sizes(end)}")
         posterior = Posterior.of(model, end)
     if not searched:
@@ -121,7 +141,10 @@ def selected(search: Search, point: Point, tell: Callable[[str], None]) -> tuple
     return searched[-1], posterior.point
 
 
-def best_predicting(search: Search, selection: Selection, tell: Callable[[str], None]) -> Selection:
+def best_predicting(
+    search: Search, selection: Selection, tell: Callable[[str], None],
+    kept: Callable[[tuple[str, ...], Point], None],
+) -> Selection:  # fmt: skip
     """Return a selection in view of what recordings disagree about, as long as it predicts as well.
 
     Each set is selected about the end of the last one, and has to predict as well as that the recordings that
@@ -140,6 +163,7 @@ def best_predicting(search: Search, selection: Selection, tell: Callable[[str], 
             tell(f"not {words}; it predicts held-out recordings worse")
             break
         tell(words)
+        kept(other.names, other.point)
         selection = other
     return selection
 
@@ -155,7 +179,7 @@ def search_of(search: Search, posterior: Posterior, begin: Float[np.ndarray, " n
     for x, known in ((nearest, point.free | (nearest != 0.0)), (point.x, point.free)):
         try:
             start = np.where(free, np.where(known, x, begin), 0.0)
-            return search.run(start, free, effort=TRIED, every=True)
+            return search.run(start, free, effort=TRIED, equations="all", near=point.x)
         except SearchError as error:
             search.tell(f"{len(names)} effects: {error}")
     return None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import types
 import warnings
 from collections.abc import Sequence
 
@@ -29,27 +30,33 @@ FEW = 0.01
 RECOVERY = 2.0
 
 
-def failed_trial(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> str | None:
+def failed_trial(
+    robot: System, data: Sequence[Experiment], space: str | SpaceScheme,
+    motions: list[Trajectory] | None = None,
+) -> str | None:  # fmt: skip
     """Return the reason why a robot is not accepted; None if it passes all trials.
 
     It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
-    tensions within the recordings' range, without a step that cannot be solved.
+    tensions within the recordings' range, without a step that cannot be solved. Its `motions` under the
+    recordings' own tensions are added to a list.
     """
     # a tendon does not push; a motor turns either way
     low = 0.0 if robot.control_layout.names[0] == "tension" else -np.inf
     trials = [
         (f"tensions of {it.name} at {amplitude:g} times their amplitude", it,
          np.maximum(it.held + amplitude * (it.control - it.held), low))
-        for it in data
         for amplitude in AMPLITUDES
+        for it in data
     ]  # fmt: skip
-    for words, like, tension in [*trials, ("random tensions", data[0], _random(data))]:
+    for k, (words, like, tension) in enumerate([*trials, ("random tensions", data[0], _random(data))]):
         try:
-            _, motion = moved(robot, tension, like, space)
+            still, motion = moved(robot, tension, like, space)
         except SimulationError as error:
             return f"{words}: {error}"
         if not np.all(np.isfinite(np.asarray(motion.y))):
             return f"{words}: a state is not finite"
+        if motions is not None and k < len(data):
+            motions += [still, motion]
     return None
 
 
@@ -68,9 +75,17 @@ def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | Spac
     return False
 
 
-def trained_range(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> TrainedRange | None:
-    """Return the range of controls, strains and strain rates of the robot in its recordings."""
-    return TrainedRange.of(part for it in data for part in moved(robot, it.control, it, space))
+def trained_range(robot: System, like: System, motions: Sequence[Trajectory]) -> TrainedRange | None:
+    """Return the range of controls, strains and strain rates of a robot that moves `like` another one.
+
+    The other one has the same strains, and may have more.
+    """
+    names, layout = robot.z_layout.names, like.z_layout
+    strains = (np.concatenate([layout.get(np.asarray(it.z), name) for name in names], -1) for it in motions)
+    return TrainedRange.of(
+        types.SimpleNamespace(time=it.time, z=z, control=it.control, result=it.result)
+        for it, z in zip(motions, strains, strict=True)
+    )
 
 
 def _random(data: Sequence[Experiment]) -> Float[np.ndarray, "T c"]:
