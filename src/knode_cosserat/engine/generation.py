@@ -35,7 +35,7 @@ def generate(text: str, level: int) -> bytes:
 
 
 def main(target: str) -> None:
-    """Write the final code of a module, read from standard input, to a file of `ProgramCache`: whole or not."""
+    """Write the final code of a module, read from standard input, to a file of `ProgramCache`, whole."""
     if hasattr(os, "nice"):
         os.nice(5)
     code = generate(sys.stdin.read(), FINAL)
