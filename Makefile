@@ -43,7 +43,7 @@ test-all: $(READY) ## run all the tests, the long ones too
 	$(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) $(PYTEST_ARGS)
 
 samples: $(READY) ## run a few of the long tests of docs, examples, recordings and types (`make test-all` runs all)
-	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m sample
+	$(BIN)/python -m pytest -n $(JOBS) --dist load --quick -m sample $(PYTEST_ARGS)
 
 costs: $(READY) ## measure the CPU time of each test file anew, for the order and the time left of `make test`
 	KNODE_COSSERAT_CACHE=build/cold-cache-$(shell date +%s) $(BIN)/python -m pytest -n $(JOBS) $(BY_FILE) -m "not campaign" --write-costs

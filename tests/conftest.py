@@ -31,6 +31,7 @@ QUICK = (
 
 def pytest_addoption(parser):
     parser.addoption("--quick", action="store_true", help="compile quickly rather than well")
+    parser.addoption("--dearest", type=int, default=0, help="show the CPU time of so many files")
     parser.addoption("--write-costs", action="store_true", help="write the CPU time of each file")
 
 

@@ -109,6 +109,16 @@ class Progress:
                 f"about {left // 60:.0f} min {left % 60:02.0f} s left"
             )
 
+    def pytest_terminal_summary(self, terminalreporter):
+        count, files = self.config.option.dearest, Counter()
+        for name, cost in self.recorder.costs.items():
+            files[file_of(name)] += cost
+        if count:
+            total = sum(files.values())
+            terminalreporter.section(f"{total:.0f} s of CPU time; the {count} dearest files")
+            for name, cost in files.most_common(count):
+                terminalreporter.write_line(f"{cost:7.1f} s {cost / total:5.1%}  {name}")
+
     def pytest_sessionfinish(self):
         if self.config.option.write_costs:
             table = {name: round(cost, 1) for name, cost in sorted(self.recorder.costs.items())}

@@ -5,6 +5,7 @@ All come from the system's own functions (`program.Program`), and derivatives fr
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from collections.abc import Iterator, Sequence
@@ -50,7 +51,32 @@ def with_moving(leaf: np.ndarray, moving: np.ndarray) -> np.ndarray:
     return np.where(moving & (leaf == 0.0), -0.0, leaf)
 
 
-class Equations:
+@dataclasses.dataclass(eq=False)
+class Sizes:
+    """Sizes of a system: strands, y, z, control and unknowns, and numbers of a record."""
+
+    strands: int
+    ny: int
+    nz: int
+    nc: int
+    k: int
+    #: y, z and, if B is not zero, y_s
+    numbers: int
+
+    def by_strand(self, values: np.ndarray) -> np.ndarray:
+        """Return packed y or records (…, x of all strands) split by strand: (…, strands, x of one)."""
+        sizes = self.strands * np.array([self.ny, self.ny + self.nz])
+        parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
+        return np.concatenate([part.reshape(*part.shape[:-1], self.strands, -1) for part in parts], axis=-1)
+
+    def joined(self, values: np.ndarray) -> np.ndarray:
+        """Return y or records by strand (…, strands, x of one) packed: (…, x of all)."""
+        sizes = np.array([self.ny, self.ny + self.nz])
+        parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
+        return np.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
+
+
+class Equations(Sizes):
     """Programs of a system: rates and strains at a point of a strand with their derivatives, base and tip.
 
     Parameters that are zero are constants, which takes fewer operations; but not those that are `moving`.
@@ -67,7 +93,6 @@ class Equations:
         self.strands = strand_count(system)
         self.ny, self.nz = strand.y_layout.size, strand.z_layout.size
         self.nc, self.k = system.control_layout.size, unknown_count(system)
-        #: numbers of a record: y, z and, if B is not zero, y_s
         self.numbers = self.ny + self.nz + (self.ny if system.mixed else 0)
         program = self.program = Program(most_operations(self.ny))
         self.parameters = [program.inputs(f"p{i}", leaf.shape, RUN, True) for i, leaf in enumerate(leaves)]
@@ -185,18 +210,6 @@ class Equations:
             outputs += nodes
         self._outputs = outputs
         self._hoist()
-
-    def by_strand(self, values: np.ndarray) -> np.ndarray:
-        """Return packed y or records (…, x of all strands) split by strand: (…, strands, x of one)."""
-        sizes = self.strands * np.array([self.ny, self.ny + self.nz])
-        parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
-        return np.concatenate([part.reshape(*part.shape[:-1], self.strands, -1) for part in parts], axis=-1)
-
-    def joined(self, values: np.ndarray) -> np.ndarray:
-        """Return y or records by strand (…, strands, x of one) packed: (…, x of all)."""
-        sizes = np.array([self.ny, self.ny + self.nz])
-        parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
-        return np.concatenate([part.reshape(*part.shape[:-2], -1) for part in parts], axis=-1)
 
     def slots(self, terms: Sequence[int]) -> Iterator[tuple[int, int, int]]:
         """Return the nodes of terms, with the first of their numbers in memory and the count of these."""

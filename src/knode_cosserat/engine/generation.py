@@ -5,6 +5,7 @@ The package is not imported here, so that the program starts at once.
 
 import hashlib
 import os
+import secrets
 import sys
 
 import llvmlite.binding as llvm
@@ -34,20 +35,26 @@ def generate(text: str, level: int) -> bytes:
     return machine.emit_object(module)
 
 
-def main(target: str) -> None:
-    """Write the final code of a module, read from standard input, to a file of `ProgramCache`, whole."""
+def main(target: str, quick: str) -> None:
+    """Write the final code of a module, read from standard input, to a file of `ProgramCache`.
+
+    The file of the quick code is removed.
+    """
     if hasattr(os, "nice"):
         os.nice(5)
     code = generate(sys.stdin.read(), FINAL)
-    temporary = f"{target}.{os.getpid()}.tmp"
+    folder, name = os.path.split(target)
+    # as `_files.writing` names them, and removes what killed processes left
+    temporary = os.path.join(folder, f".{name}.{secrets.token_hex(6)}.tmp")
     try:
         with open(temporary, "xb") as file:
             file.write(code + hashlib.sha256(code).digest())
         os.replace(temporary, target)
     finally:
-        if os.path.exists(temporary):
-            os.unlink(temporary)
+        for path in (temporary, quick):
+            if os.path.exists(path):
+                os.unlink(path)
 
 
 if __name__ == "__main__":
-    main(sys.argv[1])
+    main(*sys.argv[1:])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -13,6 +14,7 @@ from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import StepCoefficients
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
@@ -29,7 +31,17 @@ def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
         EngineError: the engine does not cover the system or the settings.
     """
     schemes = Settings(settings.time, settings.space)
-    return compiled((pattern, schemes, robots), lambda: Core(pattern.system, schemes, robots))
+    build = functools.partial(Core, pattern.system, schemes, robots)
+    return compiled((pattern, schemes, robots), Core, build, _given(pattern, schemes))
+
+
+def _given(pattern: Pattern, settings: Settings) -> dict[str, Any]:
+    """Return the attributes of a core that are no data of its own."""
+    space = settings.space
+    return {
+        "settings": settings, "scheme": settings.time, "space": space,
+        "grid": grid_of(pattern.system, space),
+    }  # fmt: skip
 
 
 def tangents_for(
@@ -37,7 +49,8 @@ def tangents_for(
 ) -> AnyTangents:
     """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
     key = pattern, masks_of(moving), settings.space, settings.memory, settings.uses_rate, kind
-    return compiled(key, lambda: kind(pattern.system, settings, moving))
+    build = functools.partial(kind, pattern.system, settings, moving)
+    return compiled(key, kind, build, _given(pattern, settings))
 
 
 def solve_steps(

@@ -11,7 +11,9 @@ import subprocess
 import sys
 import tempfile
 import threading
+import time
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
@@ -22,6 +24,10 @@ from knode_cosserat.engine import generation
 
 #: size of a text from which another process is started: smaller ones take less time than that
 LARGE = 200_000
+#: start of the names of quick code, which is kept until there is final code
+QUICK = "quick-"
+#: time (s) after which a process that generates final code has been killed
+PATIENCE = 600.0
 
 
 def stored(name: str) -> bytes | None:
@@ -69,9 +75,19 @@ class MachineCode:
             if level == generation.FINAL and len(text) > LARGE:
                 later = _generated_beside(text, name)
             code = generation.generate(text, generation.QUICK if later else level)
-            if later is None:
-                store(name, code)
+            store(f"{QUICK}{name}" if later else name, code)
         return cls(name, kinds, code, later)
+
+    @classmethod
+    def kept(cls, name: str, kinds: Mapping[str, str]) -> MachineCode | None:
+        """Return code from disk: the final code or, while a process generates it, the quick code."""
+        code, later = stored(name), None
+        if code is None and (directory := cache_directory()) is not None:
+            later = _Awaited(ProgramCache(directory).path(name))
+            with contextlib.suppress(OSError):
+                quick = ProgramCache(directory).path(f"{QUICK}{name}")
+                code = stored(f"{QUICK}{name}") if time.time() - quick.stat().st_mtime < PATIENCE else None
+        return None if code is None else cls(name, kinds, code, later)
 
     def _link(self, code: bytes) -> None:
         engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), generation.machine_of(generation.FINAL))
@@ -95,6 +111,18 @@ class MachineCode:
         return self._functions[name]
 
 
+class _Awaited:
+    """The work of a process that another one has started."""
+
+    def __init__(self, path: Path):
+        self._path = path
+
+    @property
+    def returncode(self) -> int | None:
+        """Zero when the work is done."""
+        return 0 if self._path.exists() else None
+
+
 def _generated_beside(text: str, name: str) -> Any:
     """Return a process that generates and stores the final code; None where there can be none."""
     directory, program = cache_directory(), sys.executable or ""
@@ -105,12 +133,12 @@ def _generated_beside(text: str, name: str) -> Any:
     ):
         return None
     try:
-        path = ProgramCache(directory).path(name)
+        paths = [str(ProgramCache(directory).path(each)) for each in (name, f"{QUICK}{name}")]
         with tempfile.TemporaryFile("w+", dir=directory) as file:
             file.write(text)
             file.seek(0)
             process = subprocess.Popen(
-                [program, "-P", generation.__file__, str(path)],
+                [program, "-P", generation.__file__, *paths],
                 stdin=file, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
                 env=os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
             )  # fmt: skip

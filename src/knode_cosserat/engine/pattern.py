@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 import threading
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, TypeVar
 
 import jax
@@ -70,8 +70,12 @@ def masks_of(masks: Iterable[np.ndarray]) -> Any:
     return tuple((mask.shape, np.packbits(mask).tobytes()) for mask in masks)
 
 
-def compiled(key: Any, build: Callable[[], Code]) -> Code:
-    """Return compiled code that is kept by a key.
+def compiled(
+    key: tuple[Any, ...], kind: type[Code], build: Callable[[], Code], given: Mapping[str, Any] | None = None
+) -> Code:
+    """Return compiled code of a kind that is kept by a key, in this process and on disk.
+
+    `given` are its attributes that are not stored on disk.
 
     Raises:
         EngineError: the engine does not cover the system or the settings.
@@ -85,7 +89,7 @@ def compiled(key: Any, build: Callable[[], Code]) -> Code:
             try:
                 # also while JAX traces a caller: equations are traced by themselves
                 with jax.core.eval_context():
-                    code = build()
+                    code = _kept_on_disk((kind, *key), kind, build, given or {})
             except EngineError as error:
                 # without the frames that a traceback keeps alive
                 code = error.with_traceback(None)
@@ -96,6 +100,24 @@ def compiled(key: Any, build: Callable[[], Code]) -> Code:
             del _CODES[next(iter(_CODES))]
     if isinstance(code, EngineError):
         raise code.with_traceback(None)
+    return code
+
+
+def _kept_on_disk(
+    key: tuple[Any, ...], kind: type[Code], build: Callable[[], Code], given: Mapping[str, Any]
+) -> Code:
+    from knode_cosserat.engine import sidecars  # which need all of the engine
+
+    name = sidecars.name_of([each.system if isinstance(each, Pattern) else each for each in key])
+    if name is None:
+        return build()
+    attributes = sidecars.restored(name)
+    if attributes is None:
+        code = build()
+        sidecars.keep(name, code, given)
+    else:
+        code = kind.__new__(kind)
+        vars(code).update(attributes, **given)
     return code
 
 
@@ -157,6 +179,7 @@ def values_along(function: Callable[[Any, Any, Any], Any], system: System, s: An
     """
     pattern, control = Pattern.of(system), np.asarray(control, dtype=float)
     code = compiled(
-        (pattern, function, len(control)), lambda: _PlaceCode(function, pattern.system, len(control))
-    )
+        (pattern, function, len(control)), _PlaceCode,
+        lambda: _PlaceCode(function, pattern.system, len(control)),
+    )  # fmt: skip
     return code.evaluate(np.concatenate([parameters_of(system), control]), np.asarray(s, dtype=float))
