@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 import operator
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any, NamedTuple, TypeVar
@@ -247,23 +248,25 @@ class Core(EliminationCode):
     def _write_recorded(self) -> None:
         """Rates and residual of y, the defects of the scheme's check formula, and the records."""
         e = self.equations
-        self.recorded = f = self._function("recorded", "coefficients")
-        f.call(self.residual_of_y, f.arguments[0])
+        self.recorded = f = self._function("recorded", "n_estimates", "coefficients")
+        memory, estimates, _ = f.arguments
+        f.call(self.residual_of_y, memory)
         formula, check = self.space.formula, self.space.check
-        for k in range(len(formula.stages), len(check.stages)):
-            self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
-        pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
-        changes = [weight - own for weight, own in pairs]
-        for i, j in self._components(e.ny, self.pieces):
-            self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
+        with f.if_(estimates > 0):
+            for k in range(len(formula.stages), len(check.stages)):
+                self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
+            pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
+            changes = [weight - own for weight, own in pairs]
+            for i, j in self._components(e.ny, self.pieces):
+                self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
 
     def _write_check(self) -> None:
         """The solution's records, and its residual."""
         e = self.equations
-        self.check = f = self._function("check", "numbers", "coefficients")
-        memory, numbers, coefficients = f.arguments
-        f.call(self.recorded, memory, coefficients)
+        self.check = f = self._function("check", "n_estimates", "numbers", "coefficients")
+        memory, estimates, numbers, coefficients = f.arguments
+        f.call(self.recorded, memory, estimates, coefficients)
         f.call(self.weigh, memory)
         largest = f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
@@ -521,17 +524,25 @@ class Core(EliminationCode):
     # the time loop
 
     def _write_run(self) -> None:
-        """All steps from `n_start` to `n_stop`, until every robot has failed; `reached` counts the solved."""
+        """All steps from `n_start` to `n_stop`, until every robot has failed; `reached` counts the solved.
+
+        Without estimates (`n_estimates` 0), all errors are NaN, also those of the state after the run.
+        """
         e, P = self.equations, self.P
         names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
-        names += ["n_start", "n_stop", "n_stages"]
+        names += ["n_start", "n_stop", "n_stages", "n_estimates"]
         f = self._now = self.module.function("run", names, exported=True)
-        memory, controls, coefficients, extrapolations, rows, infos, reached, start, stop, stages = (
-            f.arguments
-        )
+        memory, controls, coefficients, extrapolations, rows, infos, reached = f.arguments[:7]
+        start, stop, stages, estimates = f.arguments[7:]
         numbers = Value(f, f.reserve(f"[{8 * P} x double]"), "ptr")
         for k in range(8):
             f.store(1.0 if k == ALIVE else 0.0, numbers, k * P, P)
+        with f.if_(estimates <= 0):
+            for k in (POSITION, ANGLE, TIME):
+                f.store(math.nan, numbers, k * P, P)
+            for array in (*self.errors, self.error_rate, *self.time_errors):
+                for i, j in self._components(array.size, self.used):
+                    self._write_wide(math.nan, array, i, j)
         f.call(self.setup, memory)
         step, nodes = Variable(f, start), len(self.grid.nodes)
 
@@ -542,7 +553,8 @@ class Core(EliminationCode):
             with f.loop(stages) as stage:
                 number = step.get() * stages + stage.value
                 table = f.pointer(coefficients, number * (self.settings.memory + 3))
-                f.call(self.stage, memory, numbers, table, f.pointer(controls, number * (e.nc * P)))
+                control = f.pointer(controls, number * (e.nc * P))
+                f.call(self.stage, memory, estimates, numbers, table, control)
                 if self.scheme:
                     f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
                 with f.loop(nodes) as node:
@@ -564,8 +576,8 @@ class Core(EliminationCode):
     def _write_stage(self) -> None:
         """One stage of a step: history, first guess, solution, records and estimates."""
         e, P = self.equations, self.P
-        self.stage = f = self._function("stage", "numbers", "coefficients", "controls")
-        memory, numbers, coefficients, controls = f.arguments
+        self.stage = f = self._function("stage", "n_estimates", "numbers", "coefficients", "controls")
+        memory, estimates, numbers, coefficients, controls = f.arguments
         c0, *earlier, d1, t = (f.load(coefficients, i) for i in range(self.settings.memory + 3))
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
@@ -588,18 +600,19 @@ class Core(EliminationCode):
             self._put(self._get(self.y, i, base), self.unknowns, k)
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
-        f.call(self.check, memory, numbers, coefficients)
-        if isinstance(self.scheme, SDIRK2):
-            f.call(self.time_history, memory, coefficients)
-        if self.scheme:
-            history(self.errors, self.error_rate, self.dH, self.used)
-        f.call(self.corrected, memory, numbers)
-        if self.settings.uses_rate:
-            for i, j in self._components(e.numbers, self.used):
-                value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
-                self._write_wide(value, self.error_rate, i, j)
-        if isinstance(self.scheme, SDIRK2):
-            f.call(self.corrected_in_time, memory, numbers)
+        f.call(self.check, memory, estimates, numbers, coefficients)
+        with f.if_(estimates > 0):
+            if isinstance(self.scheme, SDIRK2):
+                f.call(self.time_history, memory, coefficients)
+            if self.scheme:
+                history(self.errors, self.error_rate, self.dH, self.used)
+            f.call(self.corrected, memory, numbers)
+            if self.settings.uses_rate:
+                for i, j in self._components(e.numbers, self.used):
+                    value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
+                    self._write_wide(value, self.error_rate, i, j)
+            if isinstance(self.scheme, SDIRK2):
+                f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
         alive = f.load(numbers, ALIVE * P, P)
         f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
@@ -648,7 +661,7 @@ class Core(EliminationCode):
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         if len(self.grid.between):
             self._write_filling(turns, self.residual_of_y)
-        f.call(self.recorded, memory, coefficients)
+        f.call(self.recorded, memory, 1, coefficients)
 
     def _write(self) -> None:
         self._write_setup()
@@ -718,9 +731,9 @@ class Core(EliminationCode):
 
     def integrate(
         self, parameters: np.ndarray, controls: np.ndarray, steps: StepCoefficients, states: States,
-        span: tuple[int, int],
+        span: tuple[int, int], estimates: bool = True,
     ) -> tuple[np.ndarray, States, StepRows]:  # fmt: skip
-        """Solve a span of steps of each robot until one fails.
+        """Solve a span of steps of each robot until one fails; without estimates, errors are NaN.
 
         Parameters (n,) of the system, or (robots, n); controls (robots, T, c) or (robots, T, stages * c) and
         states (robots, ...). Returns the numbers of steps done, the states after them, and rows. In a batch,
@@ -763,7 +776,7 @@ class Core(EliminationCode):
             memory[self._motion] = first_motions[k]
             self._put_in(memory[None], self.params, lane_parameters[k][None, :, None])
             arrays = memory, lane_controls[k], table, self._guesses, *results
-            self._functions["run"](*(each.ctypes.data for each in arrays), 0, stop, stages)
+            self._functions["run"](*(each.ctypes.data for each in arrays), 0, stop, stages, int(estimates))
             last_motions[k], length[k] = (
                 memory[self._motion],
                 self._numbers(memory[None], self.length)[0, :, 0, 0],
@@ -781,19 +794,21 @@ class Core(EliminationCode):
         robot_rows, robot_infos = (
             np.moveaxis(part, -1, 1).reshape(-1, *part.shape[1:-1])[:size] for part in (rows, infos)
         )
-        found = self._rows(robot_rows, robot_infos, newton.acceptable, length.reshape(-1)[:size], done)
+        length = length.reshape(-1)[:size]
+        found = self._rows(robot_rows, robot_infos, newton.acceptable, length, done, estimates)
         return start + done, lasts, found
 
     def _rows(
-        self, rows: np.ndarray, infos: np.ndarray, acceptable: float, length: np.ndarray, done: np.ndarray
-    ) -> StepRows:
+        self, rows: np.ndarray, infos: np.ndarray, acceptable: float, length: np.ndarray, done: np.ndarray,
+        estimates: bool,
+    ) -> StepRows:  # fmt: skip
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
         if self.strands > 1:
             rows = self.equations.joined(rows.reshape(*rows.shape[:-1], self.strands, -1))
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE)
+        fine = (off <= COARSE_SHARE * length[:, None]) & (angle <= COARSE_ANGLE) | (not estimates)
         result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
         result = np.where(error <= acceptable, result, int(Result.NO_CONVERGENCE))
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
