@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
+import math
 import operator
 from collections.abc import Callable, Iterable, Iterator
 from typing import Any
@@ -231,23 +232,25 @@ class Core(EliminationCode):
     def _write_recorded(self) -> None:
         """Rates and residual of y, the defects of the scheme's check formula, and the records."""
         e = self.equations
-        self.recorded = f = self._function("recorded", "coefficients")
-        f.call(self.residual_of_y, f.arguments[0])
+        self.recorded = f = self._function("recorded", "n_estimates", "coefficients")
+        memory, estimates, _ = f.arguments
+        f.call(self.residual_of_y, memory)
         formula, check = self.space.formula, self.space.check
-        for k in range(len(formula.stages), len(check.stages)):
-            self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
-        pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
-        changes = [weight - own for weight, own in pairs]
-        for i, j in self._components(e.ny, self.pieces):
-            self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
+        with f.if_(estimates > 0):
+            for k in range(len(formula.stages), len(check.stages)):
+                self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
+            pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
+            changes = [weight - own for weight, own in pairs]
+            for i, j in self._components(e.ny, self.pieces):
+                self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
 
     def _write_check(self) -> None:
         """The solution's records, and its residual."""
         e = self.equations
-        self.check = f = self._function("check", "numbers", "coefficients")
-        memory, numbers, coefficients = f.arguments
-        f.call(self.recorded, memory, coefficients)
+        self.check = f = self._function("check", "n_estimates", "numbers", "coefficients")
+        memory, estimates, numbers, coefficients = f.arguments
+        f.call(self.recorded, memory, estimates, coefficients)
         f.call(self.weigh, memory)
         largest = f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
@@ -505,14 +508,24 @@ class Core(EliminationCode):
     # the time loop
 
     def _write_run(self) -> None:
-        """All steps, until every robot has failed; `reached` counts the solved."""
+        """All steps, until every robot has failed; `reached` counts the solved.
+
+        Without estimates (`n_estimates` 0), all errors are NaN, also those of the state after the run.
+        """
         e, P = self.equations, self.P
         names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
-        names += ["n_steps", "n_stages"]
+        names += ["n_steps", "n_stages", "n_estimates"]
         f = self._now = self.module.function("run", names, exported=True)
-        memory, controls, coefficients, extrapolations, rows, infos, reached, steps, stages = f.arguments
+        memory, controls, coefficients, extrapolations, rows, infos, reached = f.arguments[:7]
+        steps, stages, estimates = f.arguments[7:]
         numbers = self._pointer(self.numbers, 0)
         f.store(1.0, numbers, ALIVE * P, P)
+        with f.if_(estimates <= 0):
+            for k in (POSITION, ANGLE, TIME):
+                f.store(math.nan, numbers, k * P, P)
+            for array in (*self.errors, self.error_rate, *self.time_errors):
+                for i, j in self._components(array.size, self.used):
+                    self._write_wide(math.nan, array, i, j)
         step, nodes = Variable(f, f.value(0, "i64")), len(self.grid.nodes)
 
         def going() -> Value:
@@ -522,7 +535,8 @@ class Core(EliminationCode):
             with f.loop(stages) as stage:
                 number = step.get() * stages + stage.value
                 table = f.pointer(coefficients, number * (self.settings.memory + 3))
-                f.call(self.stage, memory, numbers, table, f.pointer(controls, number * (e.nc * P)))
+                control = f.pointer(controls, number * (e.nc * P))
+                f.call(self.stage, memory, estimates, numbers, table, control)
                 if self.scheme:
                     f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
                 with f.loop(nodes) as node:
@@ -544,8 +558,8 @@ class Core(EliminationCode):
     def _write_stage(self) -> None:
         """One stage of a step: history, first guess, solution, records and estimates."""
         e, P = self.equations, self.P
-        self.stage = f = self._function("stage", "numbers", "coefficients", "controls")
-        memory, numbers, coefficients, controls = f.arguments
+        self.stage = f = self._function("stage", "n_estimates", "numbers", "coefficients", "controls")
+        memory, estimates, numbers, coefficients, controls = f.arguments
         c0, *earlier, d1, t = (f.load(coefficients, i) for i in range(self.settings.memory + 3))
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
@@ -568,18 +582,19 @@ class Core(EliminationCode):
             self._put(self._get(self.y, i, base), self.unknowns, k)
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
-        f.call(self.check, memory, numbers, coefficients)
-        if isinstance(self.scheme, SDIRK2):
-            f.call(self.time_history, memory, coefficients)
-        if self.scheme:
-            history(self.errors, self.error_rate, self.dH, self.used)
-        f.call(self.corrected, memory, numbers)
-        if self.settings.uses_rate:
-            for i, j in self._components(e.numbers, self.used):
-                value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
-                self._write_wide(value, self.error_rate, i, j)
-        if isinstance(self.scheme, SDIRK2):
-            f.call(self.corrected_in_time, memory, numbers)
+        f.call(self.check, memory, estimates, numbers, coefficients)
+        with f.if_(estimates > 0):
+            if isinstance(self.scheme, SDIRK2):
+                f.call(self.time_history, memory, coefficients)
+            if self.scheme:
+                history(self.errors, self.error_rate, self.dH, self.used)
+            f.call(self.corrected, memory, numbers)
+            if self.settings.uses_rate:
+                for i, j in self._components(e.numbers, self.used):
+                    value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
+                    self._write_wide(value, self.error_rate, i, j)
+            if isinstance(self.scheme, SDIRK2):
+                f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
         alive = f.load(numbers, ALIVE * P, P)
         f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
@@ -633,7 +648,7 @@ class Core(EliminationCode):
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         if len(self.grid.between):
             self._write_filling(turns, self.residual_of_y)
-        f.call(self.recorded, memory, coefficients)
+        f.call(self.recorded, memory, 1, coefficients)
 
     def _write(self) -> None:
         self._write_setup()

@@ -134,7 +134,7 @@ class Motions(Generic[States]):
         first = results.ctypes.data
         core._functions["run"](
             memory.ctypes.data, acting.ctypes.data, table.ctypes.data, core._guesses.ctypes.data, first,
-            first + 8 * int(ends[0]), first + 8 * int(ends[1]), len(acting), acting.shape[1],
+            first + 8 * int(ends[0]), first + 8 * int(ends[1]), len(acting), acting.shape[1], 1,
         )  # fmt: skip
         done = results[ends[1] :]
         if np.all(done == len(acting)):
