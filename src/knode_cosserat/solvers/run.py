@@ -17,6 +17,7 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from knode_cosserat.engine import loops as engine
+from knode_cosserat.engine.motions import Motions
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
@@ -80,6 +81,12 @@ class TimeIntegration:
         fails.
         """
         return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps))
+
+    def motions(self, system: System, state: Any) -> Motions[Any]:
+        """Return the motion of one robot from a state, for steps one by one."""
+        return engine.motions_of(
+            system, self.coefficients, jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
+        )
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
@@ -248,16 +255,22 @@ def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
     ny, nz = system.y_layout.size, system.z_layout.size
     invalid = numeric.asarray(rows.result) < 0
     length = system.length[..., None] if np.ndim(system.length) else system.length
-    records = numeric.where(invalid[..., None, None], numeric.nan, rows.records)
+
+    def known(values: Any, axes: int) -> Any:
+        if numeric is np and not invalid.any():
+            return values
+        return numeric.where(invalid[(..., *[None] * axes)], numeric.nan, values)
+
+    records = known(rows.records, 2)
     found = {
         "y": records[..., :ny], "z": records[..., ny : ny + nz], "result": rows.result,
         "residual": rows.error, "iterations": rows.corrections,
-        "position_error": numeric.where(invalid, numeric.nan, rows.position_error),
+        "position_error": known(rows.position_error, 0),
         # an estimate beyond the rod's length is none
         "time_error": numeric.where(~invalid & (rows.time_error <= length), rows.time_error, numeric.nan),
     }  # fmt: skip
     if rows.stages.shape[-3]:
-        found["stages"] = numeric.where(invalid[..., None, None, None], numeric.nan, rows.stages)
+        found["stages"] = known(rows.stages, 3)
     return found
 
 
