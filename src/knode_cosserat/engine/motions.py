@@ -101,7 +101,10 @@ class Motions(Generic[States]):
     @property
     def states(self) -> States:
         """The states of all robots (robots, ...)."""
-        return self._states(self.motions.copy())
+        motions = self.motions.copy()
+        if self.core.batch:
+            return self._states(motions)
+        return self._kind(*(values[None] for values in self.state_of(motions)))
 
     def _states(self, motions: np.ndarray) -> States:
         found = []

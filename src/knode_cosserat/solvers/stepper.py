@@ -31,7 +31,8 @@ class Stepper:
     """A robot that moves one step at a time, by the program of `simulate` and with its recovery.
 
     Calls of `step` return the rows of one `simulate`, to the tolerance of Newton's method. A call takes the
-    time of the step and some 20 µs, and its row more when it is first used. Programs are shared with `simulate`.
+    time of the step and some 20 µs; its row takes more when it is first used. Programs are those of
+    `simulate`.
 
         stepper = kc.solvers.Stepper(robot, dt=0.05)
         while True:
