@@ -14,7 +14,6 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,12 +29,14 @@ from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, parameters_of, slots_of
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.history import GUESS_STATES, SolverState, StateHistory
+from knode_cosserat.solvers.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.settings import Settings
 
 
-class Trajectory(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False, repr=False)
+class Trajectory:
     """A system's states at T times and N nodes; every array may have a leading batch axis.
 
     Row 0 is the initial state. Controls have one convention in this package: `held_control` and
@@ -43,40 +44,61 @@ class Trajectory(eqx.Module):
     the control in each row's own equations, which acted up to that row. Rows that were not solved are NaN;
     `result` says why. A pytree: it can be returned from a jitted function.
 
-    The last three fields are states of the solver, from which a motion continues exactly.
+    The last three fields are states of the solver, from which a motion continues exactly. Defaults are no
+    attributes of the class: fields may be deferred.
     """
 
     system: System
     #: numerical settings, or None for measured states
-    settings: Settings | None = eqx.field(static=True)
+    settings: Settings | None = dataclasses.field(metadata=CONSTANT)
     time: Float[Any, " T"]
     y: Float[Any, "*batch T N y"]
     z: Float[Any, "*batch T N z"]
     #: control in the row's equations: row i's acted from row i - 1 to i, row 0's before; see `held_control`
     control: Float[Any, "*batch T c"]
     #: a `Result` for each row
-    result: Int[Any, "*batch T"] = eqx.field(converter=ResultCodes.of)
+    result: Int[Any, "*batch T"]
     #: largest residual in natural units
     residual: Float[Any, "*batch T"]
     iterations: Int[Any, "*batch T"]
     #: estimated discretisation error of positions along the rod (m), the largest over the nodes; NaN: unknown
-    position_error: Any = None
+    position_error: Any = dataclasses.field(default_factory=type(None))
     #: estimated error of positions (m) by the time steps, the largest over the nodes; NaN or None: unknown
-    time_error: Any = None
+    time_error: Any = dataclasses.field(default_factory=type(None))
     #: True in rows outside the training range of a learned or identified model; None if unknown
-    extrapolated: Any = None
+    extrapolated: Any = dataclasses.field(default_factory=type(None))
     #: True if intermediate rows were left out: the controls held there are not known
-    thinned: bool = eqx.field(static=True, default=False)
+    thinned: bool = dataclasses.field(default_factory=bool, metadata=CONSTANT)
 
     # states of the solver
 
     #: state of the solver in row 0 of a motion; None for equilibria, and where it is unknown
-    initial_state: SolverState | None = None
+    initial_state: SolverState | None = dataclasses.field(default_factory=type(None))
     #: state of the solver in the last row, from which a motion continues exactly; None as for `initial_state`
-    final_state: SolverState | None = None
+    final_state: SolverState | None = dataclasses.field(default_factory=type(None))
     #: states y, z (and y_s, where rows have it) at the stages of the time scheme before each row, which its
     #: history needs: (*batch, T, stages - 1, N, x); None for schemes of one stage, and where they are unknown
-    stages: Any = None
+    stages: Any = dataclasses.field(default_factory=type(None))
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "result", ResultCodes.of(self.result))
+
+    @classmethod
+    def deferred(cls, fields: Callable[[], dict[str, Any]]) -> Self:
+        """Return a trajectory whose fields are computed when one of them is first used."""
+        found = object.__new__(cls)
+        found.__dict__["_deferred"] = fields
+        return found
+
+    def __getattr__(self, name: str) -> Any:
+        deferred = self.__dict__.get("_deferred")
+        if deferred is not None:
+            self.__dict__.update(deferred())
+            self.__dict__.pop("_deferred", None)
+        return object.__getattribute__(self, name)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
 
     # named parts
 

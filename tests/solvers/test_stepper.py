@@ -1,5 +1,9 @@
 """`Stepper` gives the rows of `simulate`, one by one; what cannot be solved moves nothing."""
 
+import copy
+import pickle
+
+import jax
 import numpy as np
 import pytest
 
@@ -121,3 +125,31 @@ def test_wrong_arguments_are_named(robot, change, message):
 def test_a_wrong_control_is_named(robot, control, message):
     with pytest.raises(ValueError, match=message):
         kc.solvers.Stepper(robot, DT).step(control)
+
+
+def test_copies_previews_and_failures_do_not_change_what_follows(robot, sine):
+    """The same state gives the same bits: in a copy, after a file, after previews and after a failed step."""
+    stepper = kc.solvers.Stepper(robot, DT)
+    stepper.step(sine[0])
+    others = [copy.copy(stepper), copy.deepcopy(stepper), pickle.loads(pickle.dumps(stepper))]
+    for other in others:
+        other.preview(sine[2])
+        with pytest.raises(kc.SimulationError):
+            other.step([1e8, 0.0, 0.0, 1e8])
+        np.testing.assert_array_equal(other.preview(sine[1]).y, stepper.preview(sine[1]).y)
+    rows = [each.step(sine[1]) for each in (stepper, *others)]
+    for row in rows[1:]:
+        np.testing.assert_array_equal(row.y, rows[0].y)
+        np.testing.assert_array_equal(row.final_state.history.records, rows[0].final_state.history.records)
+
+
+def test_a_row_is_a_whole_trajectory_before_any_of_it_is_used(robot, sine):
+    """Its fields are put together late: as a tree, in a pickle, and as the start of another motion."""
+    rows = [kc.solvers.Stepper(robot, DT).step(sine[0]) for _ in range(4)]
+    wanted = kc.simulate(robot, sine[:1], DT)
+    leaves = [jax.tree.leaves(rows[0]), jax.tree.leaves(pickle.loads(pickle.dumps(rows[1])))]
+    for one, other in zip(*leaves, strict=True):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_array_equal(copy.copy(rows[2]).y, wanted.y[1:])
+    after = kc.simulate(robot, sine[1:3], DT, initial=rows[3])
+    np.testing.assert_allclose(after.y[-1], kc.simulate(robot, sine[:3], DT).y[-1], rtol=0, atol=1e-7)

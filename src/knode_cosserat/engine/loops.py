@@ -63,18 +63,23 @@ def solve_steps(
     side in the lanes of vectors, each until a step fails (see `Motions.solve`).
     """
     alone, is_static = np.ndim(controls) == 2, steps.settings.time is None
-    core = core_of(Pattern.of(system), steps.settings, robots=not alone and len(controls) > 1)
-    parameters = parameters_of(system)
-    if np.ndim(system.length):
-        leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
-        parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
     states = Shape(states) if is_static else states
     controls, states = jax.tree.map(lambda leaf: np.asarray(leaf)[None if alone else ...], (controls, states))
-    motions = Motions(core, parameters, states, steps)
+    motions = motions_of(system, steps, states)
     done, rows = motions.solve(controls, span)
     last = motions.states
     found = done, last.y if is_static else last, rows
     return jax.tree.map(lambda leaf: leaf[0], found) if alone else found
+
+
+def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions[Any]:
+    """Return motions from states (robots, ...), of one system or of as many."""
+    core = core_of(Pattern.of(system), steps.settings, robots=len(states[0]) > 1)
+    parameters = parameters_of(system)
+    if np.ndim(system.length):
+        leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
+        parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+    return Motions(core, parameters, states, steps)
 
 
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:

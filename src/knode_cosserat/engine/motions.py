@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Generic, NamedTuple, TypeVar
+import functools
+import math
+from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -19,6 +21,8 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.result import Result
 
+CONVERGED, COARSE, NOT_SOLVED = int(Result.CONVERGED), int(Result.COARSE), int(Result.NO_CONVERGENCE)
+
 
 class Shape(NamedTuple):
     """The state from which an equilibrium is solved."""
@@ -32,8 +36,7 @@ States = TypeVar("States", StateHistory, Shape)
 class Motions(Generic[States]):
     """States of robots in the layout of the engine, from which steps are solved.
 
-    Vectors of robots take turns in one memory. A single vector stays there between calls, with the factors of
-    its last linearisation.
+    Vectors of robots take turns in one memory. A single vector stays there between calls.
     """
 
     def __init__(self, core: Core, parameters: np.ndarray, states: States, steps: StepCoefficients):
@@ -69,24 +72,46 @@ class Motions(Generic[States]):
 
         The memories (vectors, n) begin with the number `first`.
         """
+        shape, at, strides = self._place_of(arrays, first)
+        return np.ndarray((len(memory), *shape), float, memory, at, (memory.strides[0], *strides))
+
+    def _place_of(self, arrays: list[Array], first: int) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
+        """Return the shape (lanes, arrays, places, size) of arrays, their first byte, and their strides."""
         core, one = self.core, arrays[0]
         places = one.count if core.batch else core.stride * (one.count > 0)
         apart = arrays[1].offset - one.offset if len(arrays) > 1 else 0
-        return np.ndarray(
-            (len(memory), core.P, len(arrays), max(places, 1), one.size), float, memory,
-            8 * (one.offset - first),
-            (memory.strides[0], 8, 8 * apart, 8 * one.place, 8 * one.component),
-        )  # fmt: skip
+        shape = core.P, len(arrays), max(places, 1), one.size
+        return shape, 8 * (one.offset - first), (8, 8 * apart, 8 * one.place, 8 * one.component)
+
+    @functools.cached_property
+    def _places(self) -> list[tuple[tuple[int, ...], int, tuple[int, ...]]]:
+        """Shape, first place and strides of each part of the state of one robot of one strand."""
+        found = []
+        for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
+            _, at, strides = self._place_of(arrays, self.core._motion.start)
+            found.append((shape, at, strides[len(strides) - len(shape) :]))
+        return found
+
+    def state_of(self, motions: np.ndarray) -> States:
+        """Return the state of one robot: views of its numbers, for a system of one strand."""
+        if self.core.strands > 1:
+            return self._kind(*(values[0] for values in self._states(motions)))
+        return self._kind(*(np.ndarray(shape, float, motions, *place) for shape, *place in self._places))
 
     @property
     def states(self) -> States:
         """The states of all robots (robots, ...)."""
+        motions = self.motions.copy()
+        if self.core.batch:
+            return self._states(motions)
+        return self._kind(*(values[None] for values in self.state_of(motions)))
+
+    def _states(self, motions: np.ndarray) -> States:
         found = []
         for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
-            count = int(np.prod(shape)) // (len(arrays) * self.core._width(arrays[0]))
-            values = self.core._joined(
-                arrays[0], self._view(self.motions, arrays, self.core._motion.start), count
-            )
+            count = math.prod(shape) // (len(arrays) * self.core._width(arrays[0]))
+            view = self._view(motions, arrays, self.core._motion.start)
+            values = self.core._joined(arrays[0], view, count)
             found.append(values.reshape(-1, *shape)[: self.size])
         return self._kind(*found)
 
@@ -99,58 +124,112 @@ class Motions(Generic[States]):
         the others in its vector; its last state is not kept, except if the first step failed.
         """
         core, P, stages, (start, stop) = self.core, self.core.P, np.size(self.steps.ends), span
-        e, count, vectors = core.equations, stop - start, len(self.motions)
+        e, count, vectors = core.equations, int(stop - start), len(self.motions)
         own = self._in_lanes(controls[:, start:stop]).reshape(vectors, P, count, -1, e.nc)
         acting = np.empty((vectors, count, stages, e.nc, P))
         acting[:] = np.moveaxis(own, 1, -1)
-        table = coefficients_of(self.steps, span)
-        shapes = (
-            (count, stages, len(core.grid.nodes), core.strands * e.numbers, P),
-            (count, stages, 8 + e.k, P),
-        )
-        ends = np.cumsum([np.prod(shape) for shape in shapes])
-        results = np.zeros((vectors, ends[-1] + P))
+        table, shapes = coefficients_of(self.steps, span), self._shapes_of(count, stages)
+        sizes = [math.prod(shape) for shape in shapes]
+        results = np.zeros((vectors, sum(sizes) + P))
         for k in range(vectors):
-            self._solve(k, acting[k], table, results[k], ends)
+            self._solve(k, acting[k], table, results[k], sizes)
+        rows, infos, reached = np.split(results, np.cumsum(sizes), axis=1)
         rows, infos = (
             np.moveaxis(part.reshape(vectors, *shape), -1, 1).reshape(-1, *shape[:-1])[: self.size]
-            for part, shape in zip(np.split(results, ends, axis=1), shapes, strict=False)
+            for part, shape in zip((rows, infos), shapes, strict=True)
         )
-        done = results[:, ends[-1] :].reshape(-1)[: self.size].astype(int)
+        done = reached.reshape(-1)[: self.size].astype(int)
         return start + done, self._rows(rows, infos, done)
 
+    def _shapes_of(self, count: int, stages: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+        """Return the shapes of the rows of a vector of robots, and of the numbers of their stages."""
+        core, e = self.core, self.core.equations
+        numbers = core.strands * e.numbers
+        return (count, stages, len(core.grid.nodes), numbers, core.P), (count, stages, 8 + e.k, core.P)
+
     def _solve(
-        self, k: int, acting: np.ndarray, table: np.ndarray, results: np.ndarray, ends: np.ndarray
+        self, k: int, acting: np.ndarray, table: np.ndarray, results: np.ndarray, sizes: list[int]
     ) -> None:
-        """Solve steps of a vector of robots."""
-        core, memory, motion = self.core, self._memory, self.core._motion
-        if self._inside != k:
-            self._inside = k
-            memory[motion] = self.motions[k]
-            self._view(memory[None], [core.params])[0, :, 0, 0] = self._parameters[k]
-            self._view(memory[None], [core.numbers])[..., USABLE] = 0.0
-            core._functions["start"](memory.ctypes.data)
-            self._lengths[k] = self._view(memory[None], [core.length])[0, :, 0, 0, 0]
+        """Solve steps of a vector of robots; results are rows, numbers of stages, and steps done."""
+        core, memory, motion, count = self.core, self._memory, self.core._motion, len(acting)
+        self._enter(k)
+        rows, infos = sizes
         first = results.ctypes.data
         core._functions["run"](
             memory.ctypes.data, acting.ctypes.data, table.ctypes.data, core._guesses.ctypes.data, first,
-            first + 8 * int(ends[0]), first + 8 * int(ends[1]), len(acting), acting.shape[1], 1,
+            first + 8 * rows, first + 8 * (rows + infos), count, acting.shape[1], 1,
         )  # fmt: skip
-        done = results[ends[1] :]
-        if np.all(done == len(acting)):
-            if len(self.motions) == 1:
-                # views of the states before remain as they are
-                self.motions = memory[None, motion].copy()
-            else:
-                self.motions[k] = memory[motion]
+        done = results[rows + infos :]
+        if np.all(done == count):
+            self.motions[k] = memory[motion]
             return
         self._inside = -1
         if core.batch:
             before, after = (each.reshape(-1, core.P) for each in (self.motions[k], memory[motion]))
             before[:, done > 0] = after[:, done > 0]
-        elif done > 0:
+        elif done[0] > 0:
             # again, for the state before the step that failed
-            self._solve(k, acting[: int(done[0])], table, np.zeros_like(results), ends)
+            self._solve(k, acting[: int(done[0])], table, np.zeros_like(results), sizes)
+
+    def _enter(self, k: int) -> None:
+        """Put the states of a vector of robots into memory if they are not there."""
+        if self._inside == k:
+            return
+        core, memory = self.core, self._memory[None]
+        self._memory[core._motion] = self.motions[k]
+        self._view(memory, [core.params])[0, :, 0, 0] = self._parameters[k]
+        self._view(memory, [core.numbers])[..., USABLE] = 0.0
+        core._functions["start"](memory.ctypes.data)
+        self._lengths[k] = self._view(memory, [core.length])[0, :, 0, 0, 0]
+        self._inside = k
+
+    # one step of one robot
+
+    @functools.cached_property
+    def _step(self) -> tuple[Any, ...]:
+        """Controls, coefficients and use of factors in a step, all addresses, and shapes of its results."""
+        stages = np.size(self.steps.ends)
+        acting, table = np.empty((stages, self.core.equations.nc)), coefficients_of(self.steps, (0, 1))
+        arrays = self._memory, acting, table, self.core._guesses
+        shapes = [shape[1:-1] for shape in self._shapes_of(1, stages)]
+        usable = self._view(self._memory[None], [self.core.numbers])[0, 0, 0, :, USABLE]
+        return acting, table, usable, [each.ctypes.data for each in arrays], shapes
+
+    def step(self, motions: np.ndarray, i: int, control: np.ndarray) -> tuple[np.ndarray | None, int]:
+        """Solve step i of one robot from a state in `motions`, under a control (c,) or (stages * c,).
+
+        Return its numbers, for `row_of`, and its result; no numbers if it failed. The state after it is in
+        `motions` then, a new array. No factors are kept: the same state gives the same bits.
+        """
+        if motions is not self.motions:
+            self.motions, self._inside = motions, -1
+        core, (acting, table, usable, addresses, (rows, infos)) = self.core, self._step
+        acting[:] = control.reshape(-1, acting.shape[1])
+        if i < len(self.steps.table):
+            table[:] = coefficients_of(self.steps, (i, i + 1))
+        table[0, :, -1] = (i + self.steps.ends) * self.steps.dt
+        size = math.prod(rows)
+        results = np.zeros(size + math.prod(infos) + 1)
+        first = results.ctypes.data
+        self._enter(0)
+        usable[:] = 0.0
+        core._functions["run"](
+            *addresses, first, first + 8 * size, first + 8 * (len(results) - 1), 1, len(acting), 1
+        )
+        if not results[-1]:
+            self._inside = -1
+            return None, NOT_SOLVED
+        self.motions = self._memory[None, core._motion].copy()
+        last = len(results) - 1 - infos[-1]
+        fine = _is_fine(results.item(last + POSITION), results.item(last + ANGLE), self._lengths.item())
+        return results, CONVERGED if fine else COARSE
+
+    def row_of(self, results: np.ndarray) -> StepRows:
+        """Return the row of a step from its numbers."""
+        shapes = self._shapes_of(1, np.size(self.steps.ends))
+        size = math.prod(shapes[0])
+        rows, infos = results[:size].reshape(1, *shapes[0][:-1]), results[size:-1].reshape(1, *shapes[1][:-1])
+        return StepRows(*(leaf[0, 0] for leaf in self._rows(rows, infos, np.ones(1))))
 
     def _rows(self, rows: np.ndarray, infos: np.ndarray, done: np.ndarray) -> StepRows:
         """Return rows (robots, steps, ...); a step's row is that of its last stage."""
@@ -161,9 +240,9 @@ class Motions(Generic[States]):
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
         lengths = self._lengths.reshape(-1)[: self.size]
-        fine = (off <= COARSE_SHARE * lengths[:, None]) & (angle <= COARSE_ANGLE)
-        result = np.where(fine, int(Result.CONVERGED), int(Result.COARSE))
-        result = np.where(error <= self.steps.settings.newton.acceptable, result, int(Result.NO_CONVERGENCE))
+        fine = _is_fine(off, angle, lengths[:, None])
+        result = np.where(fine, CONVERGED, COARSE)
+        result = np.where(error <= self.steps.settings.newton.acceptable, result, NOT_SOLVED)
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
@@ -171,6 +250,11 @@ class Motions(Generic[States]):
             rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
+
+
+def _is_fine(off: Any, angle: Any, length: Any) -> Any:
+    """True where errors of positions (m) and orientations (rad) do not make a row coarse."""
+    return (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE)
 
 
 def coefficients_of(steps: StepCoefficients, span: tuple[int, int]) -> Float[np.ndarray, "T stages n"]:

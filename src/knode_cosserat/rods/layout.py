@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -41,7 +42,7 @@ class Layout:
     def __init__(self, *fields: tuple[Any, ...]):
         object.__setattr__(self, "fields", tuple(Field(*field) for field in fields))
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """Size of a packed vector."""
         return sum(field.size for field in self.fields)
@@ -101,6 +102,8 @@ class Layout:
     def beyond(self, packed: Any) -> str:
         """Describe the first control (…, size) outside its field's limits; empty if all are within."""
         for field in self.fields:
+            if field.low == -np.inf and field.high == np.inf:
+                continue
             values = np.asarray(self.get(packed, field.name))
             wrong = (values < field.low) | (values > field.high)
             if np.any(wrong):

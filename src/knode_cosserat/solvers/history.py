@@ -7,17 +7,16 @@ equations (`grid.Grid`). The history stores them there. The rows of a trajectory
 
 from __future__ import annotations
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat._modules import module_of
 from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced, unknown_count
@@ -54,16 +53,22 @@ class StateHistory(NamedTuple):
     time_error: Float[Any, "memory used x"]
 
 
-class SolverState(eqx.Module):
+#: of a field that is no leaf of a tree
+CONSTANT = {"static": True}
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True, eq=False)
+class SolverState:
     """State of the solver at a row of a motion, from which the motion continues."""
 
     history: StateHistory
     #: time step (s) between the states of the history; None if all its states are the same one
-    dt: float | None = eqx.field(static=True, default=None)
+    dt: float | None = dataclasses.field(default=None, metadata=CONSTANT)
     #: True if the history's rate is that of its newest state
-    rate_known: bool = eqx.field(static=True, default=True)
+    rate_known: bool = dataclasses.field(default=True, metadata=CONSTANT)
     #: number of different states in the history, if not all are
-    distinct: int | None = eqx.field(static=True, default=None)
+    distinct: int | None = dataclasses.field(default=None, metadata=CONSTANT)
 
     def known(self, settings: Settings) -> int:
         """Return the number of states from which the next step can be made; 0 if it lacks a rate."""
@@ -74,10 +79,7 @@ class SolverState(eqx.Module):
     def after(self, history: StateHistory, dt: float, steps: int, settings: Settings) -> SolverState:
         """Return the state after so many steps (s)."""
         distinct = self.known(settings) + steps
-        return module_of(
-            SolverState, history=history, dt=dt, rate_known=settings.uses_rate,
-            distinct=distinct if distinct < settings.memory else None,
-        )  # fmt: skip
+        return SolverState(history, dt, settings.uses_rate, distinct if distinct < settings.memory else None)
 
 
 def coefficient_table(settings: Settings, dt: float, known: int = 1) -> np.ndarray:

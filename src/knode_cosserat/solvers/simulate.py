@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat._modules import module_of
 from knode_cosserat._numbers import real_array
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
@@ -22,7 +21,6 @@ from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
 from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.result import ResultCodes
 from knode_cosserat.solvers.rollout import Solves, rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -382,8 +380,4 @@ def _trajectory(system: System, run: Any, rows: StepRows, history: Any) -> Traje
         name: numeric.concatenate([numeric.expand_dims(first[name], axis), values], axis)
         for name, values in every.items()
     }
-    joined["result"] = ResultCodes.of(joined["result"])
-    return module_of(
-        Trajectory, system=system, settings=settings, time=time, **joined, initial_state=initial,
-        final_state=final,
-    )  # fmt: skip
+    return Trajectory(system, settings, time, **joined, initial_state=initial, final_state=final)

@@ -11,6 +11,7 @@ import numpy as np
 from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.history import SolverState, StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
@@ -22,12 +23,16 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
+#: function that returns a solved step's row and the state of the solver after it
+Solved = Callable[[], tuple[StepRows, SolverState]]
+
 
 class Stepper:
     """A robot that moves one step at a time, by the program of `simulate` and with its recovery.
 
     Calls of `step` return the rows of one `simulate`, to the tolerance of Newton's method. A call takes the
-    time of the step and a fraction of a millisecond in addition. Programs are shared with `simulate`.
+    time of the step and some 20 µs; its row takes more when it is first used. Programs are those of
+    `simulate`.
 
         stepper = kc.solvers.Stepper(robot, dt=0.05)
         while True:
@@ -62,6 +67,14 @@ class Stepper:
         self.robot, self.dt = robot, checked_dt(dt)
         # layouts are put together anew in each call
         self._layout, self._control_shape = robot.control_layout, (robot.control_layout.size,)
+        self._linear = bool(self._layout.moving.any())
+        # an infinite number is beyond them, and NaN too
+        most = np.finfo(float).max
+        self._limits = [
+            (max(field.low, -most), min(field.high, most))
+            for field in self._layout.fields
+            for _ in range(field.size)
+        ]
         initial, settled = split_initial(initial)
         if initial is None:
             held = np.zeros(robot.control_layout.size) if settled else None
@@ -69,15 +82,19 @@ class Stepper:
         else:
             check_initial(robot, initial, None)
             at_start = continued_state(robot, initial, settings, self.dt)
+        self._bare = without_range(robot)
         known = at_start.state.known(settings)
         self._task = TimeIntegration(settings, self.dt, 1, known, recovery_budget)
-        self._past, self._t0 = at_start.state.history, float(at_start.state.history.t0)
-        self._steps, self._result = 0, int(at_start.result)
+        self._t0, self._steps, self._result = float(at_start.state.history.t0), 0, int(at_start.result)
         self._control = np.asarray(at_start.control, dtype=float)
         self._begun, self._first_state = at_start.state.dt is not None, at_start.state
+        # memories of the engine that no call uses, and the present state as an array of theirs
+        engine = self._task.motions(self._bare, at_start.state.history)
+        self._engines, self._motion = [engine], engine.motions
+        at_rest = jax.tree.map(np.asarray, at_start.state)
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
         row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0, 0.0, stages, np.zeros(0))
-        self._state = self._row(row, self._control, self.time, at_start.state)
+        self._state = self._row(lambda: (row, at_rest), self._control, self.time)
 
     def __repr__(self) -> str:
         return f"Stepper of a {robot_text(self.robot)}: t = {self.time:g} s, dt = {self.dt:g} s"
@@ -106,18 +123,16 @@ class Stepper:
             ValueError: a control of a wrong shape, or one that is not finite.
         """
         control = self._checked(control)
-        row, after = self._solve(control, stop)
-        self._past, self._control, self._begun = after, control, True
-        self._result = int(row.result)
+        self._result, self._motion, solved = self._solve(control, stop)
+        self._control, self._begun = control, True
         self._steps += 1
-        self._state = self._row(row, control, self.time, self._state_after(after, self._steps))
+        self._state = self._row(solved, control, self.time)
         return self._state
 
     def preview(self, control: Any, stop: Callable[[], bool] | None = None) -> Trajectory:
         """Return the row that `step` would return, without changing the state. Raises the same errors."""
         control = self._checked(control)
-        row, after = self._solve(control, stop)
-        return self._row(row, control, self.time + self.dt, self._state_after(after, self._steps + 1))
+        return self._row(self._solve(control, stop)[2], control, self.time + self.dt)
 
     def _checked(self, control: Any) -> np.ndarray:
         try:
@@ -128,42 +143,69 @@ class Stepper:
             raise ValueError(
                 f"the control has shape {control.shape}; allowed is {self._control_shape}: {self._names}"
             )
+        if all(
+            low <= number <= high for number, (low, high) in zip(control.tolist(), self._limits, strict=True)
+        ):
+            return control
         if not np.all(np.isfinite(control)):
             raise ValueError(f"the control is {control.tolist()}; it must be finite")
-        beyond = self._layout.beyond(control)
-        if beyond:
-            raise ValueError(f"the control: {beyond}")
-        return control
+        raise ValueError(f"the control: {self._layout.beyond(control)}")
 
     @property
     def _names(self) -> str:
         return ", ".join(f"{field.name} ({field.size}, {field.unit})" for field in self._layout.fields)
 
-    def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[StepRows, StateHistory]:
-        i, settings = self._steps, self._task.settings
-        control = at_stages(self.robot, settings, control[None], self._control[None], not self._begun)[0]
-        controls = np.broadcast_to(control, (i + 1, len(control)))
-        done, after, rows = self._task.solve(self.robot, controls, self._past, (i, i + 1))
-        row, cause = StepRows(*(leaf[0] for leaf in rows)), ""
-        if int(done) == i:
-            budget = Budget(self._task.recovery_budget, stop)
-            pair = self._control, control
-            after, row, cause = self._task.recover(self.robot, self._past, pair, i, budget)
-        result = Result(int(row.result))
-        if not result.solved:
-            raise SimulationError(self._steps + 1, self.time + self.dt, float(row.error), result, cause)
-        return row._replace(result=int(carried_results(np.array([result]), self._result)[0])), after
+    def __getstate__(self) -> dict[str, Any]:
+        # the engine's memory is of this object alone; the state of the solver is also in the row
+        return self.__dict__ | {"_engines": [], "_motion": None}
 
-    def _state_after(self, past: StateHistory, steps: int) -> SolverState:
-        """Return the solver's state after so many steps."""
-        past = past._replace(t0=np.asarray(self._t0 + steps * self.dt))
-        return self._first_state.after(past, self.dt, steps, self._task.settings)
+    @property
+    def _history(self) -> StateHistory:
+        """History of the present state."""
+        assert self._state.final_state is not None
+        return self._state.final_state.history._replace(t0=np.asarray(self._t0))
 
-    def _row(self, row: StepRows, control: np.ndarray, time: float, state: SolverState) -> Trajectory:
-        single = StepRows(*(np.asarray(leaf)[None] for leaf in row))
-        state = jax.tree.map(np.asarray, state)
-        found = Trajectory(
-            self.robot, self._task.settings, np.array([time]), control=control[None],
-            **rows_of(self.robot, single), initial_state=state, final_state=state,
-        )  # fmt: skip
-        return marked(found, None)
+    def _solve(self, control: np.ndarray, stop: Callable[[], bool] | None) -> tuple[int, np.ndarray, Solved]:
+        """Return the result of the next step, the engine's array of the state after it, and its row."""
+        i, settings, acting = self._steps, self._task.settings, control
+        if self._linear:
+            acting = at_stages(self.robot, settings, control[None], self._control[None], not self._begun)[0]
+        try:
+            engine = self._engines.pop()
+        except IndexError:  # another thread has it, or this is a copy
+            engine = self._task.motions(self._bare, self._history)
+            self._motion = engine.motions if self._motion is None else self._motion
+        numbers, result = engine.step(self._motion, i, acting)
+        if numbers is None:
+            budget, pair = Budget(self._task.recovery_budget, stop), (self._control, acting)
+            after, row, cause = self._task.recover(self._bare, self._history, pair, i, budget)
+            result = int(row.result)
+            if result < 0:
+                self._engines.append(engine)
+                raise SimulationError(i + 1, self.time + self.dt, float(row.error), Result(result), cause)
+            engine = self._task.motions(self._bare, after)
+        if result or self._result:
+            result = int(carried_results(np.array([result]), self._result)[0])
+        motion, t = engine.motions, np.asarray(self._t0 + (i + 1) * self.dt)
+        self._engines.append(engine)
+
+        def solved() -> tuple[StepRows, SolverState]:
+            found = row if numbers is None else engine.row_of(numbers)
+            past = engine.state_of(motion)._replace(t0=t)
+            return found._replace(result=result), self._first_state.after(past, self.dt, i + 1, settings)
+
+        return result, motion, solved
+
+    def _row(self, solved: Solved, control: np.ndarray, time: float) -> Trajectory:
+        """Return a solved row as a trajectory, put together when it is first used."""
+
+        def fields() -> dict[str, Any]:
+            row, state = solved()
+            row = StepRows(*(np.asarray(leaf)[None] for leaf in row))
+            found = Trajectory(
+                self.robot, self._task.settings, np.array([time]), control=control[None],
+                **rows_of(self.robot, row), initial_state=state, final_state=state,
+            )  # fmt: skip
+            return vars(marked(found, None))
+
+        return Trajectory.deferred(fields)
