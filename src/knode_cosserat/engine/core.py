@@ -30,7 +30,7 @@ from knode_cosserat.solvers.history import (
     ROUNDING,
     stage_extrapolations,
 )
-from knode_cosserat.solvers.problem import FILLING, Evaluated
+from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.time import SDIRK2
 
@@ -640,14 +640,14 @@ class Core(EliminationCode):
         f.call(self.setup, *f.arguments)
 
     def _write_evaluate(self) -> None:
-        """The state at y and history terms, with y at points between nodes corrected in some turns."""
-        names = ["memory", "coefficients", "control", "n_turns"]
+        """The state at y and history terms; y is corrected at points between nodes, `n_most` a segment."""
+        names = ["memory", "coefficients", "control", "n_most"]
         f = self._now = self.module.function("evaluate", names, exported=True)
-        memory, coefficients, control, turns = f.arguments
+        memory, coefficients, control, most = f.arguments
         f.call(self.setup, memory)
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         if len(self.grid.between):
-            self._write_filling(turns, self.residual_of_y)
+            self._write_filling(most, self.rates_and_slopes, self.rates)
         f.call(self.recorded, memory, 1, coefficients)
 
     def _write(self) -> None:
@@ -700,14 +700,14 @@ class Core(EliminationCode):
         self._put_in(memory[None], self.params, parameters[None, None, None])
 
         def evaluate(c0: float, t: float, control: Any, history: Any, y: Any) -> Evaluated:
-            turns = 0
+            most = 0
             if len(y) < self.strand_points:
-                y, turns = self.grid.spread(y), FILLING * (self.grid.parts.shape[1] - 1)
+                y, most = self.grid.spread(y), self.grid.parts.shape[1] - 1
             for array, values in ((self.H, history), (self.y, y)):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
             table[[0, -1]] = c0, t
-            self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), turns)
+            self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), most)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
             error = np.max(np.abs(defects[: self.pieces]) * inverse[: self.pieces])

@@ -24,11 +24,14 @@ from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Elimination, Equations
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
+from knode_cosserat.solvers.problem import FILLING
 
 #: pieces between two changes of the unknowns
 GROUPS = (3, 4, 5)
 #: columns that are solved side by side: each operation of a column waits for the one before
 COLUMNS = 2
+#: corrections between nodes with new factors, and the largest, in natural units, after which none is needed
+RENEWALS, FILLED = 2, 1e-10
 
 
 class EliminationCode(RodCode):
@@ -36,8 +39,8 @@ class EliminationCode(RodCode):
 
     solved: Function
     advance: Function
-    #: true if the entries of A are needed
-    has_entries = False
+    #: true if A and B are needed, and not B⁻¹ A
+    keeps_both = False
 
     def __init__(self, equations: Equations, robots: bool):
         super().__init__(equations, robots)
@@ -66,16 +69,18 @@ class EliminationCode(RodCode):
         for i, c, _ in self.tip_slopes:
             self.nonzero_M[i, c % ny] = True
         self.factor = a(len(self.elimination.factors), self.pieces)
-        #: entries of A
-        if self.has_entries:
+        #: true if B⁻¹ A is formed; the recursion along the rod solves by B in every piece if it is not
+        self.has_matrix = not (robots or self.keeps_both)
+        if self.keeps_both:
             self.entries = a(len(self.elimination.entries), self.pieces)
-        if robots:
-            # the recursion along the rod solves by B in every piece
+        if not self.has_matrix:
             self.added = self.r
         else:
             #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
-            self.wide_matrix, self.wide_added = a(ny * (ny + 1), self.pieces), a(ny, self.pieces)
+            self.wide_matrix = a(ny * (ny + 1), self.pieces)
             self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
+        if not robots:
+            self.wide_added = a(ny, self.pieces)
         #: columns of the unknowns along the rod
         self.X = by_rows(ny, self.own, self.points)
         tip = self.grid.tip
@@ -143,18 +148,18 @@ class EliminationCode(RodCode):
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
         el, n, blocks = self.elimination, self.equations.ny, self._blocks_of_rows()
         # a function for each block: LLVM's time grows faster than the size of a function
-        functions = [self._write_factor_of(f"factored{k}", rows) for k, rows in enumerate(blocks)]
+        self.factors = [self._write_factor_of(f"factored{k}", rows) for k, rows in enumerate(blocks)]
         # nothing is to be solved for a constant field
         blocks = [rows for rows in blocks if any(el.solved[i] != int(el.r[i]) for i in rows)]
-        if not self.batch:
+        if self.has_matrix:
             solved_columns = [
                 self._write_solved(f"solved_columns{k}", COLUMNS, rows) for k, rows in enumerate(blocks)
             ]
         self.factored = f = self._function("factored")
         memory = f.arguments[0]
-        for function in functions:
+        for function in self.factors:
             f.call(function, memory)
-        if self.batch:
+        if not self.has_matrix:
             return
         with self._places(self.pieces) as j:
             first = self._pointer(self.wide_matrix, j)
@@ -179,9 +184,9 @@ class EliminationCode(RodCode):
         with self._places(self.pieces) as j:
             known = self._slopes_at(j)
             results = [(self.factor, [(k, el.factors[k]) for k in factors])]
-            if self.has_entries:
+            if self.keeps_both:
                 results += [(self.entries, [(k, el.matrix[el.entries[k]]) for k in entries])]
-            if not self.batch:
+            if self.has_matrix:
                 inside = itertools.product(block, block)
                 results += [(self.wide_matrix, [(c * n + i, el.matrix[i, c]) for i, c in inside])]
             f.evaluate(el.program, outputs, known, self.L, stores=self._stores(results, j))
@@ -309,6 +314,10 @@ class EliminationCode(RodCode):
                     f.store(value, column, self.at_tip.at(row, 0), self.L)
         self._write_inverse()
 
+    def _of_X(self, row: int, column: int) -> int:
+        """Return the component of an entry of X."""
+        return column * self._padded(self.equations.ny) + row
+
     def _write_inverse(self) -> None:
         """The inverse of M X, by orthogonal columns (Gram-Schmidt), in the units of the residual.
 
@@ -385,7 +394,7 @@ class EliminationCode(RodCode):
         values = self._evaluated([node for *_, node in self.base_slopes], 0, False, state)
         for (i, c, _), value in zip(self.base_slopes, values, strict=True):
             strand, row = divmod(i, e.ny)
-            self._put(value, self.X, c % self.own * self._padded(e.ny) + row, self.bases[strand])
+            self._put(value, self.X, self._of_X(row, c % self.own), self.bases[strand])
         state = self._tip_state(self.y, self.H)
         values = self._evaluated([node for *_, node in self.tip_slopes], 0, False, state)
         for (i, c, _), value in zip(self.tip_slopes, values, strict=True):
@@ -413,19 +422,35 @@ class EliminationCode(RodCode):
             strand, i = divmod(k, self.own)
             self._put(self._get(self.alpha, i, strand), self.step_unknowns, k)
 
-    def _write_filling(self, turns: Any, residual: Function) -> None:
-        """Corrections of y at points between nodes (see `StepProblem.filled`); `residual` is that at y."""
-        f = self._now
-        with f.loop(turns):
-            for function in (self.linearised, residual):
-                f.call(function, f.arguments[0])
+    def _write_filling(self, most: Any, slopes: Function, rates: Function) -> None:
+        """Corrections of y at points between nodes (see `StepProblem.filled`), at most `most` in a segment.
+
+        `slopes` and `rates` are functions at a place. The first corrections for each point have new factors.
+        """
+        f, ny = self._now, self.equations.ny
+        left, turns = Variable(f, f.value(float("inf"))), Variable(f, f.value(0, "i64"))
+        with f.while_(lambda: (left.get() > FILLED) & (turns.get() < most * FILLING)):
+            turn = f.result(f"srem i64 {turns.get().name}, {FILLING}", "i64")
+            with f.if_(turn < RENEWALS):
+                self._write_places(slopes, self.y, self.H, slopes=True)
+                self._write_ends(self.slope, self.slope_end)
+                for function in self.factors:
+                    f.call(function, f.arguments[0])
+            with f.if_(~(turn < RENEWALS)):
+                self._write_places(rates, self.y, self.H)
+            self._write_defects(self.y, self.H)
             with self._places(self.pieces) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
                 f.call(self.solved, f.arguments[0], *points, j.value)
+            largest = f.value(0.0)
             for point in (base + int(cut) for base in self.bases for cut in self.grid.between):
-                for i in range(self.equations.ny):
+                for i in range(ny):
                     change = self._get(self.wide_added, i, point - 1)
                     self._put(self._get(self.y, i, point) + change, self.y, i, point)
+                    unit = self._get(self.scale_y, i, point if self.strands > 1 else 0)
+                    largest = f.apply("max", largest, f.apply("abs", change) * unit)
+            left.set(largest)
+            turns.set(turns.get() + 1)
 
     def _write_correction(self) -> None:
         """Solve for a correction, from B⁻¹ r of all pieces."""

@@ -281,6 +281,21 @@ class TangentEquations(Equations):
         moved = np.concatenate([nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)])
         grid = grid_of(system, space)
         places = self.geometry[2][: grid.ends + len(space.formula.stages) * grid.tip]
+        #: arrays of moving parameters that are read in memory, with the place of each in their vector
+        self.moving_arrays = {
+            array: int(np.searchsorted(moved, nodes.flat[0]))
+            for nodes in self.parameters
+            if (array := self.program.known_inputs(nodes)) is not None and np.isin(nodes, moved).all()
+        }
+        moves = [*moved, *self.moving_arrays]
+        self.moves_lengths = bool(self.program.dependent(self.geometry[3], moves))
+        moves += [self.s.item()] if self.program.dependent(places, moves) else []
+        moved_nodes = self.program.dependent([*itertools.chain(*results.values())], moves)
+        #: numbers of the results that move with the system at fixed y
+        self.moving_rows = {
+            name: [i for i, node in enumerate(nodes) if node in moved_nodes]
+            for name, nodes in results.items()
+        }
         (self._pull if transposed else self._push)(results, moved, places)
 
     def _push(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
@@ -321,12 +336,6 @@ class TangentEquations(Equations):
 
     def _pull(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
         program = self.program
-        #: arrays of moving parameters that are read in memory, with the place of each in their vector
-        self.moving_arrays = {
-            array: int(np.searchsorted(moved, nodes.flat[0]))
-            for nodes in self.parameters
-            if (array := program.known_inputs(nodes)) is not None and np.isin(nodes, moved).all()
-        }
         moving = [*moved, *self.moving_arrays]
         #: cotangents of the results
         self.cotangents = {

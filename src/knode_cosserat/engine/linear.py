@@ -14,19 +14,32 @@ from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.memory import Array, Memory
 
 
+@dataclasses.dataclass(frozen=True)
+class Columns:
+    """Numbers outside of the memory at an address, those of all vectors side by side."""
+
+    base: Value
+    width: Value
+
+    @property
+    def key(self) -> Any:
+        """A key that is equal for the same numbers."""
+        return self.base.name
+
+
 class Number(NamedTuple):
     """Component i of an array at place j; without an array, a number of one straight piece of a map."""
 
-    array: Array | None
+    array: Array | Columns | None
     i: int
     j: int | Index = 0
 
     @property
     def key(self) -> Any:
         """A key that is equal for the same number."""
-        own = None if self.array is None else (self.array.offset, self.array.memory)
-        j = self.j
-        return own, self.i, j if isinstance(j, int) else j.key
+        array, i, j = self
+        own = (array.offset, array.memory) if isinstance(array, Array) else array and array.key
+        return own, i, j if isinstance(j, int) else j.key
 
 
 Coefficient = Number | Value | float
@@ -59,6 +72,18 @@ class Scale:
 
 
 @dataclasses.dataclass(frozen=True)
+class Show:
+    """Copy a number to one that no other operation reads or writes."""
+
+    target: Number
+    source: Number
+
+    def transposed(self) -> Add:
+        """Return the transposed operation."""
+        return Add(self.source, self.target)
+
+
+@dataclasses.dataclass(frozen=True)
 class Loop:
     """Operations at each place from `start` to below `stop`, in this order or, if it descends, in reverse."""
 
@@ -68,60 +93,96 @@ class Loop:
     descends: bool = False
 
 
-Operation = Add | Scale | Loop
+Straight = Add | Scale | Show
+Operation = Straight | Loop
 
 
 def write(memory: Memory, operations: Sequence[Operation], lanes: int, transposed: bool) -> None:
     """Write the code of a map, with as many vectors side by side as there are lanes."""
-    straight: list[Add | Scale] = []
+    sums = _Sums(memory, lanes)
     for operation in reversed(operations) if transposed else operations:
         if not isinstance(operation, Loop):
-            straight.append(operation.transposed() if transposed else operation)
+            sums.add(operation.transposed() if transposed else operation)
             continue
-        _write_straight(memory, straight, lanes)
-        straight = []
+        sums.write_all()
         start, stop, f = operation.start, operation.stop, memory._now
         down = operation.descends != transposed
         with f.loop(start, stop + (-1), -1) if down else f.loop(stop, start) as j:
             write(memory, operation.body(j), lanes, transposed)
-    _write_straight(memory, straight, lanes)
+    sums.write_all()
 
 
-def _write_straight(memory: Memory, operations: Sequence[Add | Scale], lanes: int) -> None:
-    """Write operations without loops: each number is read once and written once."""
-    values: dict[Any, Value | None] = {}
-    changed: dict[Any, tuple[Array, int, int | Index]] = {}
+class _Sums:
+    """Operations without loops that are still to be written, by the numbers that they change.
 
-    def get(number: Number) -> Value | None:
-        """Return the value of a number; None is zero."""
-        if number.key not in values:
-            array, i, j = number
-            values[number.key] = None if array is None else memory._get(array, i, j, lanes)
-        return values[number.key]
+    A sum is written when its number is needed, or before a number changes that it needs: each number is read
+    once and written once for all that is added to it, whatever the order of the operations.
+    """
 
-    def times(coefficient: Coefficient, value: Value) -> Value:
-        if isinstance(coefficient, Number):
-            assert coefficient.array is not None
-            coefficient = memory._get(coefficient.array, coefficient.i, coefficient.j, 1)
-        return value if coefficient == 1.0 else coefficient * value
+    def __init__(self, memory: Memory, lanes: int):
+        self._memory, self._lanes = memory, lanes
+        self._waiting: dict[Any, list[Straight]] = {}
+        #: numbers that wait for the present value of a number
+        self._readers: dict[Any, set[Any]] = {}
+        #: values of numbers without an array; zero until they are set
+        self._values: dict[Any, Value | None] = {}
 
-    for operation in operations:
-        target = operation.target
-        if target.array is not None:
-            changed[target.key] = target.array, target.i, target.j
-        coefficient = operation.coefficient
-        value = None if coefficient is None else get(target)
-        if isinstance(operation, Scale):
-            values[target.key] = None if coefficient is None or value is None else times(coefficient, value)
-            continue
-        source = get(operation.source)
-        if source is None:
-            continue
-        product = times(operation.coefficient, source)
-        if value is None:
-            values[target.key] = -product if operation.is_negative else product
+    def add(self, operation: Straight) -> None:
+        """Keep an operation until its result is needed."""
+        target = operation.target.key
+        if not isinstance(operation, Scale):
+            self._write(operation.source.key)
+            self._readers.setdefault(operation.source.key, set()).add(target)
+        for reader in self._readers.pop(target, ()):
+            self._write(reader)
+        if isinstance(operation, Scale) and operation.coefficient is None:
+            self._waiting.pop(target, None)
+        self._waiting.setdefault(target, []).append(operation)
+
+    def write_all(self) -> None:
+        """Write all operations."""
+        for target in list(self._waiting):
+            self._write(target)
+
+    def _write(self, key: Any) -> None:
+        operations = self._waiting.pop(key, None)
+        if operations is None:
+            return
+        target, value = operations[0].target, self._initial(operations[0])
+        for operation in operations:
+            value = self._after(value, operation)
+        if target.array is None:
+            self._values[key] = value
         else:
-            values[target.key] = value - product if operation.is_negative else value + product
-    for key, place in changed.items():
-        value = values[key]
-        memory._put(0.0 if value is None else value, *place, lanes)
+            self._memory._put(0.0 if value is None else value, *target, self._lanes)
+
+    def _initial(self, operation: Straight) -> Value | None:
+        is_set = isinstance(operation, Show) or (
+            isinstance(operation, Scale) and operation.coefficient is None
+        )
+        return None if is_set else self._get(operation.target)
+
+    def _after(self, value: Value | None, operation: Straight) -> Value | None:
+        """Return the value of a number after an operation; None is zero."""
+        if isinstance(operation, Show):
+            return self._get(operation.source)
+        if isinstance(operation, Scale):
+            scaled = value is not None and operation.coefficient is not None
+            return self._times(operation.coefficient, value) if scaled else None
+        source = self._get(operation.source)
+        if source is None:
+            return value
+        product = self._times(operation.coefficient, source)
+        if value is None:
+            return -product if operation.is_negative else product
+        return value - product if operation.is_negative else value + product
+
+    def _get(self, number: Number) -> Value | None:
+        if number.array is None:
+            return self._values.get(number.key)
+        return self._memory._get(*number, self._lanes)
+
+    def _times(self, coefficient: Coefficient, value: Value) -> Value:
+        if isinstance(coefficient, Number):
+            coefficient = self._memory._get(*coefficient, 1)
+        return value if coefficient == 1.0 else coefficient * value

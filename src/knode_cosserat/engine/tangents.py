@@ -7,22 +7,19 @@ tangents in lanes. Cotangents pass through the transposed maps, from the last st
 
 from __future__ import annotations
 
-import functools
 import itertools
-import operator
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.engine.codegen import Index, Value
-from knode_cosserat.engine.elimination import EliminationCode
-from knode_cosserat.engine.equations import Nonzeros, TangentEquations
-from knode_cosserat.engine.linear import Add, Loop, Number, Operation, Scale, write
+from knode_cosserat.engine.codegen import Index, Value, Variable
+from knode_cosserat.engine.equations import Nonzeros
+from knode_cosserat.engine.linear import Add, Columns, Number, write
 from knode_cosserat.engine.memory import Array
+from knode_cosserat.engine.step_map import COLUMNS, STATE, StepMap
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.problem import FILLING
 from knode_cosserat.solvers.settings import Settings
 
 
@@ -40,94 +37,35 @@ class SolvedSteps(NamedTuple):
     rate: Float[Any, "used x"]
 
 
-class _Tangents(NamedTuple):
-    """Arrays of the tangents of a step, or of their cotangents."""
-
-    #: the step's data: records and rate before it, control
-    records: list[Array]
-    rate: Array
-    control: Array
-    #: history terms; rates and strains, those at ends of pieces, y behind jumps and at stages, lengths,
-    #: defects of pieces and tip, and y at the bases, at fixed y
-    history: Array
-    rates: Array
-    far: Array
-    ends: Array
-    between: Array
-    lengths: Array
-    r: Array
-    tip: Array
-    base: Array
-    #: y along the strands without the changes of the unknowns, and those of each strand's groups of pieces
-    w: Array
-    alpha: Array
-    beta: Array
-    #: the solution: y, the change of rates by it, the new records, row and unknowns
-    y: Array
-    change: Array
-    newest: Array
-    row: Array
-    unknowns: Array
-
-
-class _TangentCode(EliminationCode):
+class _TangentCode(StepMap):
     """Code of the derivatives of a system's solved steps, by all data of a step.
 
     The system changes in its `moving` parameters, a mask for each of its leaves. Functions are written by
     subclasses, forward for many tangents side by side or transposed for one cotangent.
     """
 
-    equations: TangentEquations
     transposed: bool
-    has_entries = True
 
     def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray]):
-        self.settings = settings
-        super().__init__(TangentEquations(system, moving, self.transposed, settings.space), False)
+        super().__init__(system, settings, moving, self.transposed)
         e, a = self.equations, self._array
-        ny, nx, numbers, k = e.ny, e.ny + e.nz, e.numbers, e.k
-        memory = range(settings.memory)
-        self.records, self.rate = [a(numbers, self.used) for _ in memory], a(numbers, self.used)
-        # derivatives at all places
-        self.z_by_y = a(len(e.z_by_y), self.used)
-        self.places = {"rates": self.used, "far": self.pieces, "tip": 1, "base": 1}
-        self.by_history = {name: a(len(e.by_history[name]), n) for name, n in self.places.items()}
-        self.by_control = {name: a(len(e.by_control[name]), n) for name, n in self.places.items()}
         self.jumps += [
-            (self.by_history["far"], _nodes(e.by_history["far"])),
-            (self.by_control["far"], _nodes(e.by_control["far"])),
+            (array, _nodes(nonzeros["far"]))
+            for array, nonzeros in (
+                (self.by_history["far"], e.by_history),
+                (self.by_control["far"], e.by_control),
+            )
         ]
+        # the solved motion
+        self.records = [a(e.numbers, self.used) for _ in range(settings.memory)]
+        self.rate = a(e.numbers, self.used)
         #: stages of the pieces between strands
         self.idle = [first + tip for first in self.stages for tip in self.tips[:-1]]
-        #: number of tangents side by side, and an array of them
-        self.columns = 1 if self.transposed else self.L
-        many = a if self.transposed else self._tangent_array
-        whole, self._size = self._size, 0
-        records, rate = [many(numbers, self.used, 1) for _ in memory], many(numbers, self.used, 1)
-        self._reserve_state()
-        self.state_size, self._size = self._size, whole
-        groups = self.groups[1] * self.strands
-        #: component of a packed row for each number of each strand's record
-        self.packed = e.by_strand(np.arange(self.strands * numbers))
-        self.tangents = _Tangents(
-            records, rate, many(e.nc, 1), many(numbers, self.used), many(nx, self.used),
-            many(ny, self.pieces), many(ny, self.pieces), many(ny, self.used - self.ends),
-            many(1, self.pieces), many(ny, self.pieces), many(k, 1), many(ny * self.strands, 1),
-            many(ny, self.points), many(self.own, groups + self.strands), many(self.own, groups),
-            many(ny, self.points), many(ny, self.used), many(numbers, self.used),
-            many(self.packed.size, len(self.grid.nodes)), many(k, 1),
-        )  # fmt: skip
-        #: the results of the equations at fixed y, by the names of their derivatives
-        t = self.tangents
-        self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
         #: arrays of further values of the rates, and their nodes
         self.shared = list[tuple[Array, Any]]()
         self._reserve_products()
         self._write()
         self._functions = self.module.compile()
-
-    def _reserve_state(self) -> None:
-        """Reserve arrays that last from step to step, for each column."""
 
     def _reserve_products(self) -> None:
         """Reserve arrays of the products of derivatives by the system."""
@@ -142,13 +80,14 @@ class _TangentCode(EliminationCode):
             (self.by_control["rates"], _nodes(e.by_control["rates"])),
         ]  # fmt: skip
         self.rates_and_slopes = self._write_rates("rates_and_slopes", slopes + self.shared)
-        self.solved = self._write_solved()
         self._write_factor()
-        self.advance = self._write_advance()
         self._write_along()
         self._write_linearise()
-        self.defects = self._function("defects")
-        self._write_defects(self.y, self.H)
+        if self.transposed or len(self.grid.between):
+            self.rates = self._write_rates("rates")
+        if len(self.grid.between):
+            self.solved = self._write_solved()
+            self.slopes = self._write_rates("slopes", [(self.slope, e.nonzeros)])
         self._write_data()
         self._write_solution()
         self._write_derivatives()
@@ -170,11 +109,6 @@ class _TangentCode(EliminationCode):
         for i in range(e.k):
             self._put(f.load(unknowns, i), self.unknowns, i)
 
-    @property
-    def _history_weights(self) -> range:
-        """Numbers of the coefficients of records and, if the scheme uses it, of the rate."""
-        return range(1, 1 + self.settings.memory + self.settings.uses_rate)
-
     def _write_solution(self) -> None:
         """The solution y at all points, from its row at the nodes (see `StepProblem.filled`)."""
         e, grid = self.equations, self.grid
@@ -193,7 +127,8 @@ class _TangentCode(EliminationCode):
             for i in range(e.ny):
                 low, high = self._get(self.y, i, start), self._get(self.y, i, end)
                 self._put(low + part * (high - low), self.y, i, point)
-        self._write_filling(FILLING * (int(np.max(np.diff(grid.nodes))) - 1), self.defects)
+        most = int(np.max(np.diff(grid.nodes))) - 1
+        self._write_filling(f.value(most, "i64"), self.slopes, self.rates)
 
     def _write_derivatives(self) -> None:
         """The derivatives of a step at its solution."""
@@ -255,296 +190,45 @@ class _TangentCode(EliminationCode):
                     place = {self.equations.s.item(): self._wide(self.s, 0, j + first)}
                     yield j + first, self._inside(j, count), self._state(y, self.H, j, j + first) | place
 
-    # the linear map of a step
-
-    def _by_data(self, name: str, j: Any, places: Sequence[Any]) -> list[Operation]:
-        """Set results at fixed y, by the history at a place of each strand, and by the control."""
-        e, t, target = self.equations, self.tangents, self.results[name]
-        found: list[Operation] = [Scale(Number(target, i, j)) for i in range(target.size)]
-        for nonzeros, matrix, source, at in (
-            (e.by_history[name], self.by_history[name], t.history, places),
-            (e.by_control[name], self.by_control[name], t.control, (0,)),
-        ):
-            for n, (i, c, _) in enumerate(nonzeros):
-                strand, component = divmod(c, source.size)
-                number = Number(source, component, at[strand])
-                found.append(Add(Number(target, i, j), number, Number(matrix, n, j)))
-        return found
-
-    def _at_fixed_y(self, coefficients: Value) -> list[Operation]:
-        """Return the map from the data to the results at fixed y; the system does not change."""
-        t, f = self.tangents, self._now
-        weights = [f.load(coefficients, k) for k in self._history_weights]
-
-        def at_place(j: Index) -> list[Operation]:
-            found = list[Operation]()
-            for i in range(t.history.size):
-                found.append(Scale(Number(t.history, i, j)))
-                for part, weight in zip((*t.records, t.rate), weights, strict=False):
-                    found.append(Add(Number(t.history, i, j), Number(part, i, j), weight))
-            return found + self._by_data("rates", j, [j])
-
-        def behind(j: Index) -> list[Operation]:
-            return [Scale(Number(t.lengths, 0, j)), *self._by_data("far", j, [j])]
-
-        return [
-            Loop(0, self.used, at_place), Loop(0, self.pieces, behind),
-            *self._by_data("tip", 0, self.tips), *self._by_data("base", 0, self.bases),
-        ]  # fmt: skip
-
-    def _solution_and_records(self, coefficients: Value) -> list[Operation]:
-        """Return the map from the results at fixed y to the solution, and to the records after the step."""
-        e, t, formula = self.equations, self.tangents, self.space.formula
-        near = [(self.points + k, point) for k, point in enumerate(self.near)]
-        stages = list(zip(formula.stages, self.stages, strict=True))
-
-        def slopes_by(target: tuple[Array, Any], source: Any, place: Any) -> list[Operation]:
-            """Add the product of the rates' derivatives at a place with numbers."""
-            return [
-                Add(Number(target[0], i, target[1]), source(c), Number(self.slope, n, place))
-                for n, (i, c) in enumerate(e.pattern)
-            ]
-
-        def at_ends(rates: Array) -> list[Operation]:
-            """Copy rates to the ends of pieces."""
-            found: list[Operation] = [
-                Loop(0, self.pieces, lambda j: _copies(e.ny, (t.ends, j), (rates, j + 1)))
-            ]
-            for place, point in near:
-                found += _copies(e.ny, (t.ends, point - 1), (rates, place))
-            return found
-
-        def increment(weights: Sequence[float], target: Any, rates: Array, j: Index) -> list[Operation]:
-            """Add h times the weighted sum of a piece's rates: at its start, its end and its stages."""
-            h, found = self._get(self.h, 0, j), list[Operation]()
-            places = (rates, j), (t.ends, j), *((rates, j + first) for first in self.stages)
-            for weight, (array, place) in zip(weights, places, strict=False):
-                if weight:
-                    own = h * weight
-                    found += [Add(target(i), Number(array, i, place), own) for i in range(e.ny)]
-            return found
-
-        def by_length(weights: Sequence[float], target: Any, j: Index) -> list[Operation]:
-            """Add the weighted sum of a piece's rates times the tangent of its length."""
-            places = self._places_of((self.f, self.fe), j)
-            found = list[Operation]()
-            for i in range(e.ny):
-                parts = [
-                    weight * self._get(array, i, place)
-                    for weight, (array, place) in zip(weights, places, strict=False)
-                    if weight
-                ]
-                if parts:
-                    rate = functools.reduce(operator.add, parts)
-                    found.append(Add(target(i), Number(t.lengths, 0, j), rate))
-            return found
-
-        def moved(j: Index) -> list[Operation]:
-            return slopes_by((t.rates, j), lambda c: Number(t.far, c, j), j)
-
-        def between(k: int, j: Index) -> list[Operation]:
-            """Set y at a stage at fixed y, and add its part of the rates there."""
-            (stage, first), at = stages[k], j + k * self.pieces
-            own = [Number(t.between, i, at) for i in range(e.ny)]
-            found: list[Operation] = [Scale(number) for number in own]
-            if self.far is not None:
-                found += [Add(own[i], Number(t.far, i, j), 1.0 - stage.end) for i in range(e.ny)]
-            found += by_length(stage.rates, own.__getitem__, j)
-            found += increment(stage.rates, own.__getitem__, t.rates, j)
-            return found + slopes_by((t.rates, j + first), own.__getitem__, j + first)
-
-        def defect(j: Index) -> list[Operation]:
-            r = [Number(t.r, i, j) for i in range(e.ny)]
-            found: list[Operation] = [Scale(number) for number in r]
-            found += [Add(r[i], Number(t.far, i, j)) for i in range(e.ny)]
-            found += by_length(formula.weights, r.__getitem__, j)
-            return found + increment(formula.weights, r.__getitem__, t.rates, j)
-
-        found: list[Operation] = [Loop(0, self.pieces, moved)] if e.jumping else []
-        found += at_ends(t.rates)
-        found += [Loop(0, self.pieces, functools.partial(between, k)) for k in range(len(stages))]
-        found.append(Loop(0, self.pieces, defect))
-        found += self._correction()
-
-        def jumped(j: Index) -> list[Operation]:
-            own = [(i, c, 0) for i, c, _ in e.jumping]
-            return _products(own, (self.jump, j), (t.newest, j), (t.y, j))
-
-        def changed(j: Index) -> list[Operation]:
-            """Set the change of rates at ends of pieces by y."""
-            found: list[Operation] = [Scale(Number(t.change, i, j)) for i in range(e.ny)]
-            return found + slopes_by((t.change, j), lambda c: Number(t.newest, c, j), j)
-
-        def solved_between(k: int, j: Index) -> list[Operation]:
-            """Add the change of y at a stage, and set that of the rates there."""
-            (stage, first), at = stages[k], j + k * self.pieces
-            own = [Number(None, i) for i in range(e.ny)]
-            found = list[Operation]()
-            for i in range(e.ny):
-                found.append(Add(own[i], Number(t.newest, i, j), 1.0 - stage.end))
-                found.append(Add(own[i], Number(t.y, i, j + 1), stage.end))
-            found += increment(stage.rates, own.__getitem__, t.change, j)
-            found += [Scale(Number(t.change, i, j + first)) for i in range(e.ny)]
-            found += slopes_by((t.change, j + first), own.__getitem__, j + first)
-            found += [Add(Number(t.between, i, at), own[i]) for i in range(e.ny)]
-            return found + _copies(e.ny, (t.newest, j + first), (t.between, at))
-
-        found.append(Loop(0, self.points, lambda j: _copies(e.ny, (t.newest, j), (t.y, j))))
-        if e.jumping:
-            found.append(Loop(0, self.pieces, jumped))
-        for place, point in near:
-            found += _copies(e.ny, (t.newest, place), (t.y, point))
-        if stages or self.equations.system.mixed:
-            found += [Loop(0, self.ends, changed), *at_ends(t.change)]
-            found += [Loop(0, self.pieces, functools.partial(solved_between, k)) for k in range(len(stages))]
-        if self.far is not None:
-            found.append(
-                Loop(
-                    0, self.pieces,
-                    lambda j: [Add(Number(t.newest, i, j), Number(t.far, i, j)) for i in range(e.ny)],
-                )
-            )  # fmt: skip
-        c0 = self._now.load(coefficients, 0)
-
-        def recorded(j: Index) -> list[Operation]:
-            found = _copies(e.nz, (t.newest, j), (t.rates, j), e.ny)
-            strains = [(e.ny + i, c, node) for i, c, node in e.z_by_y]
-            found += _products(strains, (self.z_by_y, j), (t.newest, j), (t.newest, j))
-            for i in range(e.numbers - e.ny - e.nz):
-                rate = Number(t.newest, e.ny + e.nz + i, j)
-                found += [Scale(rate), Add(rate, Number(t.rates, i, j)), Add(rate, Number(t.change, i, j))]
-            if self.settings.uses_rate:
-                found += _copies(e.numbers, (t.rate, j), (t.history, j))
-                for i in range(e.numbers):
-                    found.append(Add(Number(t.rate, i, j), Number(t.newest, i, j), c0))
-            for newer, older in reversed(list(itertools.pairwise(t.records))):
-                found += _copies(e.numbers, (older, j), (newer, j))
-            return found + _copies(e.numbers, (t.records[0], j), (t.newest, j))
-
-        def shown(node: Index) -> list[Operation]:
-            point = self._node(node)
-            return _set(
-                (
-                    Number(t.row, int(component), node),
-                    Number(t.y if i < e.ny else t.newest, i, point + self.bases[q]),
-                )
-                for (q, i), component in np.ndenumerate(self.packed)
-            )
-
-        found += [Loop(0, self.used, recorded), Loop(0, len(self.grid.nodes), shown)]
-        return found + _set(
-            (Number(t.unknowns, c), Number(t.alpha, c % self.own, c // self.own * (self.groups[1] + 1)))
-            for c in range(e.k)
-        )
-
-    def _correction(self) -> list[Operation]:
-        """Return the map from the defects of pieces and tip, and y at the bases, to y and the unknowns."""
-        e, t, el = self.equations, self.tangents, self.elimination
-        ny, k, own, (size, count) = e.ny, e.k, self.own, self.groups
-        stored = {int(node): n for n, node in enumerate(el.stored)}
-        entries = {at: n for n, at in enumerate(el.entries)}
-
-        def piece(j: Index) -> list[Operation]:
-            end, found = [Number(t.w, i, j + 1) for i in range(ny)], list[Operation]()
-            for i in range(ny):
-                found += [Scale(end[i]), Add(end[i], Number(t.r, i, j))]
-            for i, c in zip(*np.nonzero(el.matrix != el.program.constant(0.0)), strict=True):
-                entry: Any = el.program.values[int(el.matrix[i, c])]
-                if (i, c) in entries:
-                    entry = Number(self.entries, entries[i, c], j)
-                found.append(Add(end[i], Number(t.w, int(c), j), entry))
-            for i, c, node in el.substitution:
-                factor = Number(self.factor, stored[node], j) if node in stored else el.program.values[node]
-                found.append(
-                    Scale(end[i], factor) if i == c else Add(end[i], end[c], factor, is_negative=True)
-                )
-            return found
-
-        def by_unknowns(target: Array, j: Any, source: Array, g: Any, is_negative: bool) -> list[Operation]:
-            found = list[Operation]()
-            for i, c in np.ndindex(ny, own):
-                entry = self._entry_at(self.X, ny, i, c, j)
-                found.append(Add(Number(target, i, j), Number(source, c, g), entry, is_negative))
-            return found
-
-        def group(strand: Index, g: Index) -> list[Operation]:
-            first = strand.value * self.strand_points + g.value * size
-            last, group = self._now.index(first + size), self._now.index(strand.value * count + g.value)
-            pivots = ((Number(t.beta, c, group), Number(t.w, p, last)) for c, p in enumerate(self.pivots))
-            return [
-                Loop(first, last.value, piece), *_set(pivots), *by_unknowns(t.w, last, t.beta, group, True)
-            ]  # fmt: skip
-
-        def solved(g: Any, j: Any) -> list[Operation]:
-            return [*_copies(ny, (t.y, j), (t.w, j)), *by_unknowns(t.y, j, t.alpha, g, False)]
-
-        def group_back(strand: Index, g: Index) -> list[Operation]:
-            first = strand.value * self.strand_points + g.value * size
-            end, group = self._now.index(first + size), self._now.index(strand.value * count + g.value)
-            # a strand has one more alpha
-            alpha = self._now.index(group.value + strand.value)
-            found = solved(alpha + 1, end)
-            for c in range(own):
-                found += [
-                    Scale(Number(t.alpha, c, alpha)),
-                    Add(Number(t.beta, c, group), Number(t.alpha, c, alpha + 1), is_negative=True),
-                ]
-            for i, c in np.ndindex(own, own):
-                entry = self._entry_at(self.T, own, i, c, group)
-                found.append(
-                    Add(Number(t.alpha, i, alpha), Number(t.beta, c, group), entry, is_negative=True)
-                )
-            return [*found, Loop(first + 1, end.value, functools.partial(solved, alpha))]
-
-        def strand_ahead(strand: Index) -> list[Operation]:
-            base = strand.value * self.strand_points
-            return [
-                Loop(0, count, functools.partial(group, strand)),
-                Loop(base + count * size, base + self.grid.tip, piece),
-            ]
-
-        def strand_back(strand: Index) -> list[Operation]:
-            base = self._now.index(strand.value * self.strand_points)
-            first = self._now.index(strand.value * (count + 1))
-            return [
-                Loop(
-                    base.value + (count * size + 1), base.value + self.strand_points,
-                    functools.partial(solved, first + count),
-                ),
-                Loop(0, count, functools.partial(group_back, strand), descends=True), *solved(first, base),
-            ]  # fmt: skip
-
-        bases = ((Number(t.w, i % ny, self.bases[i // ny]), Number(t.base, i)) for i in range(t.base.size))
-        at_tip = list[Operation]()
-        for i, c, _ in self.tip_slopes:
-            strand, component = divmod(c, ny)
-            entry = self._entry_at(self.M, k, i, component, strand)
-            at_tip.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))
-        alpha = [Number(t.alpha, i % own, i // own * (count + 1) + count) for i in range(k)]
-        at_tip += map(Scale, alpha)
-        for i, c in np.ndindex(k, k):
-            entry = self._entry_at(self.inverse, k, i, c)
-            at_tip.append(Add(alpha[i], Number(t.tip, c), entry, is_negative=True))
-        return [
-            *_set(bases), Loop(0, self.strands, strand_ahead), *at_tip, Loop(0, self.strands, strand_back)
-        ]  # fmt: skip
-
-    def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Number:
-        """Return an entry of a matrix with rows in lanes."""
-        return Number(matrix, c * self._padded(rows) + i, j)
-
     # running
 
     def _data_of(self, step: Index, coefficients: Value, *data: Value) -> list[Value]:
         """Return the addresses of a step's coefficients, and of its control, row and unknowns."""
-        f, e = self._now, self.equations
-        sizes = e.nc, self._row_size, e.k
+        f, sizes = self._now, self._sizes
         found = [f.pointer(each, step.value * size) for each, size in zip(data, sizes, strict=True)]
         return [f.pointer(coefficients, step.value * (self.settings.memory + 3)), *found]
 
     @property
-    def _row_size(self) -> int:
-        return len(self.grid.nodes) * self.packed.size
+    def _sizes(self) -> tuple[int, int, int]:
+        """Numbers of a step's control, row and unknowns."""
+        return self.equations.nc, len(self.grid.nodes) * self.packed.size, self.equations.k
+
+    def _places_of_records(self) -> list[Variable]:
+        """Begin a run: return where the records of a state are, from the last one."""
+        return [Variable(self._now, self._now.value(each.offset, "i64")) for each in self.lasting[:-1]]
+
+    def _turn(self, places: list[Variable], last: int) -> None:
+        """Change the places of records between steps; `last` is the one that becomes the last."""
+        values = [each.get() for each in places]
+        for place, value in zip(places, values[last:] + values[:last], strict=True):
+            place.set(value)
+
+    def _lasting(self, states: np.ndarray, lanes: int, turns: int = 0) -> np.ndarray:
+        """Return records and rate (m, lanes, memory + 1, places, numbers) of states: a view before turns."""
+        first, second = self.lasting[:2]
+        strides = self.state_size, 1, second.offset - first.offset, first.place, first.component
+        found = np.lib.stride_tricks.as_strided(
+            states[:, first.offset :], (len(states), lanes, len(self.lasting), self.used, first.size),
+            [8 * each for each in strides],
+        )  # fmt: skip
+        memory = self.settings.memory
+        turned = [*((k + turns) % memory for k in range(memory)), memory]
+        return found[:, :, turned] if turns else found
+
+    def _write_step(self, state: Value, places: list[Variable], *arguments: Any) -> None:
+        f = self._now
+        records = [f.pointer(state, place.get()) for place in places]
+        f.call(self.step, f.arguments[0], state, *records, *arguments)
 
     def _begun(self, solved: SolvedSteps) -> list[np.ndarray]:
         """Return the memory before a run, controls, coefficients, rows and unknowns."""
@@ -564,7 +248,7 @@ class TangentCore(_TangentCode):
 
     def _reserve_state(self) -> None:
         #: added to the residual of the tip's conditions
-        self.added_tip = self._tangent_array(self.equations.k, 1, 1)
+        self.added_tip = self._columns(self.equations.k, 1, STATE)
 
     def _reserve_products(self) -> None:
         e, a = self.equations, self._array
@@ -573,8 +257,8 @@ class TangentCore(_TangentCode):
         whole, self._size = self._size, 0
         # of one direction of the system
         self.dparameters = a(len(e.dparameters), memory=1)
-        self.ds, self.dh = a(1, self.used, 1), a(1, self.pieces, 1)
-        self.moved = {name: a(len(nodes), self.places[name], 1) for name, nodes in e.moved.items()}
+        self.ds, self.dh = a(1, self.used, 1), a(1, self.pieces if e.moves_lengths else 0, 1)
+        self.moved = {name: a(len(rows), self.places[name], 1) for name, rows in e.moving_rows.items()}
         self.direction_size, self._size = self._size, whole
 
     def _write(self) -> None:
@@ -582,6 +266,10 @@ class TangentCore(_TangentCode):
         self._write_direction()
         self._write_tangents()
         self._write_run()
+
+    def _moved_nodes(self, name: str) -> list[int]:
+        """Return the nodes of the tangents of results by the system, those that are not always zero."""
+        return [self.equations.moved[name][i] for i in self.equations.moving_rows[name]]
 
     def _write_direction(self) -> None:
         """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
@@ -591,58 +279,57 @@ class TangentCore(_TangentCode):
         moves = self._inputs_of(self.dparameters, [e.dparameters], every)
         values = self._terms_known(every, moves)
         for array, nodes in ((self.ds, self._of_places(e.dplaces)), (self.dh, self._of_pieces(e.dlengths))):
-            for k, node in nodes:
+            for k, node in nodes if array.count else ():
                 self._put(values[node], array, 0, k)
         known = {node: values[node] for node in e.moved_terms} | moves
         for name in ("rates", "far"):
-            for j, _, here in self._states_at(name) if e.moved[name] else ():
+            for j, _, here in self._states_at(name) if e.moving_rows[name] else ():
                 here |= known
                 if name == "rates":
                     here |= {node: self._wide(self.common, i, j) for i, node in enumerate(e.common)}
                     here[e.ds.item()] = self._wide(self.ds, 0, j)
-                self._write_results([(self.moved[name], e.moved[name])], j, here)
+                self._write_results([(self.moved[name], self._moved_nodes(name))], j, here)
         for name, here in self._end_states():
-            for i, value in enumerate(self._evaluated(e.moved[name], 0, False, here | known)):
+            for i, value in enumerate(self._evaluated(self._moved_nodes(name), 0, False, here | known)):
                 self._put(value, self.moved[name], i)
 
     def _write_tangents(self) -> None:
         """Tangents of the step, of as many columns as there are lanes."""
-        e, L, t = self.equations, self.L, self.tangents
-        arguments = ["state", "directions", "weights", "d_control", "coefficients", "row", "unknowns"]
-        self.step = f = self._function("step", *arguments, "n_directions", "n_columns")
-        _, _, directions, weights, d_control, coefficients, row, d_unknowns, count, width = f.arguments
-        for i in range(e.nc):
-            self._put(f.load(d_control, width * i, L), t.control, i, 0, L)
-        at_tip = [Add(Number(t.tip, i), Number(self.added_tip, i)) for i in range(e.k)]
-        write(self, [*self._at_fixed_y(coefficients), *at_tip], L, False)
+        t, records = self.tangents, [f"record{k}" for k in range(self.settings.memory)]
+        arguments = ["coefficients", "control", "row", "unknowns", "directions", "weights"]
+        self.step = f = self._function("step", "state", *records, *arguments, "n_directions", "n_columns")
+        coefficients, *data, directions, weights, count, width = f.arguments[2 + len(records) :]
+        control, row, unknowns = (Columns(each, width) for each in data)
+        at_tip = [Add(Number(t.tip, i), Number(self.added_tip, i)) for i in range(self.equations.k)]
+        write(self, [*self._at_fixed_y(coefficients, control), *at_tip], COLUMNS, False)
         with f.loop(count) as d:
             own = f.pointer(directions, d.value * self.direction_size)
-            weight = f.load(weights, d.value * width, L)
+            weight = f.load(weights, d.value * width, COLUMNS)
             with f.if_(f.any(f.apply("abs", weight) > 0.0)):
-                for source, target in (
-                    *((self.moved[name], target) for name, target in self.results.items()),
-                    (self.dh, t.lengths),
-                ):
-                    with f.loop(source.count) as j:
-                        for i in range(source.size):
-                            number = f.load(j.address(own, source.place), source.at(i, 0))
-                            self._put(self._get(target, i, j, L) + weight * number, target, i, j, L)
-        write(self, self._solution_and_records(coefficients), L, False)
-        with f.loop(len(self.grid.nodes)) as node:
-            at = f.pointer(row, node.value * width * t.row.size)
-            for i in range(t.row.size):
-                f.store(self._get(t.row, i, node, L), at, width * i, L)
-        for i in range(e.k):
-            f.store(self._get(t.unknowns, i, 0, L), d_unknowns, width * i, L)
+                self._write_moved(own, weight)
+        write(self, self._solution(coefficients, row, unknowns), COLUMNS, False)
+
+    def _write_moved(self, direction: Value, weight: Value) -> None:
+        """Add a direction of the system to the results at fixed y, with a weight in each column."""
+        f, e = self._now, self.equations
+        parts = [(self.moved[name], e.moving_rows[name], target) for name, target in self.results.items()]
+        for source, rows, target in (*parts, (self.dh, [0], self.tangents.lengths)):
+            if not source.size or (source is self.dh and not e.moves_lengths):
+                continue
+            with f.loop(source.count) as j:
+                for k, i in enumerate(rows):
+                    number = f.load(j.address(direction, source.place), source.at(k, 0))
+                    moved = self._get(target, i, j, COLUMNS) + weight * number
+                    self._put(moved, target, i, j, COLUMNS)
 
     def _write_run(self) -> None:
         """All solved steps in turn; tangents have `n_columns` columns, a multiple of the lanes."""
-        e, L = self.equations, self.L
         names = ["memory", "controls", "coefficients", "rows", "unknowns", "directions", "states", "weights"]
         names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_directions", "n_columns"]
         f = self._now = self.module.function("run", names, exported=True)
         memory, controls, coefficients, rows, unknowns, directions, states, weights = f.arguments[:8]
-        d_controls, d_rows, d_unknowns, steps, count, width = f.arguments[8:]
+        *moved, steps, count, width = f.arguments[8:]
+        places = self._places_of_records()
         f.call(self.setup, memory)
         with f.loop(steps) as step:
             table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
@@ -651,18 +338,19 @@ class TangentCore(_TangentCode):
             f.call(self.derivatives, memory)
             with f.loop(count) as d:
                 f.call(self.direction, memory, f.pointer(directions, d.value * self.direction_size))
-            own = f.pointer(d_controls, step.value * width * e.nc)
-            d_row = f.pointer(d_rows, step.value * width * self._row_size)
-            d_unknown = f.pointer(d_unknowns, step.value * width * e.k)
-            with f.loop(width, 0, L) as first:
-                parts = (f.pointer(each, first.value) for each in (weights, own, d_row, d_unknown))
-                own_weights, own_control, own_row, own_unknowns = parts
-                state = f.pointer(states, first.value * (self.state_size // L))
-                f.call(
-                    self.step, memory, state, directions, own_weights, own_control, table, own_row,
-                    own_unknowns, count, width,
-                )  # fmt: skip
+            starts = [
+                f.pointer(each, step.value * width * size)
+                for each, size in zip(moved, self._sizes, strict=True)
+            ]
+            with f.loop(width, 0, COLUMNS) as first:
+                own = (f.pointer(each, first.value) for each in (*starts, weights))
+                control, row, unknown, weight = own
+                state = f.pointer(states, first.value * (self.state_size // COLUMNS))
+                self._write_step(
+                    state, places, table, control, row, unknown, directions, weight, count, width
+                )
             f.call(self.shift, memory, table)
+            self._turn(places, -1)
 
     def solve(
         self, solved: SolvedSteps, moves: tuple[Any, Any], d_controls: Any, d_states: Any, d_tip: Any = 0.0
@@ -674,43 +362,39 @@ class TangentCore(_TangentCode):
         tangents of the tip's residual. The states returned are those after the last step: records, rate, and
         their tangents.
         """
-        e, L, (d_records, d_rate) = self.equations, self.L, d_states
-        (directions, weights), count = moves, len(solved.controls)
-        m, nodes, places = d_controls.shape[-1], len(self.grid.nodes), len(solved.rate)
+        k, L, (directions, weights), count = self.equations.k, COLUMNS, moves, len(solved.controls)
+        m, places = d_controls.shape[-1], len(solved.rate)
         blocks = -(-m // L)
 
         def filled(values: Any) -> np.ndarray:
             """Return tangents with columns of zeros, so that their number is a multiple of the lanes."""
+            if np.shape(values)[-1] == blocks * L:
+                return np.ascontiguousarray(values, float)
             found = np.zeros((*np.shape(values)[:-1], blocks * L))
             found[..., :m] = values
             return found
 
         begun = self._begun(solved)
-        memory = begun[0]
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
             self._put_in(moved, self.dparameters, directions[:, None, None])
-        tangents = np.zeros((blocks, self.state_size))
-        parts = (*self.tangents.records, self.tangents.rate)
-        for array, values in zip(parts, (*d_records, d_rate), strict=True):
-            columns = filled(values).reshape(places, -1, blocks, L)
-            self._put_in(tangents, array, self._by_strand(array, np.moveaxis(columns, (2, 3), (0, 1))))
-        added = filled(np.broadcast_to(d_tip, (e.k, m))).reshape(1, -1, blocks, L)
-        self._put_in(tangents, self.added_tip, np.moveaxis(added, (2, 3), (0, 1)))
-        shapes = (nodes, self.packed.size), (e.k,)
+        states = _aligned(blocks * self.state_size).reshape(blocks, -1)
+        d_records, d_rate = d_states
+        columns = filled(np.concatenate([d_records, d_rate[None]])).reshape(-1, *d_rate.shape[:2], blocks, L)
+        self._lasting(states, L)[:] = self._by_strand(self.records[0], columns.transpose(3, 4, 0, 1, 2))
+        if np.any(d_tip):
+            added = filled(np.broadcast_to(d_tip, (k, m))).reshape(k, blocks, L).transpose(1, 0, 2)
+            states[:, self.added_tip.offset :][:, : k * L] = added.reshape(blocks, -1)
+        shapes = (len(self.grid.nodes), self.packed.size), (k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
-        arrays = *begun, moved, tangents, filled(weights), filled(d_controls), d_rows, d_unknowns
+        arrays = *begun, moved, states, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._functions["run"](*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
-        after, moved_after = (
-            [self._joined(each, self._numbers(numbers, each), places) for each in arrays]
-            for numbers, arrays in ((memory[None], (*self.records, self.rate)), (tangents, parts))
-        )
-        after = [each[0, 0] for each in after]
-        moved_after = [
-            np.moveaxis(each, (0, 1), (2, 3)).reshape(places, -1, blocks * L)[..., :m] for each in moved_after
-        ]
-        found = np.stack(after[:-1]), after[-1], np.stack(moved_after[:-1]), moved_after[-1]
-        return found, (d_rows[..., :m], d_unknowns[..., :m])
+        motion = (self._numbers(begun[0][None], each)[0, 0] for each in (*self.records, self.rate))
+        *records, rate = (self._joined(self.rate, each, places) for each in motion)
+        columns = self._joined(self.rate, self._lasting(states, L, -count), places).transpose(2, 3, 4, 0, 1)
+        columns = columns.reshape(*columns.shape[:3], blocks * L)[..., :m]
+        after = np.stack(records), rate, columns[:-1], columns[-1]
+        return after, (d_rows[..., :m], d_unknowns[..., :m])
 
 
 class CotangentCore(_TangentCode):
@@ -730,7 +414,6 @@ class CotangentCore(_TangentCode):
 
     def _write(self) -> None:
         super()._write()
-        self.rates = self._write_rates("rates")
         self._write_recorded()
         self._write_products()
         self._write_geometry()
@@ -814,33 +497,23 @@ class CotangentCore(_TangentCode):
 
     def _write_cotangents(self) -> None:
         """Cotangents of a step's data from those of its results."""
-        e, t = self.equations, self.tangents
-        self.step = f = self._function(
-            "step", "state", "coefficients", "control", "row", "unknowns", "n_columns"
-        )
-        memory, state, coefficients, control, row, unknowns, width = f.arguments
-        with f.loop(len(self.grid.nodes)) as node:
-            at = f.pointer(row, node.value * width * t.row.size)
-            for i in range(t.row.size):
-                self._put(f.load(at, width * i), t.row, i, node)
-        for i in range(e.k):
-            self._put(f.load(unknowns, width * i), t.unknowns, i)
-        write(self, self._solution_and_records(coefficients), 1, True)
-        if e.by_terms:
-            f.call(self.pulled, memory, state)
-        write(self, self._at_fixed_y(coefficients), 1, True)
-        for i in range(e.nc):
-            f.store(self._get(t.control, i), control, width * i)
-            self._put(0.0, t.control, i)
+        records = [f"record{k}" for k in range(self.settings.memory)]
+        arguments = ["coefficients", "control", "row", "unknowns", "n_columns"]
+        self.step = f = self._function("step", "state", *records, *arguments)
+        coefficients, *data, width = f.arguments[2 + len(records) :]
+        control, row, unknowns = (Columns(each, width) for each in data)
+        write(self, self._solution(coefficients, row, unknowns), 1, True)
+        if self.equations.by_terms:
+            f.call(self.pulled, *f.arguments[:2])
+        write(self, self._at_fixed_y(coefficients, control), 1, True)
 
     def _write_run(self) -> None:
         """All solved steps in turn, which keeps what each starts from; then their cotangents in reverse."""
-        e = self.equations
         names = ["memory", "controls", "coefficients", "rows", "unknowns", "kept", "states"]
         names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_columns"]
         f = self._now = self.module.function("run", names, exported=True)
-        memory, controls, coefficients, rows, unknowns, kept, states = f.arguments[:7]
-        d_controls, d_rows, d_unknowns, steps, width = f.arguments[7:]
+        memory, controls, coefficients, rows, unknowns, kept, states, *moved, steps, width = f.arguments
+        places = self._places_of_records()
 
         def copy(step: Index, forth: bool) -> None:
             """Keep the arrays that a step starts from, or restore them."""
@@ -866,14 +539,16 @@ class CotangentCore(_TangentCode):
             copy(step, False)
             f.call(self.data, memory, table, control, unknown)
             f.call(self.derivatives, memory)
-            own = f.pointer(d_controls, step.value * width * e.nc)
-            d_row = f.pointer(d_rows, step.value * width * self._row_size)
-            d_unknown = f.pointer(d_unknowns, step.value * width * e.k)
+            self._turn(places, 1)
+            starts = [
+                f.pointer(each, step.value * width * size)
+                for each, size in zip(moved, self._sizes, strict=True)
+            ]
             with f.loop(width) as column:
-                parts = (f.pointer(each, column.value) for each in (own, d_row, d_unknown))
+                own = (f.pointer(each, column.value) for each in starts)
                 state = f.pointer(states, column.value * self.state_size)
-                f.call(self.step, memory, state, table, *parts, width)
-        if e.by_terms:
+                self._write_step(state, places, table, *own, width)
+        if self.equations.by_terms:
             with f.loop(width) as column:
                 f.call(self.by_geometry, memory, f.pointer(states, column.value * self.state_size))
 
@@ -897,48 +572,26 @@ class CotangentCore(_TangentCode):
         """
         begun, count = self._begun(solved), len(solved.controls)
         d_rows, d_unknowns, d_records, d_rate = (np.ascontiguousarray(each, float) for each in cotangents)
-        m, parts = d_rate.shape[-1], (*self.tangents.records, self.tangents.rate)
-        state = np.zeros((m, self.state_size))
-        for array, values in zip(parts, (*d_records, d_rate), strict=True):
-            self._put_in(state, array, self._by_strand(array, np.moveaxis(values, -1, 0))[:, None])
-            # idle pieces have no results
-            for place in self.idle:
-                self._numbers(state, array)[:, :, place] = 0.0
-        d_controls = np.empty((count, self.equations.nc, m))
+        m, places = d_rate.shape[-1], len(d_rate)
+        states = np.zeros((m, self.state_size))
+        columns = np.concatenate([d_records, d_rate[None]]).transpose(3, 0, 1, 2)[:, None]
+        lasting = self._lasting(states, 1)
+        lasting[:] = self._by_strand(self.rate, columns)
+        # idle pieces have no results
+        lasting[..., self.idle, :] = 0.0
+        d_controls = np.zeros((count, self.equations.nc, m))
         kept = np.empty((count, self._kept_size))
-        arrays = *begun, kept, state, d_controls, d_rows, d_unknowns
+        arrays = *begun, kept, states, d_controls, d_rows, d_unknowns
         self._functions["run"](*(each.ctypes.data for each in arrays), count, m)
-        joined = [self._joined(each, self._numbers(state, each)[:, 0], len(d_rate)) for each in parts]
-        before = [np.moveaxis(each, 0, -1) for each in joined]
-        return self._numbers(state, self.parameter)[:, 0, 0].T, d_controls, np.stack(before[:-1]), before[-1]
+        before = self._joined(self.rate, self._lasting(states, 1, count)[:, 0], places).transpose(1, 2, 3, 0)
+        return self._numbers(states, self.parameter)[:, 0, 0].T, d_controls, before[:-1], before[-1]
 
 
 def _nodes(nonzeros: Nonzeros) -> list[int]:
     return [node for *_, node in nonzeros]
 
 
-def _products(
-    nonzeros: Nonzeros, matrix: tuple[Array, Any], target: tuple[Array, Any], source: tuple[Array, Any]
-) -> list[Operation]:
-    """Add the product of a sparse matrix with a vector; each has an array and a place."""
-    return [
-        Add(Number(target[0], i, target[1]), Number(source[0], c, source[1]), Number(matrix[0], n, matrix[1]))
-        for n, (i, c, _) in enumerate(nonzeros)
-    ]
-
-
-def _copies(
-    size: int, target: tuple[Array, Any], source: tuple[Array, Any], first: int = 0
-) -> list[Operation]:
-    """Copy components from `first` on; each has an array and a place."""
-    return _set(
-        (Number(target[0], i, target[1]), Number(source[0], i, source[1])) for i in range(first, first + size)
-    )
-
-
-def _set(pairs: Iterable[tuple[Number, Number]]) -> list[Operation]:
-    """Set the first number of each pair to the second."""
-    found = list[Operation]()
-    for target, source in pairs:
-        found += [Scale(target), Add(target, source)]
-    return found
+def _aligned(size: int) -> np.ndarray:
+    """Return zeros, aligned to 64 bytes."""
+    raw = np.zeros(size + 8)
+    return raw[(-raw.ctypes.data // 8) % 8 :][:size]

@@ -78,26 +78,10 @@ def tangent_time_loop(
     columns: weights, controls, state and results have one more axis, the last. Tangents of rows are those of
     all numbers, (solves, N, x, m), or of the `kept` ones, (solves, q, m).
     """
-    (system, controls), settings, (d_controls, directions, weights, d_tip, kept) = at, steps.settings, changes
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
-    if directions is None:
-        stacked = [np.zeros((0, *leaf.shape)) for leaf in leaves]
-        weights = np.zeros((0, d_controls.shape[-1]))
-    else:
-        stacked = [np.asarray(leaf, float) for leaf in jax.tree.leaves(directions)]
-    moving = [np.any(is_moving(leaf), axis=0) for leaf in stacked]
-    core = tangents_for(TangentCore, Pattern.of(system), settings, moving)
-    moved = np.concatenate(
-        [
-            leaf[:, mask].reshape(len(leaf), int(mask.sum()))
-            for leaf, mask in zip(stacked, moving, strict=True)
-        ],
-        axis=1,
-    )
-    # directions of no tangent need no derivatives of the equations
-    weights = np.asarray(weights)
-    needed = np.any(weights != 0.0, axis=1)
-    moved, weights = moved[needed], weights[needed]
+    (system, controls), settings, (d_controls, _, _, d_tip, kept) = at, steps.settings, changes
+    pattern = Pattern.of(system)
+    moving, moved, weights = _moves(pattern, changes)
+    core = tangents_for(TangentCore, pattern, settings, moving)
     own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
     table = table_of(steps, len(controls), float(state.t0))
     parameters, found = parameters_of(system), list[tuple[np.ndarray, np.ndarray]]()
@@ -114,6 +98,22 @@ def tangent_time_loop(
         return state, found[0]
     d_rows, d_unknowns = (np.concatenate(each) for each in zip(*found, strict=True))
     return state, (d_rows, d_unknowns)
+
+
+def _moves(pattern: Pattern, changes: Changes) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    """Return masks of the parameters that move, the directions in which they do, and weights of these."""
+    if changes.directions is None:
+        masks = [np.zeros(shape, bool) for shape, _ in pattern.zeros]
+        return masks, np.zeros((0, 0)), np.zeros((0, changes.controls.shape[-1]))
+    leaves, weights = map(np.asarray, jax.tree.leaves(changes.directions)), np.asarray(changes.weights)
+    stacked = [leaf.astype(float) for leaf in leaves]
+    masks = [np.any(is_moving(leaf), axis=0) for leaf in stacked]
+    moved = [
+        leaf[:, mask].reshape(len(leaf), int(mask.sum())) for leaf, mask in zip(stacked, masks, strict=True)
+    ]
+    # directions of no tangent need no derivatives of the equations
+    needed = np.any(weights != 0.0, axis=1)
+    return masks, np.concatenate(moved, axis=1)[needed], weights[needed]
 
 
 def static_tangents(
