@@ -46,6 +46,7 @@ def use(monkeypatch):
 
 
 def test_nothing_is_solved_after_the_deadline(use):
+    use(Clock())
     search = Search(Curve(), deadline=60.0)
     end = search.run(np.zeros(3), FREE)
     assert search.last is end

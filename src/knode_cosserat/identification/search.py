@@ -45,8 +45,6 @@ PASS, SETTLED = 5, 0.05
 ROUGH, FINE = (PASS, 2e-2), (25, 1e-3)
 #: the same without priors, where a start may be far
 FIRST, EXACT = (50, 1e-5), (100, 1e-10)
-#: with priors a search ends where a Gauss-Newton step promises less than this part of its last fall
-PROMISE = 0.3
 #: no coordinate moves by less, in units of a first step
 NO_STEP = 1e-9
 METHOD: Literal["trf"] = "trf"
@@ -440,7 +438,7 @@ class _Descent:
             self.reach = self._reach(begin)
         low, high = ((end - begin) / self.reach + self.unit for end in (self.low, self.high))
         start = np.clip(self.unit, low, high)
-        if not exact and not rough and self._promise(start, low, high) < PROMISE * fall:
+        if not exact and not rough and self._promise(start, low, high) < fall:
             return 0, True
         ended = least_squares(
             self.values, start, self.slopes, (low, high), method=METHOD,
