@@ -257,6 +257,6 @@ def keep(name: str, found: Any, given: Collection[str]) -> None:
         attributes = {
             key: _plain(value)
             for key, value in vars(found).items()
-            if key not in given and not isinstance(value, _WRITERS)
+            if key not in given and not any(isinstance(each, _WRITERS) for each in jax.tree.leaves(value))
         }
         store(name, json.dumps({"dict": attributes}).encode())
