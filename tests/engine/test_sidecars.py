@@ -1,4 +1,4 @@
-"""Sidecars: a later process runs stored code without tracing, and no other code than that of its equations."""
+"""Sidecars: a later process runs stored code without tracing; other equations have another name."""
 
 import importlib.util
 import itertools
@@ -64,9 +64,9 @@ def test_code_is_restored_without_tracing(cache, monkeypatch):
         again = loops.tangents_for(TangentCore, pattern.Pattern.of(other), SETTINGS, moving)
         assert again.tangents == tangents.tangents and again is not tangents
     # of another structure
-    with monkeypatch.context() as refusing, pytest.raises(AssertionError, match="traced again"):
-        refuse_traces(refusing)
-        simulated(kc.load_robot("delrin-tendon-robot").replace(nodes=6))
+    refuse_traces(monkeypatch)
+    with pytest.raises(AssertionError, match="traced again"):
+        simulated(robot.replace(nodes=6))
 
 
 def damage_half(content):

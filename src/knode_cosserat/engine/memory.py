@@ -115,12 +115,13 @@ class Memory:
         self._now = f
         return f
 
-    def _at(self, array: Array, i: int, j: int | Index) -> tuple[Value, int]:
+    def _at(self, array: Array, i: int | Index, j: int | Index) -> tuple[Value, int]:
         """Return an address and an offset from it."""
-        memory = self._now.arguments[array.memory]
-        if isinstance(j, int):
-            return memory, array.at(i, j)
-        return j.address(memory, array.place), array.at(i, j.delta)
+        address, numbers = self._now.arguments[array.memory], []
+        for at, distance in ((j, array.place), (i, array.component)):
+            address = address if isinstance(at, int) else at.address(address, distance)
+            numbers.append(at if isinstance(at, int) else at.delta)
+        return address, array.at(numbers[1], numbers[0])
 
     def _pointer(self, array: Array, j: int | Index) -> Value:
         """Return the address of component 0 at a place."""
@@ -182,10 +183,18 @@ class Memory:
         with self._now.loop(first + count, first, 1 if self.batch else self.L) as j:
             yield j
 
-    def _components(self, size: int, count: int) -> Iterator[tuple[int, Index]]:
+    def _each(self, size: int) -> Iterator[Any]:
+        """Yield each component of a place; of a single robot, write a loop over them, which compiles faster."""
+        if self.batch:
+            yield from range(size)
+        else:
+            with self._now.loop(size) as i:
+                yield i
+
+    def _components(self, size: int, count: int) -> Iterator[tuple[Any, Index]]:
         """Write a loop over places, and yield each component with the place."""
         with self._places(count) as j:
-            for i in range(size):
+            for i in self._each(size):
                 yield i, j
 
     def _transpose(

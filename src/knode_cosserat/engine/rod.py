@@ -380,13 +380,15 @@ class RodCode(Memory):
     def _numbers_of(self, state: StateArrays, stop: int) -> Iterator[tuple[int, Index, Value]]:
         """Write loops over places, and yield components of their records, places and numbers."""
         e = self.equations
-        for y, first, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
-            with self._places(end - first) as j:
-                here = j + first
-                sources = [(y, i, j) for i in range(e.ny)] + [(state.z, i, here) for i in range(e.nz)]
-                sources += [(state.f, i, here) for i in range(e.numbers - len(sources))]
-                for i, source in enumerate(sources):
-                    yield i, here, self._wide(*source)
+        for y, start, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
+            with self._places(end - start) as j:
+                here, first = j + start, 0
+                for array, size, at in (
+                    (y, e.ny, j), (state.z, e.nz, here), (state.f, e.numbers - e.ny - e.nz, here)
+                ):  # fmt: skip
+                    for i in self._each(size):
+                        yield i + first, here, self._wide(array, i, at)
+                    first += size
 
     def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
         """Write the defects of all pieces: y at their ends by the scheme, minus y."""
