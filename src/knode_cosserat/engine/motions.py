@@ -172,7 +172,8 @@ class Motions(Generic[States]):
         first = results.ctypes.data
         core._functions["run"](
             memory.ctypes.data, acting.ctypes.data, table.ctypes.data, core._guesses.ctypes.data, first,
-            first + 8 * rows, first + 8 * (rows + infos), count, acting.shape[1], 1,
+            first + 8 * rows, first + 8 * (rows + infos), count, acting.shape[1],
+            self.steps.settings.estimates,
         )  # fmt: skip
         done = results[rows + infos :]
         if np.all(done == count):
@@ -229,14 +230,20 @@ class Motions(Generic[States]):
         self._enter(0)
         usable[:] = 0.0
         core._functions["run"](
-            *addresses, first, first + 8 * size, first + 8 * (len(results) - 1), 1, len(acting), 1
+            *addresses,
+            first,
+            first + 8 * size,
+            first + 8 * (len(results) - 1),
+            1,
+            len(acting),
+            self.steps.settings.estimates,
         )
         if not results[-1]:
             self._inside = -1
             return None, NOT_SOLVED
         self.motions = self._memory[None, core._motion].copy()
         last = len(results) - 1 - infos[-1]
-        fine = _is_fine(results.item(last + POSITION), results.item(last + ANGLE), self._lengths.item())
+        fine = self._is_fine(results.item(last + POSITION), results.item(last + ANGLE), self._lengths.item())
         return results, CONVERGED if fine else COARSE
 
     def row_of(self, results: np.ndarray) -> StepRows:
@@ -258,7 +265,7 @@ class Motions(Generic[States]):
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        result = np.where(_is_fine(off, angle, lengths[: len(done)]), CONVERGED, COARSE)
+        result = np.where(self._is_fine(off, angle, lengths[: len(done)]), CONVERGED, COARSE)
         result = np.where(error <= self.steps.settings.newton.acceptable, result, NOT_SOLVED)
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
@@ -268,10 +275,9 @@ class Motions(Generic[States]):
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
 
-
-def _is_fine(off: Any, angle: Any, length: Any) -> Any:
-    """True where errors of positions (m) and orientations (rad) do not make a row coarse."""
-    return (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE)
+    def _is_fine(self, off: Any, angle: Any, length: Any) -> Any:
+        """True where no estimated error of positions (m) or orientations (rad) makes a row coarse."""
+        return (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE) | (not self.steps.settings.errors)
 
 
 def coefficients_of(steps: StepCoefficients, span: tuple[int, int]) -> Float[np.ndarray, "T stages n"]:
