@@ -256,7 +256,9 @@ class Trajectory:
             for where, error in (("along the rod", self.position_error), ("in time", self.time_error))
             if error is not None and np.any(np.isfinite(error))
         ]
-        if errors and self.position_error is not None:
+        if self.settings is not None and not self.settings.errors:
+            lines.append("errors not estimated")
+        elif errors and self.position_error is not None:
             lost = int(np.sum(np.isnan(self.position_error) & (np.asarray(self.result) >= 0)))
             lines.append(
                 f"largest position error, by estimate: {', '.join(errors)}"

@@ -310,3 +310,25 @@ def test_tendons_that_push_are_warned_of(robot, sine):
         warnings.simplefilter("error")
         # noise of what was measured
         kc.equilibrium(robot, np.array([5.0, -0.01, 0.0, 0.0]))
+
+
+@pytest.mark.parametrize("time", ["sdirk2", "bdf2"])
+def test_errors_that_are_not_estimated_are_said_to_be_unknown(robot, sine, time):
+    """The motion is the same; no error of a row or of the state after it is a number."""
+    known, by_grid, unknown = (
+        kc.simulate(robot, sine[:5], DT, time=time, errors=errors) for errors in (True, "grid", False)
+    )
+    for motion in (by_grid, unknown):
+        np.testing.assert_allclose(motion.y, known.y, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(motion.result, known.result)
+        assert np.all(np.isnan(motion.time_error)) and np.all(np.isnan(motion.final_state.history.time_error))
+    np.testing.assert_allclose(by_grid.position_error, known.position_error, rtol=1e-6)
+    assert np.all(np.isnan(unknown.position_error)) and np.all(np.isnan(unknown.final_state.history.error))
+    assert "errors not estimated" in str(unknown) and "along the rod" in str(by_grid)
+    with pytest.raises(ValueError, match="needs estimates"):
+        kc.simulate(robot, sine[:5], DT, errors=False, position_tolerance=1e-3)
+    with pytest.raises(ValueError, match="errors is 'none'"):
+        kc.simulate(robot, sine[:5], DT, errors="none")
+    # a motion with estimates that continues one without has none
+    after = kc.simulate(robot, sine[5:7], DT, time=time, initial=unknown)
+    assert np.all(np.isnan(after.position_error[1:])) and np.all(after.result[1:] == kc.Result.COARSE)

@@ -510,7 +510,8 @@ class Core(EliminationCode):
     def _write_run(self) -> None:
         """All steps, until every robot has failed; `reached` counts the solved.
 
-        Without estimates (`n_estimates` 0), all errors are NaN, also those of the state after the run.
+        Errors of the grid (`n_estimates` 1 or 2) and of the time scheme (2) that are not estimated are NaN,
+        also those of the state after the run.
         """
         e, P = self.equations, self.P
         names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
@@ -520,12 +521,14 @@ class Core(EliminationCode):
         steps, stages, estimates = f.arguments[7:]
         numbers = self._pointer(self.numbers, 0)
         f.store(1.0, numbers, ALIVE * P, P)
-        with f.if_(estimates <= 0):
-            for k in (POSITION, ANGLE, TIME):
-                f.store(math.nan, numbers, k * P, P)
-            for array in (*self.errors, self.error_rate, *self.time_errors):
-                for i, j in self._components(array.size, self.used):
-                    self._write_wide(math.nan, array, i, j)
+        grid, time = ((POSITION, ANGLE), (*self.errors, self.error_rate)), ((TIME,), self.time_errors)
+        for least, (places, arrays) in ((1, grid), (2, time)):
+            with f.if_(estimates < least):
+                for k in places:
+                    f.store(math.nan, numbers, k * P, P)
+                for array in arrays:
+                    for i, j in self._components(array.size, self.used):
+                        self._write_wide(math.nan, array, i, j)
         step, nodes = Variable(f, f.value(0, "i64")), len(self.grid.nodes)
 
         def going() -> Value:
@@ -583,9 +586,10 @@ class Core(EliminationCode):
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
         f.call(self.check, memory, estimates, numbers, coefficients)
-        with f.if_(estimates > 0):
-            if isinstance(self.scheme, SDIRK2):
+        if isinstance(self.scheme, SDIRK2):
+            with f.if_(estimates > 1):
                 f.call(self.time_history, memory, coefficients)
+        with f.if_(estimates > 0):
             if self.scheme:
                 history(self.errors, self.error_rate, self.dH, self.used)
             f.call(self.corrected, memory, numbers)
@@ -593,7 +597,8 @@ class Core(EliminationCode):
                 for i, j in self._components(e.numbers, self.used):
                     value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
                     self._write_wide(value, self.error_rate, i, j)
-            if isinstance(self.scheme, SDIRK2):
+        if isinstance(self.scheme, SDIRK2):
+            with f.if_(estimates > 1):
                 f.call(self.corrected_in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
         alive = f.load(numbers, ALIVE * P, P)

@@ -15,7 +15,7 @@ from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameter
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import StepCoefficients
+from knode_cosserat.solvers.history import StepCoefficients, StepRows
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
 
@@ -54,19 +54,25 @@ def tangents_for(
 
 
 def solve_steps(
-    system: System, steps: StepCoefficients, controls: Any, states: Any, span: tuple[int, int]
+    system: System,
+    steps: StepCoefficients,
+    controls: Any,
+    states: Any,
+    span: tuple[int, int],
+    rows: StepRows | None = None,
 ) -> tuple[Any, Any, Any]:
     """Solve a span of steps until one fails: the number of steps done, the state after them, and rows.
 
     The state is a `StateHistory`; of equilibria, solved in turn, it is y at all points. Controls are (T, c).
     A batch has controls (B, T, c), as many states, and one system or as many: its robots are solved side by
-    side in the lanes of vectors, each until a step fails (see `Motions.solve`).
+    side in the lanes of vectors, each until a step fails (see `Motions.solve`); its rows may be given.
     """
     alone, is_static = np.ndim(controls) == 2, steps.settings.time is None
     states = Shape(states) if is_static else states
     controls, states = jax.tree.map(lambda leaf: np.asarray(leaf)[None if alone else ...], (controls, states))
     motions = motions_of(system, steps, states)
-    done, rows = motions.solve(controls, span)
+    rows = rows if rows is None or not alone else StepRows(*(leaf[None] for leaf in rows))
+    done, rows = motions.solve(controls, span, rows)
     last = motions.states
     found = done, last.y if is_static else last, rows
     return jax.tree.map(lambda leaf: leaf[0], found) if alone else found

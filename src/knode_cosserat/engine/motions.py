@@ -21,6 +21,8 @@ from knode_cosserat.solvers.history import (
 )
 from knode_cosserat.solvers.result import Result
 
+#: largest number of results that are copied to rows at once
+BLOCK = 1 << 17
 CONVERGED, COARSE, NOT_SOLVED = int(Result.CONVERGED), int(Result.COARSE), int(Result.NO_CONVERGENCE)
 
 
@@ -116,30 +118,43 @@ class Motions(Generic[States]):
         return self._kind(*found)
 
     def solve(
-        self, controls: np.ndarray, span: tuple[int, int]
+        self, controls: np.ndarray, span: tuple[int, int], rows: StepRows | None = None
     ) -> tuple[Int[np.ndarray, " robots"], StepRows]:
         """Solve a span of steps of each robot until one fails: the number of steps done, and rows.
 
         Controls (robots, T, c) or (robots, T, stages * c). In a batch, a robot with a failed step waits for
-        the others in its vector; its last state is not kept, except if the first step failed.
+        the others in its vector; its last state is not kept, except if the first step failed. Rows are
+        written to `rows` if they are given.
         """
         core, P, stages, (start, stop) = self.core, self.core.P, np.size(self.steps.ends), span
         e, count, vectors = core.equations, int(stop - start), len(self.motions)
-        own = self._in_lanes(controls[:, start:stop]).reshape(vectors, P, count, -1, e.nc)
+        held = 1 if controls.shape[2] == e.nc else stages
+        own = self._in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
         acting = np.empty((vectors, count, stages, e.nc, P))
         acting[:] = np.moveaxis(own, 1, -1)
         table, shapes = coefficients_of(self.steps, span), self._shapes_of(count, stages)
-        sizes = [math.prod(shape) for shape in shapes]
-        results = np.zeros((vectors, sum(sizes) + P))
-        for k in range(vectors):
-            self._solve(k, acting[k], table, results[k], sizes)
-        rows, infos, reached = np.split(results, np.cumsum(sizes), axis=1)
-        rows, infos = (
-            np.moveaxis(part.reshape(vectors, *shape), -1, 1).reshape(-1, *shape[:-1])[: self.size]
-            for part, shape in zip((rows, infos), shapes, strict=True)
-        )
-        done = reached.reshape(-1)[: self.size].astype(int)
-        return start + done, self._rows(rows, infos, done)
+        sizes, done = [math.prod(shape) for shape in shapes], np.zeros(self.size, dtype=int)
+        # results of some vectors at a time, which are copied while they are in the cache
+        block = max(1, BLOCK // (sum(sizes) + P))
+        results = np.zeros((min(vectors, block), sum(sizes) + P))
+        for first in range(0, vectors, block):
+            part, robots = results[: vectors - first], slice(first * P, (first + block) * P)
+            part[:] = 0.0
+            for k, own in enumerate(part, first):
+                self._solve(k, acting[k], table, own, sizes)
+            reached = part[:, sum(sizes) :].reshape(-1)[: self.size - first * P]
+            done[robots] = reached
+            found = self._rows(
+                part, shapes, self._lengths[first : first + block].reshape(-1, 1), done[robots]
+            )
+            if rows is None and vectors <= block:
+                return start + done, found
+            if rows is None:
+                rows = StepRows(*(np.empty((self.size, *leaf.shape[1:]), leaf.dtype) for leaf in found))
+            for every, leaf in zip(rows, found, strict=True):
+                every[robots] = leaf
+        assert rows is not None
+        return start + done, rows
 
     def _shapes_of(self, count: int, stages: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
         """Return the shapes of the rows of a vector of robots, and of the numbers of their stages."""
@@ -157,7 +172,8 @@ class Motions(Generic[States]):
         first = results.ctypes.data
         core._functions["run"](
             memory.ctypes.data, acting.ctypes.data, table.ctypes.data, core._guesses.ctypes.data, first,
-            first + 8 * rows, first + 8 * (rows + infos), count, acting.shape[1], 1,
+            first + 8 * rows, first + 8 * (rows + infos), count, acting.shape[1],
+            self.steps.settings.estimates,
         )  # fmt: skip
         done = results[rows + infos :]
         if np.all(done == count):
@@ -204,7 +220,7 @@ class Motions(Generic[States]):
         if motions is not self.motions:
             self.motions, self._inside = motions, -1
         core, (acting, table, usable, addresses, (rows, infos)) = self.core, self._step
-        acting[:] = control.reshape(-1, acting.shape[1])
+        acting[:] = control.reshape(1 if len(control) == acting.shape[1] else len(acting), acting.shape[1])
         if i < len(self.steps.table):
             table[:] = coefficients_of(self.steps, (i, i + 1))
         table[0, :, -1] = (i + self.steps.ends) * self.steps.dt
@@ -214,34 +230,42 @@ class Motions(Generic[States]):
         self._enter(0)
         usable[:] = 0.0
         core._functions["run"](
-            *addresses, first, first + 8 * size, first + 8 * (len(results) - 1), 1, len(acting), 1
+            *addresses,
+            first,
+            first + 8 * size,
+            first + 8 * (len(results) - 1),
+            1,
+            len(acting),
+            self.steps.settings.estimates,
         )
         if not results[-1]:
             self._inside = -1
             return None, NOT_SOLVED
         self.motions = self._memory[None, core._motion].copy()
         last = len(results) - 1 - infos[-1]
-        fine = _is_fine(results.item(last + POSITION), results.item(last + ANGLE), self._lengths.item())
+        fine = self._is_fine(results.item(last + POSITION), results.item(last + ANGLE), self._lengths.item())
         return results, CONVERGED if fine else COARSE
 
     def row_of(self, results: np.ndarray) -> StepRows:
         """Return the row of a step from its numbers."""
         shapes = self._shapes_of(1, np.size(self.steps.ends))
-        size = math.prod(shapes[0])
-        rows, infos = results[:size].reshape(1, *shapes[0][:-1]), results[size:-1].reshape(1, *shapes[1][:-1])
-        return StepRows(*(leaf[0, 0] for leaf in self._rows(rows, infos, np.ones(1))))
+        return StepRows(
+            *(leaf[0, 0] for leaf in self._rows(results[None], shapes, self._lengths, np.ones(1)))
+        )
 
-    def _rows(self, rows: np.ndarray, infos: np.ndarray, done: np.ndarray) -> StepRows:
-        """Return rows (robots, steps, ...); a step's row is that of its last stage."""
-        core = self.core
+    def _rows(self, results: np.ndarray, shapes: Any, lengths: np.ndarray, done: np.ndarray) -> StepRows:
+        """Return rows (robots, steps, ...) of vectors of results; a step's row is that of its last stage."""
+        core, size = self.core, math.prod(shapes[0])
+        rows, infos = (
+            np.moveaxis(part.reshape(len(results), *shape), -1, 1).reshape(-1, *shape[:-1])[: len(done)]
+            for part, shape in zip((results[:, :size], results[:, size : -core.P]), shapes, strict=True)
+        )
         if core.strands > 1:
             rows = core.equations.joined(rows.reshape(*rows.shape[:-1], core.strands, -1))
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        lengths = self._lengths.reshape(-1)[: self.size]
-        fine = _is_fine(off, angle, lengths[:, None])
-        result = np.where(fine, CONVERGED, COARSE)
+        result = np.where(self._is_fine(off, angle, lengths[: len(done)]), CONVERGED, COARSE)
         result = np.where(error <= self.steps.settings.newton.acceptable, result, NOT_SOLVED)
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
@@ -251,10 +275,9 @@ class Motions(Generic[States]):
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
 
-
-def _is_fine(off: Any, angle: Any, length: Any) -> Any:
-    """True where errors of positions (m) and orientations (rad) do not make a row coarse."""
-    return (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE)
+    def _is_fine(self, off: Any, angle: Any, length: Any) -> Any:
+        """True where no estimated error of positions (m) or orientations (rad) makes a row coarse."""
+        return (off <= COARSE_SHARE * length) & (angle <= COARSE_ANGLE) | (not self.steps.settings.errors)
 
 
 def coefficients_of(steps: StepCoefficients, span: tuple[int, int]) -> Float[np.ndarray, "T stages n"]:

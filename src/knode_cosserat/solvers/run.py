@@ -26,7 +26,14 @@ from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.guess import materials
-from knode_cosserat.solvers.history import SolverState, StepCoefficients, StepRows, TimeStep, map_robots
+from knode_cosserat.solvers.history import (
+    SolverState,
+    StepCoefficients,
+    StepRows,
+    TimeStep,
+    map_robots,
+    no_rows,
+)
 from knode_cosserat.solvers.recovery import Budget, SolvedStep, StaticRecovery, StepRecovery, recovered_stages
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
@@ -76,13 +83,16 @@ class TimeIntegration:
         """Coefficients of the steps."""
         return StepCoefficients.of(self.settings, self.dt, self.known)
 
-    def solve(self, system: System, controls: Any, state: Any, span: tuple[int, int] | None = None) -> Any:
+    def solve(
+        self, system: System, controls: Any, state: Any, span: tuple[int, int] | None = None,
+        rows: StepRows | None = None,
+    ) -> Any:  # fmt: skip
         """Solve steps, all by default, until one fails: the number done, the last state, rows of the span.
 
         A batch of robots has controls (B, T, c) and as many states; each is solved until one of its steps
-        fails.
+        fails. Rows are written to `rows` if they are given.
         """
-        return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps))
+        return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps), rows)
 
     def motions(self, system: System, state: Any) -> Motions[Any]:
         """Return the motion of one robot from a state, for steps one by one."""
@@ -103,37 +113,32 @@ class TimeIntegration:
 
 def run_one(
     task: TimeIntegration, system: System, controls: np.ndarray, start: tuple[Any, Any],
-    watch: Literal["signals", "bar"] | None = "signals",
+    watch: Literal["signals", "bar"] | None = "signals", rows: StepRows | None = None,
 ) -> tuple[StepRows, Any, str]:  # fmt: skip
     """Return all steps of one robot, with recovery, the last state, and the likely cause of a failure.
 
     They start from a state and the control before it. To watch for signals, the compiled loop returns about
     every `RESPONSE` seconds; a progress bar shows it. Pieces change the result within the tolerance: if it
-    has to be the same bits in each run, nothing is watched, and there is one piece.
+    has to be the same bits in each run, nothing is watched, and there is one piece. Rows are written to
+    `rows` if they are given: those of steps that are not reached.
     """
     total, (state, before) = task.steps, start
     piece = FIRST_STEPS if watch else total
     budget = Budget(task.recovery_budget)
-    rows: StepRows | None = None
+    rows = no_rows(system, (total,), task.settings.stages) if rows is None else rows
     done, cause = 0, ""
     with _bar(watch, total, "step") as advance:
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
-            reached, state, new = task.solve(system, controls, state, (done, stop))
+            reached, state, _ = task.solve(
+                system, controls, state, (done, stop), _picked(rows, slice(done, stop))
+            )
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
             if watch:
                 # short enough to respond to an interruption, long enough to cost nothing
                 piece = max(piece, int((reached - done) * RESPONSE / max(elapsed, 1e-6)))
-            if rows is None and reached == total:
-                rows = new
-                break
-            if rows is None:
-                rows = StepRows(*(np.zeros((total, *leaf.shape[1:]), leaf.dtype) for leaf in new))
-                rows.result[:] = int(Result.NOT_REACHED)
-            for every, leaf in zip(rows, new, strict=True):
-                every[done:reached] = leaf[: reached - done]
             if reached < stop:
                 pair = (controls[reached - 1] if reached else before), controls[reached]
                 solved = task.recover(system, state, pair, reached, budget)
@@ -144,7 +149,6 @@ def run_one(
                 reached += not cause
             advance(reached - done)
             done = reached
-    assert rows is not None
     return rows, state, cause
 
 
@@ -296,7 +300,7 @@ def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
 
 def run_batch(
     task: TimeIntegration, system: System, controls: np.ndarray, start: tuple[Any, Any],
-    watch: Literal["signals", "bar"] | None = "signals",
+    watch: Literal["signals", "bar"] | None = "signals", rows: StepRows | None = None,
 ) -> tuple[StepRows, Any, dict[int, str]]:  # fmt: skip
     """Return the rows and last states of all robots, and the likely cause for each robot that failed.
 
@@ -306,35 +310,39 @@ def run_batch(
     size, batched, (states, before) = controls.shape[0], np.ndim(system.length) > 0, start
     workers = usable_cores()
     chunk = min(CHUNK, -(-size // workers))
+    every = no_rows(system, (size, task.steps), task.settings.stages) if rows is None else rows
+    done, lasts = np.zeros(size, dtype=int), jax.tree.map(lambda leaf: np.empty(np.shape(leaf)), states)
 
     def robot(index: Any) -> System:
         return _picked(system, index) if batched else system
 
     with _bar(watch, size, "robot") as advance:
 
-        def work(first: int) -> Any:
+        def work(first: int) -> None:
             index = slice(first, first + chunk)
-            done, lasts, rows = task.solve(robot(index), controls[index], _picked(states, index))
-            advance(len(done))
-            return done, lasts, *rows
+            own, rows = _picked(states, index), _picked(every, index)
+            done[index], after, _ = task.solve(robot(index), controls[index], own, rows=rows)
+            _put(lasts, index, after)
+            advance(len(done[index]))
 
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
-            chunks = list(pool.map(work, range(0, size, chunk)))
-    done, lasts, *leaves = (
-        jax.tree.map(lambda *parts: np.concatenate(parts), *parts) for parts in zip(*chunks, strict=True)
-    )
-    rows, causes = StepRows(*leaves), {}
+            list(pool.map(work, range(0, size, chunk)))
+    causes = {}
     for i in np.flatnonzero(done < task.steps):
         *solved, cause = run_one(task, robot(i), controls[i], (_picked(states, i), before[i]))
-        for every, one in zip(jax.tree.leaves((rows, lasts)), jax.tree.leaves(solved), strict=True):
-            every[i] = one
+        _put((every, lasts), i, solved)
         if cause:
             causes[int(i)] = cause
-    return rows, lasts, causes
+    return every, lasts, causes
 
 
 def _picked(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
+
+
+def _put(tree: Any, index: Any, values: Any) -> None:
+    for every, part in zip(jax.tree.leaves(tree), jax.tree.leaves(values), strict=True):
+        every[index] = part
 
 
 def usable_cores() -> int:

@@ -12,6 +12,7 @@ from knode_cosserat.solvers.time import BDF2, TWO_STAGES, TimeScheme
 
 Start = Literal["paper", "consistent"]
 Between = Literal["held", "linear"]
+Errors = Literal[True, False, "grid"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +59,9 @@ class Settings:
     newton: NewtonOptions = NewtonOptions()
     #: controls are constant from row to row, or linear (`history.at_stages`)
     between: Between = "held"
+    #: True if the errors of every row are estimated, "grid" if only those by the grid are, False if none is:
+    #: they are NaN then, and no row is called coarse
+    errors: Errors = True
 
     @property
     def uses_rate(self) -> bool:
@@ -70,6 +74,11 @@ class Settings:
         return 2 if self.time is None else self.time.memory
 
     @property
+    def estimates(self) -> int:
+        """Number of estimated errors: by the grid, and by the time scheme."""
+        return 1 if self.errors == "grid" else 2 * self.errors
+
+    @property
     def stages(self) -> int:
         """Number of boundary-value problems that are solved in a step."""
         return 1 if self.time is None else len(self.time.ends)
@@ -77,7 +86,7 @@ class Settings:
     @classmethod
     def of(
         cls, time: str | TimeScheme | None, space: str | SpaceScheme, start: str, newton: NewtonOptions,
-        between: str = "held",
+        between: str = "held", errors: Errors = True,
     ) -> Self:  # fmt: skip
         """Return settings from names or schemes; `time` is None for statics.
 
@@ -87,6 +96,8 @@ class Settings:
             raise ValueError(f"newton is {newton!r}; allowed is a NewtonOptions")
         if start not in ("paper", "consistent"):
             raise ValueError(f'start is {start!r}; allowed is "paper" or "consistent"')
+        if errors not in (True, False, "grid"):
+            raise ValueError(f'errors is {errors!r}; allowed is True, False or "grid"')
         if between not in ("held", "linear"):
             raise ValueError(f'between is {between!r}; allowed is "held" or "linear"')
         return cls(
@@ -95,6 +106,7 @@ class Settings:
             start,  # type: ignore[arg-type]
             newton,
             between,  # type: ignore[arg-type]
+            errors,
         )
 
     def described(self) -> dict[str, Any]:
@@ -105,6 +117,7 @@ class Settings:
             "start": self.start,
             "newton": dataclasses.asdict(self.newton),
             "between": self.between,
+            "errors": self.errors,
         }
 
     @classmethod
@@ -117,6 +130,8 @@ class Settings:
             start=described["start"],
             newton=NewtonOptions(**described["newton"]),
             between=described["between"],
+            # files of earlier versions have no other motions
+            errors=described.get("errors", True),
         )
 
 

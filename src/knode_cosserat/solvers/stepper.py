@@ -17,7 +17,7 @@ from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, carried_results, rows_of
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
+from knode_cosserat.solvers.settings import Errors, NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, split_initial
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
@@ -50,6 +50,7 @@ class Stepper:
         start: Literal["paper", "consistent"] = "consistent",
         initial: Trajectory | Literal["equilibrium"] | None = None,
         newton: NewtonOptions = NewtonOptions(),
+        errors: Errors = True,
         recovery_budget: float | None = None,
     ):
         """Start unstressed, in equilibrium, or at the last row of `initial`: arguments as in `simulate`.
@@ -63,7 +64,7 @@ class Stepper:
             raise ValueError(f"robot is {type(robot).__name__}; a stepper is of one robot, not of a batch")
         if time in (None, "static"):
             raise ValueError(f"time is {time!r}; a stepper moves: see `equilibrium` for shapes at rest")
-        settings = Settings.of(time, space, start, newton)
+        settings = Settings.of(time, space, start, newton, errors=errors)
         self.robot, self.dt = robot, checked_dt(dt)
         # layouts are put together anew in each call
         self._layout, self._control_shape = robot.control_layout, (robot.control_layout.size,)
