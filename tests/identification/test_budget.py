@@ -10,6 +10,7 @@ from knode_cosserat.identification.search import OutOfTime, Search
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
 from tests.identification.test_journal import FREE, Curve
+from tests.identification.test_selection import ROWS
 
 IDENTIFY, SEARCH = (
     importlib.import_module(f"knode_cosserat.identification.{it}") for it in ("identify", "search")
@@ -56,45 +57,38 @@ def test_nothing_is_solved_after_the_deadline(use):
     assert search.last is end
 
 
-class _Model:
-    nominal = NOMINAL
+def _run(monkeypatch, clock, stages):
+    """Begin some stages in place of a search; the last one may be an interruption."""
+
+    def staged(search, course, *_):
+        for stage in stages:
+            if stage is KeyboardInterrupt:
+                raise KeyboardInterrupt
+            course.begin(stage)
+            if stage == "trials":
+                course.result = kc.identification.Identified(TRUE)
+
+    monkeypatch.setattr(IDENTIFY, "Search", lambda misfit, *_, **__: Search(Curve()))
+    monkeypatch.setattr(IDENTIFY, "Misfit", lambda *_: None)
+    monkeypatch.setattr(IDENTIFY, "_with_effects", staged)
+    return kc.identify(NOMINAL, [ROWS], minutes=1.0, progress=clock.tell)
 
 
-class _Misfit:
-    model = _Model
+@pytest.mark.parametrize("stage", IDENTIFY.STAGES)
+def test_a_result_says_what_was_not_done(monkeypatch, use, stage):
+    clock = use(Clock(f", {stage}"))
+    found = _run(monkeypatch, clock, IDENTIFY.STAGES)
+    assert not found.complete and not found.to_dict()["complete"]
+    missing = ", ".join(IDENTIFY.STAGES[IDENTIFY.STAGES.index(stage) :])
+    assert found.steps[-1] == f"not complete, the time is over; not done: {missing}"
+    assert (found.robot is TRUE) == (stage == IDENTIFY.STAGES[-1])
+    assert clock.lines[0] == "stage 1 of 6, first answer, 60 s left"
 
 
-class _NoSearch:
-    last, misfit = None, _Misfit
-
-
-def test_the_best_robot_is_returned_or_belongs_to_the_interruption(use):
-    clock = use(Clock("trials"))
-    course = IDENTIFY._Course(clock.tell, 60.0)
-    best = kc.identification.Identified(TRUE)
-
-    def whole(interrupted=False):
-        course.begin("all effects")
-        course.best = lambda: best
-        if interrupted:
-            raise KeyboardInterrupt
-        course.begin("trials")
-
-    found = course.followed(_NoSearch, whole)
-    assert found.robot is TRUE and not found.complete and not found.to_dict()["complete"]
-    assert found.steps[-1].endswith("not done: trials, next experiment, band of predictions")
-    assert clock.lines[0] == "stage 2 of 7, all effects, 60 s left"
-    use(Clock())
+def test_the_best_robot_belongs_to_an_interruption(monkeypatch, use):
     with pytest.raises(KeyboardInterrupt) as stopped:
-        course.followed(_NoSearch, lambda: whole(True))
-    assert stopped.value.best.robot is TRUE and not stopped.value.best.complete
-
-
-def test_without_any_search_the_nominal_robot_is_returned(use):
-    use(Clock("stage 1"))
-    course = IDENTIFY._Course(IDENTIFY.clock.tell, 60.0)
-    found = course.followed(_NoSearch, lambda: course.begin("first answer"))
-    assert found.robot is NOMINAL and not found.complete and "first answer" in found.steps[-1]
+        _run(monkeypatch, use(Clock()), [*IDENTIFY.STAGES, KeyboardInterrupt])
+    assert stopped.value.best.robot is TRUE and "interrupted" in stopped.value.best.steps[-1]
 
 
 @pytest.mark.parametrize("minutes", [0.0, -1.0, np.nan])
@@ -111,15 +105,11 @@ def test_a_budget_ends_in_each_stage_and_a_later_run_resumes(tmp_path, use):
     for stage in IDENTIFY.STAGES:
         clock = use(Clock(f", {stage}"))
         found = kc.identify(NOMINAL, given, minutes=1.0, progress=clock.tell, checkpoint=tmp_path)
-        if found.complete:  # all was decided: there is no next experiment
-            assert stage == "next experiment"
-            continue
         assert found.steps[-1].startswith("not complete") and stage in found.steps[-1]
         if stage != "first answer":
             assert {"youngs_modulus", "bending_damping"} <= {it.label for it in found.estimates}
             assert max(found.error.values()) < 0.2 * max(found.nominal_error.values())
-        if stage in ("all effects", "selection of effects"):
-            assert found.held_out_error and "held-out rows" in found.steps[0]
+            assert "held-out rows" in found.steps[0]
     use(Clock())
     resumed = kc.identify(NOMINAL, given, minutes=1.0, checkpoint=tmp_path)
     assert resumed.complete and resumed.to_dict() == kc.identify(NOMINAL, given).to_dict()

@@ -134,44 +134,51 @@ def identify(
     plain = [] if parameters is None else parameter_effects(robot, parameters)
     rows = [it for it in data if isinstance(it, Measurements)]
     plain += place_effects(rows, flat=named)
+    measured = [] if named else measured_rows(data)
 
-    def searched(model: Model, data: Sequence[Experiment]) -> Search:
-        return Search(Misfit(model, data), course.tell_left, journal=journal, deadline=course.deadline)
+    def searched(robot: Any) -> Search:
+        if named:
+            model = Model(robot, plain)
+            experiments = experiments_of(data, model, space)
+        else:
+            tension = np.concatenate([rows.tension for rows in measured])
+            model = library_model(robot, tension, measured[0].fractions, plain)
+            experiments = [it.rough() for it in experiments_of(measured, model, space)]
+        misfit = Misfit(model, experiments)
+        course.search = Search(misfit, course.tell_left, journal=journal, deadline=course.deadline)
+        return course.search
 
-    if named:
-        model = Model(robot, plain)
-        search = searched(model, experiments_of(data, model, space))
-        return course.followed(search, lambda: _with_parameters(search))
-    measured = measured_rows(data)
-    tension = np.concatenate([rows.tension for rows in measured])
-
-    def with_library(robot: Any) -> Search:
-        model = library_model(robot, tension, measured[0].fractions, plain)
-        return searched(model, [it.rough() for it in experiments_of(measured, model, space)])
-
-    search = with_library(robot)
-    return course.followed(
-        search, lambda: _with_effects(search, course, effects and [*effects, *(it.name for it in plain)],
-                                      space, with_library)
-    )  # fmt: skip
+    search = searched(robot)
+    try:
+        if named:
+            return _with_parameters(search)
+        wanted = None if effects is None else [*effects, *(it.name for it in plain)]
+        found = _with_effects(search, course, wanted, space, searched)
+    except OutOfTime:
+        return course.best("the time is over")
+    except KeyboardInterrupt as stop:
+        stop.best = course.best("interrupted")  # type: ignore[attr-defined]
+        raise
+    return dataclasses.replace(found, steps=tuple(course.steps))
 
 
 #: stages of an identification by effects
 STAGES = (
-    "first answer", "all effects", "selection of effects", "held-out recordings", "trials", "next experiment",
-    "band of predictions",
+    "first answer", "all effects", "selection of effects", "held-out recordings", "trials",
+    "next experiment and band of predictions",
 )  # fmt: skip
 
 
 @dataclasses.dataclass
 class _Course:
-    """Course of an identification: its stages, its selections in words, and the best robot so far."""
+    """Course of an identification: its stage, its selections in words, and the result of the trials."""
 
     tell: Tell
     deadline: float
     steps: list[str] = dataclasses.field(default_factory=list)
     stage: str = ""
-    best: Callable[[], Identified] | None = None
+    search: Any = None
+    result: Identified | None = None
 
     def tell_left(self, line: str) -> None:
         """Tell a line, with the time left."""
@@ -190,40 +197,27 @@ class _Course:
         if clock() > self.deadline:
             raise OutOfTime
 
-    def followed(self, search: Search, whole: Callable[[], Identified]) -> Identified:
-        """Return the whole result, or the best one when the time is over."""
-        try:
-            return whole()
-        except OutOfTime:
-            return self._so_far(search, "the time is over")
-        except KeyboardInterrupt as stop:
-            if self.best or search.last:
-                stop.best = self._so_far(search, "interrupted")  # type: ignore[attr-defined]
-            raise
-
-    def _so_far(self, search: Search, reason: str) -> Identified:
-        model = search.misfit.model
-        if self.best is not None:
-            found = self.best()
-        elif search.last is not None:
-            names = [it.name for it in model.effects if search.last.free[model.slice(it.name)].any()]
-            found = _untried(search, names, search.last.x)
-        else:
-            found = Identified(model.nominal)
-        missing = STAGES[STAGES.index(self.stage) :] if self.stage else ("the search",)
-        self.step(f"not complete, {reason}; not done: {', '.join(missing)}")
+    def best(self, reason: str) -> Identified:
+        """Return the best robot so far: of the last search, or else the nominal one."""
+        search, found = self.search, self.result
+        model, last = search.misfit.model, search.last
+        if found is None and last is not None:
+            names = [it.name for it in model.effects if last.free[model.slice(it.name)].any()]
+            search.deadline = np.inf
+            point = search.run(last.x, last.free, effort=(0, 0.0))
+            posterior = Posterior.of(model, point, names)
+            found = _result(search, model.reduced(last.x, names), (last.x, names), posterior)
+        missing = ", ".join(STAGES[STAGES.index(self.stage) :]) if self.stage else "the search"
+        self.step(f"not complete, {reason}; not done: {missing}")
+        found = found or Identified(model.nominal)
         return dataclasses.replace(found, steps=tuple(self.steps), complete=False)
 
 
 def _with_effects(
     search: Search, course: _Course, effects: Sequence[str] | None, space: str | SpaceScheme,
-    with_library: Callable[[Any], Search],
+    searched: Callable[[Any], Search],
 ) -> Identified:  # fmt: skip
     """Return the robot with the named effects, or with selected ones."""
-
-    def kept(names: Sequence[str], point: Point) -> None:
-        course.best = lambda: _untried(search, names, point.x)
-
     model = search.misfit.model
     try:
         if effects is not None:
@@ -236,28 +230,27 @@ def _with_effects(
         for refinements in range(REFINEMENTS + 1):
             if effects is None:
                 course.begin("selection of effects")
-                names, point = selected(search, point, course.step, kept)
+                names, point = selected(search, point, course.step)
             elif refinements:
                 point = search.run(point.x, model.mask(names))
             if not has_coarse_rows(search.misfit.system(point.x), search.misfit.data, space):
                 break
             nodes = 2 * model.nominal.nodes
             course.step(f"{nodes} nodes, for the grid was too coarse")
-            search = with_library(model.nominal.replace(nodes=nodes))
+            search = searched(model.nominal.replace(nodes=nodes))
             model = search.misfit.model
     except SearchError as error:
         raise IdentificationError(f"{error}; the data sheet's numbers are too far from the robot") from None
-    kept(names, point)
     course.begin("held-out recordings")
     selection = Selection.of(search, names, point)
     if effects is None and selection.folds:
-        selection = best_predicting(search, selection, course.step, kept)
-    found = _accepted(search, selection, effects is not None, space, course)
-    return dataclasses.replace(found, steps=tuple(course.steps))
+        selection = best_predicting(search, selection, course.step)
+        search.last = selection.point
+    return _accepted(search, selection, effects is not None, space, course)
 
 
 def _first_answer(search: Search, course: _Course) -> Point | None:
-    """Tell and keep the robot of the first rows, and how well it predicts the held-out rows after them."""
+    """Tell the numbers of the robot of the first rows, and its error in the held-out rows after them."""
     course.begin("first answer")
     model = search.misfit.model
     try:
@@ -265,32 +258,12 @@ def _first_answer(search: Search, course: _Course) -> Point | None:
     except SearchError as error:
         search.tell(f"no first answer: {error}")
         return None
-    errors = _errors(search, point.x, rows=rows)
-    known = [error for error in errors if error is not None]
-    if known:
-        posterior = Posterior.of(model, point, model.names)
-        words = ", ".join(f"{it.label} {it.value:.3g} ± {it.error:.2g} {it.unit}".rstrip()
-                          for it in estimates_of(posterior, point.x, model.names)
-                          if model.effect(it.effect).basic)  # fmt: skip
-        course.step(f"first answer, tip error in held-out rows {1e3 * np.mean(known):.3g} mm: {words}")
-        held_out = dict(zip((it.name for it in search.misfit.data), errors, strict=True))
-
-        def found() -> Identified:
-            robot = model.reduced(point.x, model.names)
-            result = _result(search, robot, (point.x, model.names), posterior)
-            return dataclasses.replace(result, held_out_error=held_out)
-
-        course.best = found
+    errors = [error for error in _errors(search, point.x, rows=rows) if error is not None]
+    found = estimates_of(Posterior.of(model, point, model.names), point.x, model.names)
+    words = ", ".join(f"{it.label} {it.value:.3g} ± {it.error:.2g} {it.unit}" for it in found
+                      if model.effect(it.effect).basic)  # fmt: skip
+    course.step(f"first answer, tip error in held-out rows {1e3 * np.mean(errors or np.nan):.3g} mm: {words}")
     return point
-
-
-def _untried(search: Search, names: Sequence[str], x: np.ndarray) -> Identified:
-    """Return the robot with some effects, which was neither tried nor compared with other sets of effects."""
-    model = search.misfit.model
-    free = model.mask(names)
-    search.deadline = np.inf
-    point = search.run(x, free, effort=(0, 0.0))
-    return _result(search, model.reduced(x, names), (x, names), Posterior.of(model, point, names))
 
 
 # plain parameters
@@ -434,14 +407,14 @@ def _accepted(
     result = _result(search, robot, (x, kept), posterior)
     held_out = {it.name: _places(it) and error for it, error in zip(data, errors, strict=True)}
     result = dataclasses.replace(result, held_out_error=held_out)
-    course.best = lambda: result
-    if result.undecided:
-        course.begin("next experiment")
-        experiment = next_experiment(search, posterior, x, tuple(result.undecided))
-        result = dataclasses.replace(result, next_experiment=experiment)
-    course.begin("band of predictions")
-    ensemble = sampled(search, (x, kept), posterior, selection.held_out, robot.trained)
-    return dataclasses.replace(result, ensemble=ensemble)
+    course.result = result
+    course.begin(STAGES[-1])
+    undecided = tuple(result.undecided)
+    return dataclasses.replace(
+        result,
+        next_experiment=next_experiment(search, posterior, x, undecided) if undecided else None,
+        ensemble=sampled(search, (x, kept), posterior, selection.held_out, robot.trained),
+    )
 
 
 def _averaged(

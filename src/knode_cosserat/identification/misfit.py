@@ -169,7 +169,7 @@ class Misfit:
         resolved = [k for k, target in targets.items() if target.is_resolved]
         # the longest ones first
         wanted = [(k, 2) for k in resolved]
-        wanted += [(k, 1) for k, target in targets.items() if k in resolved or target is not self.data[k]]
+        wanted += [(k, 1) for k, target in targets.items() if target is not self.data[k]]
 
         def solved(part: tuple[int, int]) -> np.ndarray | None:
             target = targets[part[0]]

@@ -119,6 +119,14 @@ class Posterior:
         spread = np.where(spread > 0.0, spread, np.inf)
         return covariance / np.outer(spread, spread)
 
+    def score(self, names: Iterable[str]) -> float:
+        """Return the logarithm of the probability of a set of effects, but for a constant."""
+        from scipy.special import betaln
+
+        options = sum(not effect.basic for effect in self.model.effects)
+        extra = sum(not self.model.effect(name).basic for name in names)
+        return self.evidence(names) + float(betaln(extra + 1, options - extra + 1))
+
     def evidence(self, names: Iterable[str]) -> float:
         """Return the logarithm of the probability of the data with these effects, but for a constant."""
         return self._solved(names)[2]
@@ -148,18 +156,8 @@ class Posterior:
 
     def _sampled(self) -> dict[tuple[str, ...], float]:
         """Return sets of effects with their shares of a Markov chain (Madigan & York 1995)."""
-        from scipy.special import betaln
-
-        model, random = self.model, np.random.default_rng(0)
+        model, random, score = self.model, np.random.default_rng(0), functools.cache(self.score)
         options = [effect.name for effect in model.effects if not effect.basic]
-        scores: dict[tuple[str, ...], float] = {}
-
-        def score(names: tuple[str, ...]) -> float:
-            if names not in scores:
-                extra = sum(not model.effect(name).basic for name in names)
-                scores[names] = self.evidence(names) + float(betaln(extra + 1, len(options) - extra + 1))
-            return scores[names]
-
         names, counts = model.names, dict[tuple[str, ...], float]()
         for sweep in range(SWEEPS):
             for name in random.permutation(options):

@@ -7,6 +7,7 @@ field, by Huber's loss, and priors of the numbers. `scipy.optimize.least_squares
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
 import time
 from collections.abc import Callable, Sequence
@@ -136,7 +137,7 @@ class Search:
         deadline: float = np.inf,
     ):  # fmt: skip
         self.misfit, self.tell, self.journal, self.deadline = misfit, tell, journal, deadline
-        #: the end of the last search
+        #: the end of the last search in all recordings
         self.last: Point | None = None
         self.prior = np.asarray(misfit.model.prior if prior is None else prior)
         #: True if no number has a prior: the equations are taken to be exact, and noise to be white
@@ -247,7 +248,7 @@ class Search:
         effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None,
         equations: Equations = "free", near: Float[np.ndarray, " n"] | None = None,
     ) -> Point:  # fmt: skip
-        """Return the end of a search (Levenberg-Marquardt) from a point, which is `last` from then on.
+        """Return the end of a search (Levenberg-Marquardt) from a point.
 
         Args:
             x: the point.
@@ -261,26 +262,31 @@ class Search:
         Raises:
             SearchError: the robot at that point cannot be simulated.
         """
-        if self.journal is None:
-            self.last = self._searched(x, free, subset, effort, scale, equations, near)
-            return self.last
-        options = repr((subset.rows, subset.which and tuple(subset.which), effort, scale is None, equations))
+        options = (subset.rows, subset.which and tuple(subset.which), effort, scale is None, equations)
         begins = (np.zeros(0) if it is None else it for it in (scale, near))
-        key = hashed(self._identity, options, x, free, *begins)
+        solve = functools.partial(self._searched, x, free, subset, effort, scale, equations, near)
+        point = self._resumed(solve, repr(options), x, free, *begins) if self.journal else solve()
+        if subset.which is None:
+            self.last = point
+        return point
+
+    def _resumed(self, solve: Callable[[], Point], *begun: Any) -> Point:
+        """Return the end of a search that began so, from the journal if it is there."""
+        assert self.journal is not None
+        key = hashed(self._identity, *begun)
         try:
             kept = self.journal.load(key)
         except CheckpointError:  # a damaged file counts as missing
             kept = None
         if kept is None:
             try:
-                kept = self._searched(x, free, subset, effort, scale, equations, near).facts()
+                kept = solve().facts()
             except SearchError as error:
                 kept = {"failed": str(error)}
             self.journal.save(key, kept)
         if "failed" in kept:
             raise SearchError(kept["failed"])
-        self.last = Point.of(kept)
-        return self.last
+        return Point.of(kept)
 
     def without(
         self, point: Point, k: int, effort: tuple[int, float], equations: Equations = "free"

@@ -22,6 +22,8 @@ TRIED = (15, 2e-3)
 FIRST, FOLD = (6, 1e-2), (8, 5e-3)
 #: part of the motion that the first answer is searched in
 SEEN = 0.25
+#: a set of effects is not searched if the logarithm of its probability is larger by less
+HARDLY = 1.0
 #: most selections by what recordings disagree about
 SELECTIONS = 3
 #: a set of effects, or their average, is not used if the logarithm of the differences' size is larger by this
@@ -114,14 +116,11 @@ def _with_few_first(search: Search) -> Point:
         return point
 
 
-def selected(
-    search: Search, point: Point, tell: Callable[[str], None],
-    kept: Callable[[tuple[str, ...], Point], None],
-) -> tuple[tuple[str, ...], Point]:  # fmt: skip
+def selected(search: Search, point: Point, tell: Callable[[str], None]) -> tuple[tuple[str, ...], Point]:
     """Return the effects that are more probable than not, and the end of their search.
 
     The probabilities belong to equations that are linear about a point (`Posterior`), so the search with the
-    selected effects gives new ones, until no other set is selected. Each end is `kept`.
+    selected effects gives new ones, until no other set is selected that is clearly more probable.
 
     Raises:
         SearchError: no set of effects can be searched.
@@ -129,11 +128,12 @@ def selected(
     model, searched = search.misfit.model, list[tuple[str, ...]]()
     begin, posterior = np.where(point.free, point.x, model.begin), Posterior.of(model, point)
     while posterior.names() not in searched and len(searched) < MOST:
+        if searched and not is_clearly_better(posterior, searched[-1]):
+            break
         end = search_of(search, posterior, begin)
         if end is None:
             break
         searched.append(posterior.names())
-        kept(searched[-1], end)
         tell(f"with {', '.join(searched[-1])}: {sizes(end)}")
         posterior = Posterior.of(model, end)
     if not searched:
@@ -141,10 +141,7 @@ def selected(
     return searched[-1], posterior.point
 
 
-def best_predicting(
-    search: Search, selection: Selection, tell: Callable[[str], None],
-    kept: Callable[[tuple[str, ...], Point], None],
-) -> Selection:  # fmt: skip
+def best_predicting(search: Search, selection: Selection, tell: Callable[[str], None]) -> Selection:
     """Return a selection in view of what recordings disagree about, as long as it predicts as well.
 
     Each set is selected about the end of the last one, and has to predict as well as that the recordings that
@@ -152,7 +149,7 @@ def best_predicting(
     """
     for _ in range(SELECTIONS):
         posterior, last = selection.posterior(search.misfit.model), selection.point
-        if posterior.names() == selection.names:
+        if not is_clearly_better(posterior, selection.names):
             break
         end = search_of(search, posterior, np.where(last.free, last.x, search.misfit.model.begin))
         if end is None:
@@ -163,9 +160,13 @@ def best_predicting(
             tell(f"not {words}; it predicts held-out recordings worse")
             break
         tell(words)
-        kept(other.names, other.point)
         selection = other
     return selection
+
+
+def is_clearly_better(posterior: Posterior, names: tuple[str, ...]) -> bool:
+    """Return True if the selected effects are clearly more probable than others."""
+    return posterior.score(posterior.names()) > posterior.score(names) + HARDLY
 
 
 def search_of(search: Search, posterior: Posterior, begin: Float[np.ndarray, " n"]) -> Point | None:
