@@ -613,7 +613,7 @@ class Function:
     def side_by_side(
         self, program: Program, outputs: Sequence[int], every: Sequence[Mapping[int, Any]]
     ) -> list[Values]:
-        """Write the operations of scalars that outputs need, each for all known values before the next one."""
+        """Write the scalar operations that outputs need, each for all known values before the next one."""
         found = [Values(known) for known in every]
         for node, values in itertools.product(program.needed(outputs, found[0]), found):
             if node not in values:
