@@ -109,7 +109,9 @@ class ArrayCode:
         """Return the value of a scalar, or the memory of an array; None if it is not known yet."""
         if self.program.is_constant(node):
             return self.function.value(self.program.values[node])
-        return self._values.get(node)
+        if node not in self._values:
+            return None
+        return self._values[node]
 
     def write(self, node: int) -> None:
         """Write an array, with those that share its loop; nothing if it is computed where it is used."""

@@ -164,11 +164,6 @@ class Values(dict[int, Any]):
         value = super().__getitem__(node)
         return value() if callable(value) else value
 
-    def get(self, node: int, default: Any = None) -> Any:
-        """Return the value of a node, or the default."""
-        value = super().get(node, default)
-        return value() if callable(value) else value
-
 
 class Module:
     """Functions that are compiled together."""
@@ -613,7 +608,7 @@ class Function:
     def side_by_side(
         self, program: Program, outputs: Sequence[int], every: Sequence[Mapping[int, Any]]
     ) -> list[Values]:
-        """Write the operations of scalars that outputs need, each for all known values before the next."""
+        """Write the scalar operations that outputs need, each for all known values before the next one."""
         found = [Values(known) for known in every]
         for node, values in itertools.product(program.needed(outputs, found[0]), found):
             if node not in values:
