@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -49,7 +50,7 @@ class Pattern:
             zeros.append(constant_zeros(np.any(is_moving(known), axis=tuple(range(axis))).astype(float)))
         return Pattern(structure, masks_of(zeros))
 
-    @property
+    @functools.cached_property
     def system(self) -> System:
         """A system of this pattern, with ones for all other parameters."""
         leaves = []
