@@ -1,13 +1,19 @@
 """Closed-loop control, its study and the times of its parts: `python -m benchmarks.control [--full]`.
 
 Writes benchmarks/control.json and prints the tables of docs/control.md. The quick study takes ten minutes.
+
+`python -m benchmarks.control --periods [--against CHECKOUT]` prints the times of 1,000 periods at 50 and
+100 Hz only, beside those of another checkout: a process for each, which take turns.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import os
 import statistics
+import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -18,6 +24,10 @@ from benchmarks.run import machine
 
 RESULTS = Path("benchmarks/control.json")
 ROUNDS = 200
+#: periods (s) of control, number of periods, and periods in a turn
+PERIODS, COUNT, TURN = (0.02, 0.01), 1000, 100
+#: predictive controllers: the default, which earlier versions have, and one whose size is chosen
+SIZES = {"20 steps, 8 knots": "predictive", "chosen": "predictive:realtime=0.6"}
 
 
 def _milliseconds(function: Callable[[], Any]) -> float:
@@ -83,6 +93,94 @@ def costs() -> dict[str, Any]:
     }
 
 
+def loops(source: str) -> None:
+    """Close a loop of the paper's robot, a turn for each line of input, and print its times."""
+    sys.path.insert(0, f"{source}/src")
+    import knode_cosserat as kc
+    from knode_cosserat import control as kcc
+    from knode_cosserat.control.loop import Loop
+
+    made = json.loads(sys.stdin.readline())
+    robot, tip = kc.load_robot("delrin-tendon-robot"), kc.estimation.TipPosition()
+    try:
+        controller = kcc.controller_named(made["name"], robot, made["dt"], kcc.ControlLimits(0.0, 10.0, 40.0))
+    except ValueError as error:
+        print(json.dumps([False, str(error)]), flush=True)
+        return
+    spent = [0.0]
+
+    def timed(function: Callable[..., Any]) -> Callable[..., Any]:
+        def call(*arguments: Any) -> Any:
+            before = time.process_time()
+            result = function(*arguments)
+            spent[0] += time.process_time() - before
+            return result
+
+        return call
+
+    plant = kcc.SimulatedPlant(robot, made["dt"], kcc.Sensor(tip))
+    loop = Loop(controller, plant, kcc.circle(0.1, 4.0))
+    for name in ("command", "advance", "prepare"):
+        setattr(controller, name, timed(getattr(controller, name)))
+    import gc
+
+    gc.collect()
+    gc.disable()
+    cpu = []
+    print(json.dumps([True, repr(controller)]), flush=True)
+    for _ in sys.stdin:
+        for _ in range(TURN):
+            spent[0] = 0.0
+            loop.period()
+            cpu.append(spent[0])
+        log = loop.log()
+        cycle = log.feedback + log.preparation
+        rows = [log.feedback.tolist(), cycle.tolist(), cpu]
+        print(json.dumps([rows, log.tip_rmse(), log.fallbacks]), flush=True)
+
+
+def periods(against: str | None) -> str:
+    """Return a table of the times of periods, of this checkout and of another one."""
+    import numpy as np
+
+    from studies.report import markdown_table
+
+    sources = {"this one": str(Path(__file__).resolve().parents[1])} | ({against: against} if against else {})
+    rows = []
+    for dt in PERIODS:
+        workers, answers = {}, dict[Any, Any]()
+        for name, controller in SIZES.items():
+            for label, source in sources.items():
+                environment = os.environ | {"PYTHONPATH": f"{source}/src:{source}"}
+                worker = subprocess.Popen(
+                    [sys.executable, __file__, "--loops", source], stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE, text=True, env=environment,
+                )  # fmt: skip
+                ready, said = _asked(worker, json.dumps({"name": controller, "dt": dt}))
+                if ready:
+                    workers[name, label] = worker
+                print(f"{1.0 / dt:g} Hz, {name}, {label}: {said}", flush=True)
+        for _ in range(COUNT // TURN):
+            for key, worker in workers.items():
+                answers[key] = _asked(worker, "")
+        for (name, label), ((feedback, cycle, cpu), rmse, fallbacks) in answers.items():
+            late = int(np.sum(np.array(cycle) > dt))
+            quantiles = np.percentile([feedback, cycle, cpu], (50, 99), axis=1).T
+            times = [f"{1e3 * quantile:.1f}" for quantile in quantiles.ravel()]
+            own = [f"{1.0 / dt:g} Hz", name, label, *times, f"{late}", f"{fallbacks}", f"{1e3 * rmse:.4f}"]
+            rows.append(own)
+            workers[name, label].stdin.close()
+            workers[name, label].wait()
+    head = ["period", "prediction", "checkout", "feedback, ms", "p99", "cycle, ms", "p99", "CPU, ms", "p99"]
+    return markdown_table([*head, "late", "fallbacks", "tip RMSE, mm"], rows)
+
+
+def _asked(worker: Any, line: str) -> Any:
+    worker.stdin.write(line + "\n")
+    worker.stdin.flush()
+    return json.loads(worker.stdout.readline())
+
+
 def table(found: Mapping[str, Any]) -> str:
     """Return the tables in Markdown."""
     from studies.report import markdown_table
@@ -137,7 +235,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--out", type=Path, default=RESULTS)
     parser.add_argument("--full", action="store_true", help="the full study, some hours")
+    parser.add_argument("--periods", action="store_true", help="only the times of periods")
+    parser.add_argument("--against", metavar="CHECKOUT", help="with --periods: another checkout beside it")
+    parser.add_argument("--loops", metavar="CHECKOUT", help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.loops:
+        loops(given.loops)
+        return
+    if given.periods:
+        print(f"{machine()}\n\n{periods(given.against)}")
+        return
     from studies.control import rerun
 
     timed = costs()

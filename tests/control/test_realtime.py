@@ -18,6 +18,7 @@ from knode_cosserat.control import (
 from knode_cosserat.control.planning import Knots
 from knode_cosserat.control.realtime import Size, candidates, chosen, seconds_in_period
 from knode_cosserat.estimation import KalmanObserver, TipPosition
+from tests import commands
 
 DT = 0.02
 ROBOT = kc.load_robot("delrin-tendon-robot")
@@ -103,3 +104,15 @@ def test_a_chosen_controller_runs_and_its_numbers_make_it_again(observer, monkey
     assert named.settings["horizon"] > own.settings["horizon"]
     with pytest.raises(ValueError, match="give either realtime or these numbers"):
         PredictiveController(observer, TipPosition(), LIMITS, realtime=True, horizon=12)
+
+
+def test_the_command_says_what_was_chosen(monkeypatch):
+    monkeypatch.setattr("knode_cosserat.control.predictive.seconds_in_period", lambda controller: 4e-3)
+    words = "control", commands.ROBOT, "--dt", "0.1", "--reference", "circle:radius=0.05,period=4"
+    said = commands.succeeded(*words, "--seconds", "0.3", "--realtime")
+    assert "horizon 1 s in 10 steps of 100 ms, 5 knots: 4.0 ms of 100 ms a period" in said
+    given = said.split("--method ")[1].split()[0]
+    again = commands.told(*words, "--seconds", "0.3", "--method", given)
+    assert again["settings"] == {"horizon": 10, "knots": 5, "stride": 1}
+    failed = commands.run(*words, "--method", "pid", "--realtime")
+    assert failed.exit_code != 0 and "has no option 'realtime'" in failed.stderr

@@ -187,10 +187,6 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
     controller = kcc.controller_named(
         method.name, model, method.dt, limits, method.adapt or (), TipPosition(sigma=method.deviation)
     )
-    choice = getattr(controller, "choice", None)
-    if choice is not None:
-        again = ",".join(f"{name}={value}" for name, value in controller.settings.items())
-        typer.echo(f"{choice} (again with --method predictive:{again})", err=True)
     plant = task.plant_of(model, method.dt)
     beyond = None  # with --live, the target moves
     if task.reference is not None:
@@ -236,6 +232,8 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
         from knode_cosserat.figures import closed_loop
 
         closed_loop(log).savefig(output.figure)
+    choice = getattr(controller, "choice", None)
+    again = ",".join(f"{name}={value}" for name, value in log.settings.items())
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
     lines = [
         f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "
@@ -244,6 +242,7 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
         f"{facts['periods']} periods, {facts['fallbacks']} without a solution; feedback "
         f"{facts['feedback_ms']:.2f} ms, preparation {facts['preparation_ms']:.1f} ms (medians); "
         f"{facts['missed']} took longer than the period of {1e3 * method.dt:g} ms",
+        *([f"{choice}; the same again: --method predictive:{again}"] if choice else []),
         *(f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()),
     ]
     write_output(output.as_json, facts, lines, out=output.out, export=viewer.export)
