@@ -1,8 +1,8 @@
 """Sidecars of machine code on disk: all that running it needs, so that a later process derives nothing again.
 
 A sidecar is JSON with numbers, arrays and the fields of data classes of this package; reading one runs no
-code from it. Its name is a digest of all on which the code depends: structure and zeros of a system, settings,
-the sources of this package, and functions and classes from elsewhere with all to which they refer. If
+code from it. Its name is a digest of all on which the code depends: structure and zeros of a system,
+settings, the sources of this package, and functions and classes from elsewhere with all to which they refer. If
 something there cannot be described, such as an open file, there is no sidecar.
 """
 
@@ -35,17 +35,38 @@ PACKAGE = "knode_cosserat"
 #: packages described by their versions
 LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "numpy")
 #: attributes of a class that do not change what its instances compute, beside those of its fields
-_INCIDENTAL = frozenset(
-    "__module__ __qualname__ __doc__ __dict__ __weakref__ __annotations__ __init__ __repr__ __eq__ __hash__ "
-    "__setattr__ __delattr__ __dataclass_fields__ __dataclass_params__ __match_args__ __parameters__ "
-    "__orig_bases__ __abstractmethods__ _abc_impl __replace__ __firstlineno__ __static_attributes__ "
-    "__annotate_func__ __annotations_cache__ __slots__".split()
-)
+_INCIDENTAL = {
+    "__module__",
+    "__qualname__",
+    "__doc__",
+    "__dict__",
+    "__weakref__",
+    "__annotations__",
+    "__init__",
+    "__repr__",
+    "__eq__",
+    "__hash__",
+    "__setattr__",
+    "__delattr__",
+    "__dataclass_fields__",
+    "__dataclass_params__",
+    "__match_args__",
+    "__parameters__",
+    "__orig_bases__",
+    "__abstractmethods__",
+    "_abc_impl",
+    "__replace__",
+    "__firstlineno__",
+    "__static_attributes__",
+    "__annotate_func__",
+    "__annotations_cache__",
+    "__slots__",
+}
 #: what writes code, and is not needed to run it
 _WRITERS = Elimination, Function, Module
 
 
-class _Unknown(Exception):
+class _UnknownError(Exception):
     """A value that cannot be described or stored."""
 
 
@@ -69,7 +90,7 @@ def name_of(key: Any) -> str | None:
         for part in _described(key, set()):
             described.update(f"{len(part)} {part}".encode())
         described.update(f"{_surroundings()} {os.environ.get('KNODE_COSSERAT_CODE')}".encode())
-    except (_Unknown, OSError, RecursionError):
+    except (_UnknownError, OSError, RecursionError):
         return None
     return f"core-{described.hexdigest()}"
 
@@ -83,7 +104,7 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
     elif isinstance(value, (np.ndarray, np.generic, jax.Array)) and not isinstance(value, jax.core.Tracer):
         numbers = np.asarray(value)
         if numbers.dtype.hasobject:
-            raise _Unknown
+            raise _UnknownError
         yield f"array {numbers.dtype} {numbers.shape} {hashlib.sha256(numbers.tobytes()).hexdigest()}"
     elif isinstance(value, types.CodeType):
         yield f"code {value.co_name} {value.co_code.hex()} {value.co_names} {value.co_varnames}"
@@ -120,10 +141,10 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         yield from _all_described((type(value), inner), seen)
     elif _is_versioned(type(value).__module__) and _is_versioned(str(getattr(value, "__module__", "-"))):
         if (name := getattr(value, "__qualname__", getattr(value, "__name__", None))) is None:
-            raise _Unknown
+            raise _UnknownError
         yield f"{value.__module__} {name}"
     else:
-        raise _Unknown
+        raise _UnknownError
 
 
 def _all_described(values: Any, seen: set[int]) -> Iterator[str]:
@@ -193,7 +214,7 @@ def _plain(value: Any) -> Any:
         return {"dict": {name: _plain(each) for name, each in value.items()}}
     if type(value) in (tuple, list):
         return {type(value).__name__: [_plain(each) for each in value]}
-    raise _Unknown
+    raise _UnknownError
 
 
 def _fields(kind: type) -> Sequence[str] | None:
@@ -207,7 +228,7 @@ def _object(module: str, name: str, fields: dict[str, Any]) -> Any:
     """Return an instance of a data class or named tuple of this package, without running its code."""
     kind = getattr(importlib.import_module(module), name) if module.startswith(f"{PACKAGE}.") else None
     if kind is None or _fields(kind) is None:
-        raise _Unknown
+        raise _UnknownError
     values = {key: _restored(each) for key, each in fields.items()}
     if issubclass(kind, tuple):
         return tuple.__new__(kind, values.values())
@@ -229,7 +250,7 @@ def _restored(data: Any) -> Any:
         return jax.ShapeDtypeStruct(tuple(content), float)
     if name == "code":
         if (code := MachineCode.kept(*content)) is None:
-            raise _Unknown
+            raise _UnknownError
         return code
     if name == "object":
         return _object(*content)
@@ -244,7 +265,7 @@ def restored(name: str) -> dict[str, Any] | None:
     content = stored(name)
     try:
         return None if content is None else _restored(json.loads(content))
-    except _Unknown:
+    except _UnknownError:
         return None
 
 
@@ -253,7 +274,7 @@ def keep(name: str, found: Any, given: Collection[str]) -> None:
 
     Nothing is stored if one of them is no data.
     """
-    with contextlib.suppress(_Unknown):
+    with contextlib.suppress(_UnknownError):
         attributes = {
             key: _plain(value)
             for key, value in vars(found).items()
