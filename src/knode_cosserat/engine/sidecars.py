@@ -2,8 +2,8 @@
 
 A sidecar is JSON with numbers, arrays and the fields of data classes of this package; reading one runs no
 code from it. Its name is a digest of all on which the code depends: structure and zeros of a system,
-settings, the sources of this package, and functions and classes from elsewhere with all to which they refer. If
-something there cannot be described, such as an open file, there is no sidecar.
+settings, the sources of this package, and functions and classes from elsewhere with all to which they
+refer. If something there cannot be described, such as an open file, there is no sidecar.
 """
 
 from __future__ import annotations
