@@ -120,7 +120,9 @@ class _Sums:
     """
 
     def __init__(self, memory: Memory, lanes: int):
-        self._memory, self._lanes = memory, lanes
+        # numbers may be those of `Columns`, which only the memory of a map knows
+        self._memory: Any = memory
+        self._lanes = lanes
         self._waiting: dict[Any, list[Straight]] = {}
         #: numbers that wait for the present value of a number
         self._readers: dict[Any, set[Any]] = {}
@@ -157,18 +159,16 @@ class _Sums:
             self._memory._put(0.0 if value is None else value, *target, self._lanes)
 
     def _initial(self, operation: Straight) -> Value | None:
-        is_set = isinstance(operation, Show) or (
-            isinstance(operation, Scale) and operation.coefficient is None
-        )
-        return None if is_set else self._get(operation.target)
+        is_cleared = isinstance(operation, Scale) and operation.coefficient is None
+        return None if is_cleared or isinstance(operation, Show) else self._get(operation.target)
 
     def _after(self, value: Value | None, operation: Straight) -> Value | None:
         """Return the value of a number after an operation; None is zero."""
         if isinstance(operation, Show):
             return self._get(operation.source)
         if isinstance(operation, Scale):
-            scaled = value is not None and operation.coefficient is not None
-            return self._times(operation.coefficient, value) if scaled else None
+            factor = operation.coefficient
+            return None if value is None or factor is None else self._times(factor, value)
         source = self._get(operation.source)
         if source is None:
             return value
