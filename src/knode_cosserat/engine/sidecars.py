@@ -26,7 +26,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import knode_cosserat
 from knode_cosserat.engine.codegen import Function, Module
 from knode_cosserat.engine.equations import Elimination, Sizes
 from knode_cosserat.engine.machine_code import MachineCode, computer, store, stored
@@ -52,7 +51,7 @@ class UnknownError(Exception):
 @functools.cache
 def _surroundings() -> str:
     """Return a digest of this package's sources, and versions of the libraries."""
-    found, folder = hashlib.sha256(), Path(knode_cosserat.__file__).parent
+    found, folder = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         found.update(f"{path.relative_to(folder)}\0".encode() + path.read_bytes())
     versions = [sys.modules[name].__version__ for name in LIBRARIES]
