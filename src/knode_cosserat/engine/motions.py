@@ -49,17 +49,39 @@ class Motions(Generic[States]):
         options = dataclasses.astuple(steps.settings.newton)
         for array, numbers in ((core.options, options), (core.tip_offset, steps.tip_offset)):
             self._view(self._memory[None], [array])[:] = numbers
-        self._parameters = self._in_lanes(np.broadcast_to(parameters, (self.size, core.params.size)))
+        self.parameters = parameters
         #: lengths of the robots (m), and states of their vectors
         self._lengths = np.zeros(self._parameters.shape[:2])
         self.motions = np.empty((len(self._parameters), core._motion.stop - core._motion.start))
+        self.put(states, np.arange(len(self._parameters) * core.P))
+
+    @property
+    def parameters(self) -> np.ndarray:
+        """Parameters (vectors, lanes, n)."""
+        return self._parameters
+
+    @parameters.setter
+    def parameters(self, values: np.ndarray) -> None:
+        self._parameters = self._in_lanes(np.broadcast_to(values, (self.size, self.core.params.size)))
+        self._inside = -1
+
+    def put(self, states: States, places: np.ndarray) -> None:
+        """Write the states (n, ...) of robots at places (n,); the last one is that of all places beyond."""
+        core, self._inside = self.core, -1
+        vectors, lanes = np.divmod(places, core.P)
         for arrays, values in zip(core._parts.values(), states, strict=True):
             values = np.asarray(values, float)
-            values = values.reshape(self.size, len(arrays), -1, core._width(arrays[0]))
-            values = self._in_lanes(core._by_strand(arrays[0], values))
+            values = values.reshape(len(values), len(arrays), -1, core._width(arrays[0]))
+            values = core._by_strand(arrays[0], values)[np.minimum(np.arange(len(places)), len(values) - 1)]
             target, count = self._view(self.motions, arrays, core._motion.start), values.shape[-2]
             # the last place is repeated in the lanes beyond it
-            target[..., :count, :], target[..., count:, :] = values, values[..., -1:, :]
+            for where, own in ((slice(count), values), (slice(count, None), values[..., -1:, :])):
+                target[vectors, lanes, :, where] = own
+
+    def set_times(self, t0: Float[np.ndarray, " robots"]) -> None:
+        """Set the times (s) of row 0."""
+        self._view(self.motions, [self.core.t0], self.core._motion.start)[:, :, 0, 0, 0] = self._in_lanes(t0)
+        self._inside = -1
 
     def _in_lanes(self, values: np.ndarray) -> np.ndarray:
         """Return values (vectors, lanes, ...) of robots; the last robot is repeated in the last vector."""
