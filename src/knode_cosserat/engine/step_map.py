@@ -82,10 +82,13 @@ class StepMap(EliminationCode):
         reached = range(ny) if self.stages else self.rows["far"]
         slopes = {i for i, c in e.pattern if c in reached}
         self.rows["rates"] = sorted(slopes.union(self.rows["rates"]))
+        groups, blocks = self.groups[1] * self.strands, range(0, self.own, COLUMNS)
         #: columns of X and T in lanes, in as many vectors as are needed
-        self.width = -(-self.own // COLUMNS) * COLUMNS
-        self.X = self._in_lanes(ny, self.points)
-        self.T = self._in_lanes(self.own, self.groups[1] * self.strands)
+        self.width = len(blocks) * COLUMNS
+        self.X, self.T = (
+            dataclasses.replace(self._columns(rows * len(blocks), count), component=1)
+            for rows, count in ((ny, self.points), (self.own, groups))
+        )
         #: component of a packed row for each number of each strand's record
         self.packed = e.by_strand(np.arange(self.strands * numbers))
         many = a if transposed else self._columns
@@ -99,7 +102,6 @@ class StepMap(EliminationCode):
             dataclasses.replace(each, offset=0, memory=STATE + 1 + n)
             for n, each in enumerate(self.lasting[:-1])
         ]
-        groups = self.groups[1] * self.strands
         # without jumps, y at the points is part of the new record
         y = dataclasses.replace(records[-1], size=ny, count=self.points)
         t = self.tangents = Tangents(
@@ -116,13 +118,6 @@ class StepMap(EliminationCode):
         """Reserve an array of tangents side by side."""
         found = Array(self._size, size, count, COLUMNS, size * COLUMNS, memory)
         self._size += size * count * COLUMNS
-        return found
-
-    def _in_lanes(self, rows: int, count: int) -> Array:
-        """Reserve matrices with a strand's unknowns in lanes."""
-        size = rows * self.width
-        found = Array(self._size, size, count, 1, size)
-        self._size += size * count
         return found
 
     def _of_X(self, row: int, column: int) -> int:
@@ -148,18 +143,16 @@ class StepMap(EliminationCode):
         k, own, (size, count) = self.equations.k, self.own, self.groups
         self.along = f = self._function("along")
 
-        def advance(start: Any, stop: Any) -> None:
-            write(self, [Loop(start, stop, self._columns_advanced)], COLUMNS, False)
-
+        advance = functools.partial(Loop, body=self._columns_advanced)
         with f.loop(self.strands) as strand:
             base = strand.value * self.strand_points
             with f.loop(count) as g:
                 first = base + g.value * size
                 last = f.index(first + size)
-                advance(first, last.value)
+                write(self, [advance(first, last.value)], COLUMNS, False)
                 self._write_change(last, f.index(strand.value * count + g.value))
             tip = f.index(base + self.grid.tip)
-            advance(base + count * size, tip.value)
+            write(self, [advance(base + count * size, tip.value)], COLUMNS, False)
             column = strand.value * (own * self._padded(k))
             for i, block in itertools.product(range(k), range(0, own, COLUMNS)):
                 row = f.splat(f.value(0.0), COLUMNS)
@@ -195,9 +188,9 @@ class StepMap(EliminationCode):
             for b, numbers in zip(blocks, lanes, strict=True):
                 change = -(scale * self._get(self.X, self._of_X(pivot, b), point, L))
                 changes.append(f.select(f.compare("eq", numbers, float(r)), scale - 1.0, change))
-            for matrix, at in ((self.X, point), (self.T, group)):
+            for matrix, at, rows in ((self.X, point, self.equations.ny), (self.T, group, own)):
                 first = self._pointer(matrix, at)
-                with f.loop(matrix.size // self.width) as row:
+                with f.loop(rows) as row:
                     here = f.pointer(first, row.value * self.width)
                     number = f.load(here, r)
                     for b, change in zip(blocks, changes, strict=True):

@@ -49,13 +49,8 @@ class _TangentCode(StepMap):
     def __init__(self, system: System, settings: Settings, moving: Sequence[np.ndarray]):
         super().__init__(system, settings, moving, self.transposed)
         e, a = self.equations, self._array
-        self.jumps += [
-            (array, _nodes(nonzeros["far"]))
-            for array, nonzeros in (
-                (self.by_history["far"], e.by_history),
-                (self.by_control["far"], e.by_control),
-            )
-        ]
+        for arrays, nonzeros in (self.by_history, e.by_history), (self.by_control, e.by_control):
+            self.jumps.append((arrays["far"], _nodes(nonzeros["far"])))
         # the solved motion
         self.records = [a(e.numbers, self.used) for _ in range(settings.memory)]
         self.rate = a(e.numbers, self.used)
@@ -203,14 +198,16 @@ class _TangentCode(StepMap):
         """Numbers of a step's control, row and unknowns."""
         return self.equations.nc, len(self.grid.nodes) * self.packed.size, self.equations.k
 
-    def _places_of_records(self) -> list[Variable]:
-        """Begin a run: return where the records of a state are, from the last one."""
-        return [Variable(self._now, self._now.value(each.offset, "i64")) for each in self.lasting[:-1]]
+    def _begin_turns(self) -> None:
+        """Begin a run, in which the records of a state change places from step to step."""
+        offsets = (self._now.value(each.offset, "i64") for each in self.lasting[:-1])
+        #: where the records are, from the last one
+        self.turning = [Variable(self._now, each) for each in offsets]
 
-    def _turn(self, places: list[Variable], last: int) -> None:
-        """Change the places of records between steps; `last` is the one that becomes the last."""
-        values = [each.get() for each in places]
-        for place, value in zip(places, values[last:] + values[:last], strict=True):
+    def _turn(self, last: int) -> None:
+        """Change the places of records; `last` is the one that becomes the last."""
+        values = [each.get() for each in self.turning]
+        for place, value in zip(self.turning, values[last:] + values[:last], strict=True):
             place.set(value)
 
     def _lasting(self, states: np.ndarray, lanes: int, turns: int = 0) -> np.ndarray:
@@ -225,10 +222,28 @@ class _TangentCode(StepMap):
         turned = [*((k + turns) % memory for k in range(memory)), memory]
         return found[:, :, turned] if turns else found
 
-    def _write_step(self, state: Value, places: list[Variable], *arguments: Any) -> None:
-        f = self._now
-        records = [f.pointer(state, place.get()) for place in places]
-        f.call(self.step, f.arguments[0], state, *records, *arguments)
+    def _begin_step(self, *arguments: str) -> list[Any]:
+        """Begin the map of a step for columns side by side; return data, then what else is given."""
+        records = [f"record{k}" for k in range(self.settings.memory)]
+        names = "state", *records, "coefficients", "control", "row", "unknowns", *arguments
+        self.step = self._function("step", *names, "n_columns")
+        coefficients, *data, width = self.step.arguments[STATE + 1 + len(records) :]
+        return [coefficients, *(Columns(each, width) for each in data[:3]), *data[3:], width]
+
+    def _write_columns(
+        self, step: Index, table: Value, lanes: int, states: Value, moved: Sequence[Value], *given: Value
+    ) -> None:
+        """Write the map of a step for all columns: those of `moved` control, row, unknowns, and weights."""
+        f, width = self._now, given[-1]
+        sizes = itertools.chain(self._sizes, itertools.repeat(0))
+        starts = [
+            f.pointer(each, step.value * width * size) for each, size in zip(moved, sizes, strict=False)
+        ]
+        with f.loop(width, 0, lanes) as first:
+            own = [f.pointer(each, first.value) for each in starts]
+            state = f.pointer(states, first.value * (self.state_size // lanes))
+            records = [f.pointer(state, place.get()) for place in self.turning]
+            f.call(self.step, f.arguments[0], state, *records, table, *own, *given)
 
     def _begun(self, solved: SolvedSteps) -> list[np.ndarray]:
         """Return the memory before a run, controls, coefficients, rows and unknowns."""
@@ -295,11 +310,11 @@ class TangentCore(_TangentCode):
 
     def _write_tangents(self) -> None:
         """Tangents of the step, of as many columns as there are lanes."""
-        t, records = self.tangents, [f"record{k}" for k in range(self.settings.memory)]
-        arguments = ["coefficients", "control", "row", "unknowns", "directions", "weights"]
-        self.step = f = self._function("step", "state", *records, *arguments, "n_directions", "n_columns")
-        coefficients, *data, directions, weights, count, width = f.arguments[2 + len(records) :]
-        control, row, unknowns = (Columns(each, width) for each in data)
+        t = self.tangents
+        coefficients, control, row, unknowns, weights, directions, count, width = self._begin_step(
+            "weights", "directions", "n_directions"
+        )
+        f = self._now
         at_tip = [Add(Number(t.tip, i), Number(self.added_tip, i)) for i in range(self.equations.k)]
         write(self, [*self._at_fixed_y(coefficients, control), *at_tip], COLUMNS, False)
         with f.loop(count) as d:
@@ -329,7 +344,7 @@ class TangentCore(_TangentCode):
         f = self._now = self.module.function("run", names, exported=True)
         memory, controls, coefficients, rows, unknowns, directions, states, weights = f.arguments[:8]
         *moved, steps, count, width = f.arguments[8:]
-        places = self._places_of_records()
+        self._begin_turns()
         f.call(self.setup, memory)
         with f.loop(steps) as step:
             table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
@@ -338,19 +353,9 @@ class TangentCore(_TangentCode):
             f.call(self.derivatives, memory)
             with f.loop(count) as d:
                 f.call(self.direction, memory, f.pointer(directions, d.value * self.direction_size))
-            starts = [
-                f.pointer(each, step.value * width * size)
-                for each, size in zip(moved, self._sizes, strict=True)
-            ]
-            with f.loop(width, 0, COLUMNS) as first:
-                own = (f.pointer(each, first.value) for each in (*starts, weights))
-                control, row, unknown, weight = own
-                state = f.pointer(states, first.value * (self.state_size // COLUMNS))
-                self._write_step(
-                    state, places, table, control, row, unknown, directions, weight, count, width
-                )
+            self._write_columns(step, table, COLUMNS, states, [*moved, weights], directions, count, width)
             f.call(self.shift, memory, table)
-            self._turn(places, -1)
+            self._turn(-1)
 
     def solve(
         self, solved: SolvedSteps, moves: tuple[Any, Any], d_controls: Any, d_states: Any, d_tip: Any = 0.0
@@ -497,14 +502,10 @@ class CotangentCore(_TangentCode):
 
     def _write_cotangents(self) -> None:
         """Cotangents of a step's data from those of its results."""
-        records = [f"record{k}" for k in range(self.settings.memory)]
-        arguments = ["coefficients", "control", "row", "unknowns", "n_columns"]
-        self.step = f = self._function("step", "state", *records, *arguments)
-        coefficients, *data, width = f.arguments[2 + len(records) :]
-        control, row, unknowns = (Columns(each, width) for each in data)
+        coefficients, control, row, unknowns, _ = self._begin_step()
         write(self, self._solution(coefficients, row, unknowns), 1, True)
         if self.equations.by_terms:
-            f.call(self.pulled, *f.arguments[:2])
+            self._now.call(self.pulled, *self._now.arguments[:2])
         write(self, self._at_fixed_y(coefficients, control), 1, True)
 
     def _write_run(self) -> None:
@@ -513,7 +514,7 @@ class CotangentCore(_TangentCode):
         names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_columns"]
         f = self._now = self.module.function("run", names, exported=True)
         memory, controls, coefficients, rows, unknowns, kept, states, *moved, steps, width = f.arguments
-        places = self._places_of_records()
+        self._begin_turns()
 
         def copy(step: Index, forth: bool) -> None:
             """Keep the arrays that a step starts from, or restore them."""
@@ -539,15 +540,8 @@ class CotangentCore(_TangentCode):
             copy(step, False)
             f.call(self.data, memory, table, control, unknown)
             f.call(self.derivatives, memory)
-            self._turn(places, 1)
-            starts = [
-                f.pointer(each, step.value * width * size)
-                for each, size in zip(moved, self._sizes, strict=True)
-            ]
-            with f.loop(width) as column:
-                own = (f.pointer(each, column.value) for each in starts)
-                state = f.pointer(states, column.value * self.state_size)
-                self._write_step(state, places, table, *own, width)
+            self._turn(1)
+            self._write_columns(step, table, 1, states, moved, width)
         if self.equations.by_terms:
             with f.loop(width) as column:
                 f.call(self.by_geometry, memory, f.pointer(states, column.value * self.state_size))
