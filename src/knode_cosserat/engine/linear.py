@@ -30,7 +30,8 @@ class Columns:
 class Number(NamedTuple):
     """Component i of an array at place j; without an array, a number of one straight piece of a map."""
 
-    array: Array | Columns | None
+    #: `Array`, `Columns` or None
+    array: Any
     i: int
     j: int | Index = 0
 
@@ -154,7 +155,7 @@ class _Sums:
         if target.array is None:
             self._values[key] = value
         else:
-            self._memory._put(0.0 if value is None else value, *target, self._lanes)
+            self._memory._put(0.0 if value is None else value, target.array, target.i, target.j, self._lanes)
 
     def _initial(self, operation: Straight) -> Value | None:
         is_set = isinstance(operation, Show) or (
@@ -167,8 +168,9 @@ class _Sums:
         if isinstance(operation, Show):
             return self._get(operation.source)
         if isinstance(operation, Scale):
-            scaled = value is not None and operation.coefficient is not None
-            return self._times(operation.coefficient, value) if scaled else None
+            if value is None or operation.coefficient is None:
+                return None
+            return self._times(operation.coefficient, value)
         source = self._get(operation.source)
         if source is None:
             return value
@@ -180,9 +182,9 @@ class _Sums:
     def _get(self, number: Number) -> Value | None:
         if number.array is None:
             return self._values.get(number.key)
-        return self._memory._get(*number, self._lanes)
+        return self._memory._get(number.array, number.i, number.j, self._lanes)
 
     def _times(self, coefficient: Coefficient, value: Value) -> Value:
         if isinstance(coefficient, Number):
-            coefficient = self._memory._get(*coefficient, 1)
+            coefficient = self._memory._get(coefficient.array, coefficient.i, coefficient.j, 1)
         return value if coefficient == 1.0 else coefficient * value

@@ -32,7 +32,7 @@ class Shape(NamedTuple):
     y: Float[np.ndarray, "points y"]
 
 
-States = TypeVar("States", StateHistory, Shape)
+States = TypeVar("States", bound=StateHistory | Shape)
 
 
 class Motions(Generic[States]):
@@ -43,7 +43,8 @@ class Motions(Generic[States]):
 
     def __init__(self, core: Core, parameters: np.ndarray, states: States, steps: StepCoefficients):
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
-        self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
+        self.core, self.steps, self.size = core, steps, len(states[0])
+        self._kind: Any = type(states)
         self._shapes = [np.shape(values)[1:] for values in states]
         self._memory, self._inside = core._empty_memory(), -1
         options = dataclasses.astuple(steps.settings.newton)
@@ -108,9 +109,9 @@ class Motions(Generic[States]):
         return shape, 8 * (one.offset - first), (8, 8 * apart, 8 * one.place, 8 * one.component)
 
     @functools.cached_property
-    def _places(self) -> list[tuple[tuple[int, ...], int, tuple[int, ...]]]:
+    def _places(self) -> list[Any]:
         """Shape, first place and strides of each part of the state of one robot of one strand."""
-        found = []
+        found = list[Any]()
         for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
             _, at, strides = self._place_of(arrays, self.core._motion.start)
             found.append((shape, at, strides[len(strides) - len(shape) :]))

@@ -240,7 +240,8 @@ class OnlineModel:
         )
         d_rows = d_rows[settings.stages - 1 :: settings.stages]
         d_rows = d_rows[:, *np.divmod(columns, rows.records.shape[-1])]
-        spread = Spread(*(np.moveaxis(part, -1, 0) for part in last[2:]), spread.parameters)
+        records, rate = (np.moveaxis(part, -1, 0) for part in last[2:])
+        spread = Spread(records, rate, spread.parameters)
         return moved, Motion(after, rows.records, d_rows, spread)
 
     def predicted(

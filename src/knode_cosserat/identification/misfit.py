@@ -179,14 +179,16 @@ class Misfit:
         found = dict(zip(wanted, self._parallel(solved, wanted), strict=True))
         refined = list[Any]()
         for k, rollout in zip(chosen, rollouts, strict=True):
-            if k in targets:
+            if rollout is not None and k in targets:
                 values, finer = found.get((k, 1), rollout.plain), found.get((k, 2))
                 if values is not None and finer is not None:
                     values = (4.0 * finer - values) / 3.0
                 if values is not None and (finer is not None or k not in resolved):
                     self._accurate[at.tobytes(), k] = values
-            values = None if rollout is None else self._accurate.get((at.tobytes(), k))
-            refined.append(rollout if values is None else rollout.moved(values - rollout.plain))
+            values = self._accurate.get((at.tobytes(), k))
+            if rollout is not None and values is not None:
+                rollout = rollout.moved(values - rollout.plain)
+            refined.append(rollout)
         self._accurate = dict([*self._accurate.items()][-KEPT * len(self.data) :])
         return refined
 
