@@ -236,6 +236,11 @@ def _restored(data: Any) -> Any:
     return {key: _restored(each) for key, each in content.items()}
 
 
+def _writes(value: Any) -> bool:
+    """True for what writes code, or a list of it."""
+    return isinstance(value, _WRITERS) or (type(value) is list and bool(value) and all(map(_writes, value)))
+
+
 def restored(name: str) -> dict[str, Any] | None:
     """Return the attributes of an object from its sidecar; None if it is not complete on disk."""
     content = stored(name)
@@ -254,6 +259,6 @@ def keep(name: str, found: Any, given: Collection[str]) -> None:
         attributes = {
             key: _plain(value)
             for key, value in vars(found).items()
-            if key not in given and not isinstance(value, _WRITERS)
+            if key not in given and not _writes(value)
         }
         store(name, json.dumps({"dict": attributes}).encode())
