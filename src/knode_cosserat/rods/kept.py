@@ -18,17 +18,13 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 _ENTRIES: dict[int, _Entry] = {}
 
 
-def _forget(entries: dict[int, _Entry], key: int, _: Any) -> None:
-    """Drop the entry of a system that is gone; a module's names may be gone too, at the end of a process."""
-    entries.pop(key, None)
-
-
 class _Entry:
     """Results for one system."""
 
     def __init__(self, system: System):
-        key = id(system)
-        self.system = weakref.ref(system, functools.partial(_forget, _ENTRIES, key))
+        # its names also exist when modules are gone at the end of a process
+        key, pop = id(system), _ENTRIES.pop
+        self.system = weakref.ref(system, lambda _: pop(key, None) and None)
         #: arrays of the system that a user can change in place, with their numbers
         self.numbers = [
             (leaf, leaf.tobytes())
