@@ -30,8 +30,7 @@ class Columns:
 class Number(NamedTuple):
     """Component i of an array at place j; without an array, a number of one straight piece of a map."""
 
-    #: `Array`, `Columns` or None
-    array: Any
+    array: Array | Columns | None
     i: int
     j: int | Index = 0
 
@@ -121,7 +120,9 @@ class _Sums:
     """
 
     def __init__(self, memory: Memory, lanes: int):
-        self._memory, self._lanes = memory, lanes
+        # numbers may be those of `Columns`, which only the memory of a map knows
+        self._memory: Any = memory
+        self._lanes = lanes
         self._waiting: dict[Any, list[Straight]] = {}
         #: numbers that wait for the present value of a number
         self._readers: dict[Any, set[Any]] = {}
@@ -155,22 +156,19 @@ class _Sums:
         if target.array is None:
             self._values[key] = value
         else:
-            self._memory._put(0.0 if value is None else value, target.array, target.i, target.j, self._lanes)
+            self._memory._put(0.0 if value is None else value, *target, self._lanes)
 
     def _initial(self, operation: Straight) -> Value | None:
-        is_set = isinstance(operation, Show) or (
-            isinstance(operation, Scale) and operation.coefficient is None
-        )
-        return None if is_set else self._get(operation.target)
+        is_cleared = isinstance(operation, Scale) and operation.coefficient is None
+        return None if is_cleared or isinstance(operation, Show) else self._get(operation.target)
 
     def _after(self, value: Value | None, operation: Straight) -> Value | None:
         """Return the value of a number after an operation; None is zero."""
         if isinstance(operation, Show):
             return self._get(operation.source)
         if isinstance(operation, Scale):
-            if value is None or operation.coefficient is None:
-                return None
-            return self._times(operation.coefficient, value)
+            factor = operation.coefficient
+            return None if value is None or factor is None else self._times(factor, value)
         source = self._get(operation.source)
         if source is None:
             return value
@@ -182,9 +180,9 @@ class _Sums:
     def _get(self, number: Number) -> Value | None:
         if number.array is None:
             return self._values.get(number.key)
-        return self._memory._get(number.array, number.i, number.j, self._lanes)
+        return self._memory._get(*number, self._lanes)
 
     def _times(self, coefficient: Coefficient, value: Value) -> Value:
         if isinstance(coefficient, Number):
-            coefficient = self._memory._get(coefficient.array, coefficient.i, coefficient.j, 1)
+            coefficient = self._memory._get(*coefficient, 1)
         return value if coefficient == 1.0 else coefficient * value
