@@ -126,7 +126,7 @@ class StepMap(EliminationCode):
     def _reserve_state(self) -> None:
         """Reserve further arrays that last from step to step, for each column."""
 
-    def _at(self, array: Array | Columns, i: int, j: int | Index) -> tuple[Value, Any]:
+    def _at(self, array: Array | Columns, i: Any, j: int | Index) -> tuple[Value, Any]:
         if isinstance(array, Columns):
             return array.base, array.width * i
         return super()._at(array, i, j)
@@ -203,7 +203,7 @@ class StepMap(EliminationCode):
         t = self.tangents
         weights = [self._now.load(coefficients, k) for k in self._history_weights]
 
-        def by_data(name: str, places: Sequence[Any], j: Index) -> list[Operation]:
+        def by_data(name: str, places: Sequence[Any], j: Any) -> list[Operation]:
             return self._by_data(name, j, places, (weights, control))
 
         found: list[Operation] = [Loop(0, self.used, lambda j: by_data("rates", [j], j))]
