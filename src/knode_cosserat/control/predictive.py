@@ -54,7 +54,7 @@ class PredictiveController(PlanController):
 
     def __init__(
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, stride: int = 1, realtime: bool | float = False, weights: Weights = Weights(),
+        knots: int = 8, stride: int = 1, realtime: bool | float = 0.0, weights: Weights = Weights(),
         soft: Sequence[SoftLimit] = (),
     ):  # fmt: skip
         """Set up the controller around an observer of the model; `realtime` compiles and measures, too.
