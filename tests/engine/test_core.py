@@ -386,6 +386,25 @@ def test_a_span_continues_another():
     np.testing.assert_allclose(second.records, whole.records[10:], atol=1e-8)
 
 
+@pytest.mark.parametrize("scheme", ["sdirk2", "bdf2"])
+def test_motions_without_estimates(scheme):
+    """The solved rows are the same; errors are NaN, which is not coarse, and stay unknown."""
+    robot, settings, control = robot_of(PAPER), settings_of(scheme), tensions(1)
+    steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
+    pasts = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
+    core = loops.core_of(Pattern.of(robot), settings, robots=False)
+    given = pattern.parameters_of(robot), control, steps
+    _, wanted, with_estimates = core.integrate(*given, pasts, (0, STEPS))
+    _, state, rows = core.integrate(*given, pasts, (0, STEPS), estimates=False)
+    for field in ("records", "unknowns", "corrections", "result", "error"):
+        np.testing.assert_array_equal(getattr(rows, field), getattr(with_estimates, field), field)
+    np.testing.assert_array_equal(state.y, wanted.y)
+    assert np.all(np.isnan(rows.position_error)) and np.all(np.isnan(rows.time_error))
+    assert np.all(np.isnan(state.error)) and not np.any(np.isnan(state.records))
+    _, _, later = core.integrate(*given, state, (0, 2))
+    assert np.all(np.isnan(later.position_error)) and np.max(later.error) <= 1e-10
+
+
 @pytest.mark.parametrize("motion", ["smooth", "random", "still"])
 def test_the_first_guess_trusts_what_was_right_before(motion):
     """Extrapolations are weighted by the third power of their errors in the newest step."""
@@ -425,7 +444,7 @@ def test_a_failed_step_ends_the_loop_with_the_state_before_it():
 
 @pytest.mark.parametrize("name", [PAPER, ROUTED, NETWORK])
 def test_robots_in_lanes_have_their_own_parameters_and_controls(name):
-    """Ten robots in lanes of eight. Estimates of a vector stop together: they differ by their tolerance."""
+    """Ten robots in lanes. Estimates of a vector stop together: they differ by their tolerance."""
     robot, settings, control = robot_of(name), settings_of("sdirk2"), tensions(10)
     moduli = np.linspace(2e9, 4e9, 10)
     systems = [robot.replace(youngs_modulus=modulus) for modulus in moduli]

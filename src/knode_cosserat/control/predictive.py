@@ -54,7 +54,7 @@ class PredictiveController(PlanController):
 
     def __init__(
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, stride: int = 1, realtime: float = 0.0, weights: Weights = Weights(),
+        knots: int = 8, stride: int = 1, realtime: bool | float = 0.0, weights: Weights = Weights(),
         soft: Sequence[SoftLimit] = (),
     ):  # fmt: skip
         """Set up the controller around an observer of the model; `realtime` compiles and measures, too.
@@ -88,8 +88,8 @@ class PredictiveController(PlanController):
                 )
 
             def seconds(size: Size) -> float:
-                sizes, how = size._asdict(), {"weights": weights, "soft": soft}
-                return seconds_in_period(type(self)(copy.copy(observer), target, limits, **sizes, **how))
+                own: dict[str, Any] = size._asdict() | {"weights": weights, "soft": soft}
+                return seconds_in_period(type(self)(copy.copy(observer), target, limits, **own))
 
             share = SHARE if realtime is True else float(realtime)
             self.choice = chosen(seconds, observer.dt, share)

@@ -78,14 +78,18 @@ def solve_steps(
     return jax.tree.map(lambda leaf: leaf[0], found) if alone else found
 
 
-def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions[Any]:
+def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions:
     """Return motions from states (robots, ...), of one system or of as many."""
     core = core_of(Pattern.of(system), steps.settings, robots=len(states[0]) > 1)
-    parameters = parameters_of(system)
-    if np.ndim(system.length):
-        leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
-        parameters = np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-    return Motions(core, parameters, states, steps)
+    return Motions(core, packed(system), states, steps)
+
+
+def packed(system: System) -> np.ndarray:
+    """Return the parameters of a system (n,), or of a batch of robots (robots, n)."""
+    if not np.ndim(system.length):
+        return parameters_of(system)
+    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
+    return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
 
 
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:

@@ -184,7 +184,7 @@ class Memory:
             yield j
 
     def _each(self, size: int) -> Iterator[Any]:
-        """Yield each component of a place; of a single robot, write a loop, which compiles faster."""
+        """Yield each component of a place: in a loop for a single robot, which compiles faster."""
         if self.batch:
             yield from range(size)
         else:

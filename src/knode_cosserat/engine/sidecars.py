@@ -2,8 +2,8 @@
 
 A sidecar is JSON with numbers, arrays and the fields of data classes of this package; reading one runs no
 code from it. Its name is a digest of all on which the code depends: structure and zeros of a system,
-settings, the sources of this package, and functions and classes from elsewhere with all to which they
-refer. If something there cannot be described, such as an open file, there is no sidecar.
+settings, the sources of this package, and functions and classes from elsewhere with all to which they refer.
+If something there cannot be described, such as an open file, there is no sidecar.
 """
 
 from __future__ import annotations
@@ -26,7 +26,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import knode_cosserat
 from knode_cosserat.engine.codegen import Function, Module
 from knode_cosserat.engine.equations import Elimination, Sizes
 from knode_cosserat.engine.machine_code import MachineCode, computer, store, stored
@@ -34,39 +33,15 @@ from knode_cosserat.engine.machine_code import MachineCode, computer, store, sto
 PACKAGE = "knode_cosserat"
 #: packages described by their versions
 LIBRARIES = ("equinox", "jax", "jaxlib", "jaxtyping", "numpy")
-#: attributes of a class that do not change what its instances compute, beside those of its fields
-_INCIDENTAL = {
-    "__module__",
-    "__qualname__",
-    "__doc__",
-    "__dict__",
-    "__weakref__",
-    "__annotations__",
-    "__init__",
-    "__repr__",
-    "__eq__",
-    "__hash__",
-    "__setattr__",
-    "__delattr__",
-    "__dataclass_fields__",
-    "__dataclass_params__",
-    "__match_args__",
-    "__parameters__",
-    "__orig_bases__",
-    "__abstractmethods__",
-    "_abc_impl",
-    "__replace__",
-    "__firstlineno__",
-    "__static_attributes__",
-    "__annotate_func__",
-    "__annotations_cache__",
-    "__slots__",
-}
+#: functions of a class that construct, print and compare its instances
+_GENERATED = frozenset(
+    ("__init__", "__repr__", "__eq__", "__hash__", "__setattr__", "__delattr__", "__replace__")
+)
 #: what writes code, and is not needed to run it
 _WRITERS = Elimination, Function, Module
 
 
-class _UnknownError(Exception):
+class UnknownError(Exception):
     """A value that cannot be described or stored."""
 
 
@@ -76,7 +51,7 @@ class _UnknownError(Exception):
 @functools.cache
 def _surroundings() -> str:
     """Return a digest of this package's sources, and versions of the libraries."""
-    found, folder = hashlib.sha256(), Path(knode_cosserat.__file__).parent
+    found, folder = hashlib.sha256(), Path(__file__).parents[1]
     for path in sorted(folder.rglob("*.py")):
         found.update(f"{path.relative_to(folder)}\0".encode() + path.read_bytes())
     versions = [sys.modules[name].__version__ for name in LIBRARIES]
@@ -90,7 +65,7 @@ def name_of(key: Any) -> str | None:
         for part in _described(key, set()):
             described.update(f"{len(part)} {part}".encode())
         described.update(f"{_surroundings()} {os.environ.get('KNODE_COSSERAT_CODE')}".encode())
-    except (_UnknownError, OSError, RecursionError):
+    except (UnknownError, OSError, RecursionError):
         return None
     return f"core-{described.hexdigest()}"
 
@@ -104,7 +79,7 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
     elif isinstance(value, (np.ndarray, np.generic, jax.Array)) and not isinstance(value, jax.core.Tracer):
         numbers = np.asarray(value)
         if numbers.dtype.hasobject:
-            raise _UnknownError
+            raise UnknownError
         yield f"array {numbers.dtype} {numbers.shape} {hashlib.sha256(numbers.tobytes()).hexdigest()}"
     elif isinstance(value, types.CodeType):
         yield f"code {value.co_name} {value.co_code.hex()} {value.co_names} {value.co_varnames}"
@@ -115,7 +90,7 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         seen.add(id(value))
         yield f"{value.__module__} {value.__qualname__}"
         if not _is_versioned(value.__module__) or "<" in value.__qualname__:
-            yield from (_class if isinstance(value, type) else _function)(value, seen)
+            yield from _class(value, seen) if isinstance(value, type) else _function(value, seen)
     elif isinstance(value, (tuple, list, set, frozenset, dict)):
         yield f"{type(value).__module__} {type(value).__qualname__} {len(value)}"
         if isinstance(value, dict):
@@ -126,7 +101,7 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
     elif isinstance(value, functools.partial):
         yield from _all_described((value.func, value.args, value.keywords), seen)
     elif isinstance(value, (staticmethod, classmethod, types.MethodType)):
-        yield type(value).__name__
+        yield f"{type(value).__qualname__}"
         yield from _all_described((value.__func__, getattr(value, "__self__", None)), seen)
     elif isinstance(value, (property, functools.cached_property)):
         yield from _all_described([getattr(value, part, None) for part in ("fget", "fset", "func")], seen)
@@ -141,10 +116,10 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         yield from _all_described((type(value), inner), seen)
     elif _is_versioned(type(value).__module__) and _is_versioned(str(getattr(value, "__module__", "-"))):
         if (name := getattr(value, "__qualname__", getattr(value, "__name__", None))) is None:
-            raise _UnknownError
+            raise UnknownError
         yield f"{value.__module__} {name}"
     else:
-        raise _UnknownError
+        raise UnknownError
 
 
 def _all_described(values: Any, seen: set[int]) -> Iterator[str]:
@@ -166,7 +141,8 @@ def _captured(function: Any) -> list[Any]:
 def _class(kind: type, seen: set[int]) -> Iterator[str]:
     yield from _all_described(kind.__bases__, seen)
     for name, value in sorted(vars(kind).items()):
-        if name not in _INCIDENTAL:
+        is_special = name.startswith("__") and not isinstance(value, types.FunctionType)
+        if not is_special and name not in _GENERATED and name != "_abc_impl":
             yield name
             yield from _described(value, seen)
 
@@ -214,7 +190,7 @@ def _plain(value: Any) -> Any:
         return {"dict": {name: _plain(each) for name, each in value.items()}}
     if type(value) in (tuple, list):
         return {type(value).__name__: [_plain(each) for each in value]}
-    raise _UnknownError
+    raise UnknownError
 
 
 def _fields(kind: type) -> Sequence[str] | None:
@@ -228,7 +204,7 @@ def _object(module: str, name: str, fields: dict[str, Any]) -> Any:
     """Return an instance of a data class or named tuple of this package, without running its code."""
     kind = getattr(importlib.import_module(module), name) if module.startswith(f"{PACKAGE}.") else None
     if kind is None or _fields(kind) is None:
-        raise _UnknownError
+        raise UnknownError
     values = {key: _restored(each) for key, each in fields.items()}
     if issubclass(kind, tuple):
         return tuple.__new__(kind, values.values())
@@ -250,7 +226,7 @@ def _restored(data: Any) -> Any:
         return jax.ShapeDtypeStruct(tuple(content), float)
     if name == "code":
         if (code := MachineCode.kept(*content)) is None:
-            raise _UnknownError
+            raise UnknownError
         return code
     if name == "object":
         return _object(*content)
@@ -260,12 +236,17 @@ def _restored(data: Any) -> Any:
     return {key: _restored(each) for key, each in content.items()}
 
 
+def _writes(value: Any) -> bool:
+    """True for what writes code, or a list of it."""
+    return isinstance(value, _WRITERS) or (type(value) is list and bool(value) and all(map(_writes, value)))
+
+
 def restored(name: str) -> dict[str, Any] | None:
     """Return the attributes of an object from its sidecar; None if it is not complete on disk."""
     content = stored(name)
     try:
         return None if content is None else _restored(json.loads(content))
-    except _UnknownError:
+    except UnknownError:
         return None
 
 
@@ -274,10 +255,10 @@ def keep(name: str, found: Any, given: Collection[str]) -> None:
 
     Nothing is stored if one of them is no data.
     """
-    with contextlib.suppress(_UnknownError):
+    with contextlib.suppress(UnknownError):
         attributes = {
             key: _plain(value)
             for key, value in vars(found).items()
-            if key not in given and not any(isinstance(each, _WRITERS) for each in jax.tree.leaves(value))
+            if key not in given and not _writes(value)
         }
         store(name, json.dumps({"dict": attributes}).encode())

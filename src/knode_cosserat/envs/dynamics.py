@@ -24,7 +24,7 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
-from knode_cosserat.solvers.history import StateHistory, StepRows, rest_record, resting_history
+from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
@@ -142,7 +142,8 @@ def commanded(
 class EpisodeState(NamedTuple):
     """State of an episode."""
 
-    history: StateHistory
+    #: None where the engine keeps it
+    history: Any
     goal: Any
     #: places of the parameters in their ranges, 0 to 1, before and after the change; the period of the change
     drawn: Float[Any, "2 k"]
@@ -274,47 +275,53 @@ def step_many(
     spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]
 ) -> tuple[EpisodeState, Transition]:
     """Return the states after one period of many episodes under actions (B, c), and their transitions."""
-    systems, states, acting, valid = _moved(spec, arrays, states, actions)
-    task = TimeIntegration(spec.settings, spec.dt, 1, spec.settings.memory)
+    history, others = states.history._replace(t0=states.count * spec.dt), states._replace(history=None)
+    systems, others, acting, valid = moved(spec, arrays, others, actions)
     if is_traced((arrays, states, actions)):
-        solve, axes = rollout(task, Pattern.of(systems)), (None if spec.is_shared else 0, 0, 0)
-        rows, histories = jax.vmap(solve, in_axes=axes)(systems, acting, states.history)
+        task, axes = period(spec), (None if spec.is_shared else 0, 0, 0)
+        solve = rollout(task, Pattern.of(systems))
+        rows, history = jax.vmap(solve, in_axes=axes)(systems, acting, history)
     else:
-        _, histories, rows = task.solve(systems, np.asarray(acting), states.history)
-    after: tuple[EpisodeState, Transition] = _arrived(
-        spec, arrays, systems, states._replace(history=histories), (rows, valid)
+        _, history, rows = period(spec).solve(systems, np.asarray(acting), history)
+    others, transitions = arrived(
+        spec, arrays, systems, others, (rows.records[:, 0], rows.result[:, 0], valid)
     )
-    return after
+    return others._replace(history=history), transitions
+
+
+def period(spec: Spec) -> TimeIntegration:
+    """Return the one step of a period."""
+    return TimeIntegration(spec.settings, spec.dt, 1, spec.settings.memory)
 
 
 @functools.partial(jax.jit, static_argnames="spec")
-def _moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Any:
+def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Any:
     """Return systems, states with the commands of actions, acting controls (B, 1, c), and valid actions."""
 
-    def moved(state: EpisodeState, action: Any) -> Any:
+    def each(state: EpisodeState, action: Any) -> Any:
         before, action = state.commands[0], jnp.asarray(action, dtype=float)
         valid = jnp.all(jnp.isfinite(action))
         command = commanded(spec, arrays, before, jnp.where(valid, action, 0.0))
         commands = jnp.concatenate([jnp.where(valid, command, before)[None], state.commands[:-1]])
-        history = state.history._replace(t0=jnp.asarray(state.count * spec.dt, dtype=float))
-        state = state._replace(commands=commands, history=history)
+        state = state._replace(commands=commands)
         system = None if spec.is_shared else system_of(spec, arrays, state)
         return system, state, commands[state.delay][None], valid
 
-    systems, *rest = jax.vmap(moved)(states, actions)
+    systems, *rest = jax.vmap(each)(states, actions)
     return arrays.robot if spec.is_shared else systems, *rest
 
 
 @functools.partial(jax.jit, static_argnames="spec")
-def _arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solution: Any) -> Any:
-    """Return the states after a solved step, with rows (B, 1, ...), and the transitions.
+def arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solution: Any) -> Any:
+    """Return the states after a solved step, and the transitions; states have no history here.
 
-    `solution` has the rows, and True for valid actions. Without a solution, the state is the one before.
+    `solution` has records and results of the rows, and True for valid actions. Without a solution, the state
+    is the one before.
     """
 
-    def arrived(system: System, state: EpisodeState, row: StepRows, valid: Any) -> Any:
-        solved, coarse = row.result >= 0, row.result == int(Result.COARSE)
-        y, z = split_record(system, jnp.where(solved, row.records, 0.0))
+    def each(system: System, state: EpisodeState, record: Any, result: Any, valid: Any) -> Any:
+        solved, coarse = result >= 0, result == int(Result.COARSE)
+        y, z = split_record(system, jnp.where(solved, record, 0.0))
         key, noise_key = jax.random.split(state.key)
         positions = _noisy(arrays, noise_key, spec.output.value(system, y, z))
         measured = jnp.concatenate([
@@ -342,9 +349,8 @@ def _arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, sol
         )  # fmt: skip
         return state, transition
 
-    rows, valid = solution
-    rows = jax.tree.map(lambda leaf: leaf[:, 0], rows)
-    return jax.vmap(arrived, in_axes=(None if spec.is_shared else 0, 0, 0, 0))(systems, states, rows, valid)
+    axes = (None if spec.is_shared else 0, *[0] * 4)
+    return jax.vmap(each, in_axes=axes)(systems, states, *solution)
 
 
 @functools.partial(jax.jit, static_argnames="spec")
@@ -355,8 +361,9 @@ def reset_many(spec: Any, arrays: Any, keys: Any) -> Any:
 
 @functools.partial(jax.jit, static_argnames="spec", donate_argnames="states")
 def restart(spec: Any, arrays: Any, states: Any, places: Any, keys: Any) -> Any:
-    """Return states with new episodes at some places, and their observations."""
+    """Return states with new episodes at some places, their observations and histories."""
     fresh, observations = jax.vmap(lambda key: reset(spec, arrays, key))(keys)
+    histories, fresh = fresh.history, fresh._replace(history=None)
     # places beyond the end are not written: they only fill up the number
     states = jax.tree.map(lambda leaf, new: leaf.at[places].set(new, mode="drop"), states, fresh)
-    return states, observations
+    return states, observations, histories

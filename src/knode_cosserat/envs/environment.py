@@ -13,6 +13,9 @@ from jaxtyping import Float
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.control import ControlLimits, Reference
+from knode_cosserat.engine.loops import motions_of, packed
+from knode_cosserat.engine.motions import Motions
+from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.envs import dynamics
 from knode_cosserat.envs.dynamics import TENSIONS, Actions, Arrays, EpisodeState, Spec, Transition
 from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError
@@ -103,7 +106,8 @@ class Environment:
         stacked = None
         if models:
             stacked = jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), *models)
-        settings, rest = Settings(), None
+        # the errors by the time scheme are not read
+        settings, rest = Settings(errors="grid"), None
         if Ends.of(equipped).rest_is_guess:
             at_start = initial_state(equipped, settings)
             rest = (at_start.state.history, at_start.record)
@@ -227,6 +231,8 @@ class Episodes:
         # equal parts, the last one filled up: one shape, one program
         self._size = -(-count // parts)
         self._parts: list[Any] = [None] * -(-count // self._size)
+        #: motions of each part, with the pattern of its robots
+        self._motions: list[Any] = []
         self._pool = concurrent.futures.ThreadPoolExecutor(len(self._parts))
 
     def close(self) -> None:
@@ -235,10 +241,16 @@ class Episodes:
 
     def start(self, keys: np.ndarray) -> np.ndarray:
         """Start all episodes by keys (B, 2), and return their observations (B, o)."""
-        self._parts, observations = map(
-            list, zip(*(self.environment.reset_many(part) for part in self._filled(keys)), strict=True)
-        )
-        return self._joined([np.asarray(part) for part in observations])
+        started = [self.environment.reset_many(part) for part in self._filled(keys)]
+        self._parts = [states._replace(history=None) for states, _ in started]
+        self._motions = [self._motion(states.history) for states, _ in started]
+        return self._joined([np.asarray(observations) for _, observations in started])
+
+    def _motion(self, history: Any, systems: Any = None) -> tuple[Pattern, Motions]:
+        """Return the motions of a part, and the pattern of its robots."""
+        systems = self.environment.arrays.robot if systems is None else systems
+        steps = dynamics.period(self.environment.spec).coefficients
+        return Pattern.of(systems), motions_of(systems, steps, jax.tree.map(np.asarray, history))
 
     def restart(self, where: np.ndarray, keys: np.ndarray) -> np.ndarray:
         """Start new episodes at places (n,) by keys (n, 2), and return their observations (n, o)."""
@@ -249,32 +261,39 @@ class Episodes:
             for first in range(0, len(rows), RESET_AT_ONCE):
                 some = rows[first : first + RESET_AT_ONCE]
                 places, padded = _padded(where[some] - part * self._size, keys[some], self._size)
-                self._parts[part], seen = dynamics.restart(
+                self._parts[part], seen, histories = dynamics.restart(
                     environment.spec, environment.arrays, self._parts[part], places, padded
                 )
                 observations[some] = np.asarray(seen)[: len(some)]
+                self._motions[part][1].put(histories, places[: len(some)])
         return observations
 
     def step(self, actions: np.ndarray) -> dynamics.Transition:
         """Move all episodes on by one period under actions (B, c); return arrays with a leading axis."""
         filled = self._filled(actions)
-        spec, arrays = self.environment.spec, self.environment.arrays
-
-        def work(part: int) -> Any:
-            self._parts[part], transitions = dynamics.step_many(spec, arrays, self._parts[part], filled[part])
-            return jax.tree.map(np.asarray, transitions)
-
-        transitions = list(self._pool.map(work, range(len(self._parts))))
+        transitions = list(self._pool.map(lambda part: self._step(part, filled[part]), range(len(filled))))
         return jax.tree.map(lambda *parts: self._joined(parts), *transitions)
+
+    def _step(self, part: int, actions: np.ndarray) -> Any:
+        """Move the episodes of a part on; their histories stay in the engine's memory."""
+        spec, arrays, before = self.environment.spec, self.environment.arrays, self._parts[part]
+        systems, states, acting, valid = dynamics.moved(spec, arrays, before, actions)
+        pattern, motions = self._motions[part]
+        if not spec.is_shared:
+            if Pattern.of(systems) != pattern:
+                self._motions[part] = _, motions = self._motion(motions.states, systems)
+            motions.set_parameters(packed(systems))
+        motions.set_times(np.asarray(before.count) * spec.dt)
+        _, rows = motions.solve(np.asarray(acting), (0, 1))
+        solution = rows.records[:, 0], rows.result[:, 0], valid
+        self._parts[part], transitions = dynamics.arrived(spec, arrays, systems, states, solution)
+        return jax.tree.map(np.asarray, transitions)
 
     def warm_up(self) -> None:
         """Compile the programs of steps and restarts, so that none is compiled later."""
-        environment = self.environment
-        states, _ = environment.reset_many(np.zeros((self._size, 2), dtype=np.uint32))
-        actions = np.zeros((self._size, environment.action_size))
-        states, _ = dynamics.step_many(environment.spec, environment.arrays, states, actions)
-        places, keys = _padded(np.zeros(0), np.zeros((0, 2)), self._size)
-        jax.block_until_ready(dynamics.restart(environment.spec, environment.arrays, states, places, keys))
+        self.start(np.zeros((self.count, 2), dtype=np.uint32))
+        self.step(np.zeros((self.count, self.environment.action_size)))
+        self.restart(np.zeros(1, dtype=int), np.zeros((1, 2), dtype=np.uint32))
 
     def _filled(self, rows: np.ndarray) -> np.ndarray:
         missing = len(self._parts) * self._size - self.count

@@ -136,6 +136,8 @@ class KalmanObserver:
         self.belief = online.Belief(np.zeros(n), past, online.Spread(rows, rows[:, 0], coordinates))
         self._slopes = np.zeros((self.columns, len(self.output.noise)))
         self._innovation, self._surprise = np.full(len(self.output.noise), np.nan), 0.0
+        #: the output that was predicted for this time; NaN at the start
+        self.expected = np.full(self.output.size, np.nan)
         # the predicted outputs of the last second, in units of the noise
         self._values = np.zeros((0, len(self.output.noise)))
         # running mean of the measurement's errors, in standard deviations of their predictions
@@ -226,7 +228,6 @@ class KalmanObserver:
         records = np.asarray(spread.records)[..., : len(self._scale)] / self._scale
         flat = np.concatenate([records.reshape(len(records), -1), np.asarray(spread.parameters)], axis=1)
         matrix = np.linalg.eigh(flat @ flat.T)[1][:, ::-1][:, : self.columns]
-        #: the output that is predicted for this time
         self.expected = np.asarray(motion.values[-1])
         value = self.expected[: len(self.output.noise)] / self.output.noise
         self._values = np.concatenate([self._values, value[None]])[-max(2, round(BIASED / self.dt)) :]

@@ -179,14 +179,16 @@ class Misfit:
         found = dict(zip(wanted, self._parallel(solved, wanted), strict=True))
         refined = list[Any]()
         for k, rollout in zip(chosen, rollouts, strict=True):
-            if k in targets:
+            if rollout is not None and k in targets:
                 values, finer = found.get((k, 1), rollout.plain), found.get((k, 2))
                 if values is not None and finer is not None:
                     values = (4.0 * finer - values) / 3.0
                 if values is not None and (finer is not None or k not in resolved):
                     self._accurate[at.tobytes(), k] = values
-            values = None if rollout is None else self._accurate.get((at.tobytes(), k))
-            refined.append(rollout if values is None else rollout.moved(values - rollout.plain))
+            values = self._accurate.get((at.tobytes(), k))
+            if rollout is not None and values is not None:
+                rollout = rollout.moved(values - rollout.plain)
+            refined.append(rollout)
         self._accurate = dict([*self._accurate.items()][-KEPT * len(self.data) :])
         return refined
 
@@ -214,9 +216,11 @@ class Misfit:
         if start is None:
             return None
         acting, slope = _acting(system, data)
-        task: Any = TimeIntegration(data.settings, data.dt / data.steps, max(steps, 1), start.known, RECOVERY)
+        # a search does not read the errors of its motions
+        settings = dataclasses.replace(data.settings, errors=False)
+        task: Any = TimeIntegration(settings, data.dt / data.steps, max(steps, 1), start.known, RECOVERY)
         if data.static:
-            task = dataclasses.replace(task, settings=dataclasses.replace(data.settings, time=None), dt=0.0)
+            task = dataclasses.replace(task, settings=dataclasses.replace(settings, time=None), dt=0.0)
         else:
             acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
         solved_rows, _, cause = run_one(task, system, acting, (start.state, start.before), watch=None)

@@ -322,7 +322,7 @@ class Search:
             used, ended = descent.run(budget, fall, rough)
             x, rollouts, remaining = descent.x, descent.rollouts, remaining - used
             fine = rough or (fine and not used)
-            if not fine and (not used or self.exact or remaining <= 0):
+            if not fine and (ended or remaining <= 0):
                 fine = True
                 if subset.rows is None:
                     rollouts = self.misfit.refined(rollouts, x, which)
@@ -432,8 +432,8 @@ class _Descent:
     def run(self, most: int, fall: float, rough: bool) -> tuple[int, bool]:
         """Minimise; return the number of evaluations and a flag of convergence.
 
-        With priors and updated derivatives it has converged if the first step promises too little to be made.
-        A `rough` end is where a step was too little.
+        With updated derivatives it has converged if the first step promises or brings too little; a `rough`
+        end is where any step did.
         """
         from scipy.optimize import least_squares  # imported here: it takes a third of a second
 
@@ -453,7 +453,8 @@ class _Descent:
         solved = self._at(ended.x)
         assert solved is not None
         self.x, self.rollouts = self._whole(ended.x), solved
-        return max(int(ended.nfev) - 1, 1), bool(ended.status > 0) and (exact or rough)
+        used = max(int(ended.nfev) - 1, 1)
+        return used, bool(ended.status > 0) and (exact or rough or used == 1)
 
     def _promise(self, start: np.ndarray, low: np.ndarray, high: np.ndarray) -> float:
         """Return the part by which the cost falls in a Gauss-Newton step from a start within bounds."""

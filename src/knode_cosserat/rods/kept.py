@@ -22,9 +22,9 @@ class _Entry:
     """Results for one system."""
 
     def __init__(self, system: System):
-        key = id(system)
-        # `pop` also exists when modules are gone at the end of a process
-        self.system = weakref.ref(system, lambda _, pop=_ENTRIES.pop: pop(key, None))
+        # its names also exist when modules are gone at the end of a process
+        key, pop = id(system), _ENTRIES.pop
+        self.system = weakref.ref(system, lambda _: pop(key, None) and None)
         #: arrays of the system that a user can change in place, with their numbers
         self.numbers = [
             (leaf, leaf.tobytes())

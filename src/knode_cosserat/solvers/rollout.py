@@ -140,7 +140,7 @@ def _core_of_solves(spec: Solves, *operands: Any) -> Any:
 def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
     leaves, controls = arrays[: spec.leaves], arrays[spec.leaves]
     task, parameters = spec.task, np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-    states = (StateHistory if task.settings.time else Shape)(*arrays[spec.leaves + 1 :])
+    states: Any = (StateHistory if task.settings.time else Shape)(*arrays[spec.leaves + 1 :])
     motions = Motions(core, parameters, states, task.coefficients)
     done, rows = motions.solve(controls, (0, task.steps))
     return [done, *motions.states, *rows]

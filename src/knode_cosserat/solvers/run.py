@@ -94,7 +94,7 @@ class TimeIntegration:
         """
         return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps), rows)
 
-    def motions(self, system: System, state: Any) -> Motions[Any]:
+    def motions(self, system: System, state: Any) -> Motions:
         """Return the motion of one robot from a state, for steps one by one."""
         return engine.motions_of(
             system, self.coefficients, jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
@@ -211,11 +211,11 @@ def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
     ny, nz = system.y_layout.size, system.z_layout.size
     z = in_strands(system, np.asarray(rows.records)[..., ny : ny + nz])
     radius = _radii(strand, system.control_layout.size)
-    rows = slice(None) if solved.all() else solved
+    where: Any = slice(None) if solved.all() else solved
     u, v = strand.z_layout.get(z, "u")[..., :2], strand.z_layout.get(z, "v")
     # several times as fast as norms
-    bent = np.max((np.sqrt(np.einsum("...i,...i", u, u)) * radius[..., None, :, None])[rows])
-    stretch = np.einsum("...i,...i", v, v)[rows]
+    bent = np.max((np.sqrt(np.einsum("...i,...i", u, u)) * radius[..., None, :, None])[where])
+    stretch = np.einsum("...i,...i", v, v)[where]
     found = []
     if bent > MOST_BENT:
         found.append(f"radius × curvature reaches {bent:.2g} (allowed: up to {MOST_BENT:g})")

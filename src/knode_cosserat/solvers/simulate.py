@@ -92,7 +92,7 @@ def simulate(
         position_tolerance: largest discretisation error (m) of positions along the rod. The number of nodes
             is chosen so that the estimate stays below it in every row; by default it is the robot's.
         errors: estimate the errors of every row; "grid": those by the nodes only; False: none, which takes
-            12 to 30 % less time. Errors that are not estimated are NaN, and no row can be COARSE then.
+            12 to 30 % less time. Errors that are not estimated are NaN, and no row is known to be COARSE.
         recovery_budget: seconds that recovery from failed steps may take, 0 for none; by default 20 times
             the run's own time or 5 s, whichever is more.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with the remaining rows invalid.
