@@ -516,7 +516,7 @@ class Core(EliminationCode):
         e, P = self.equations, self.P
         names = ["memory", "controls", "coefficients", "extrapolations", "rows", "infos", "reached"]
         names += ["n_steps", "n_stages", "n_estimates"]
-        f = self._now = self.module.function("run", names, exported=True)
+        self.steps = f = self._function("steps", *names[1:])
         memory, controls, coefficients, extrapolations, rows, infos, reached = f.arguments[:7]
         steps, stages, estimates = f.arguments[7:]
         numbers = self._pointer(self.numbers, 0)
@@ -639,10 +639,42 @@ class Core(EliminationCode):
             self._put(weight, self.weights, k)
         self._write_shift([self.y, *self.past], self.points)
 
-    def _write_start(self) -> None:
-        """All that depends on the parameters alone."""
-        f = self._now = self.module.function("start", ["memory"], exported=True)
-        f.call(self.setup, *f.arguments)
+    def _write_vectors(self) -> None:
+        """Runs of vectors of robots in turn, each from its state, which is replaced by the state after it.
+
+        Results are rows, numbers of stages, the number of solved steps and the length (m). The state of a
+        robot whose first step failed remains; that of a single robot remains if any step failed.
+        """
+        e, P, L = self.equations, self.P, self.L
+        names = ["memory", "motions", "parameters", "controls", "coefficients", "extrapolations", "results"]
+        names += ["n_vectors", "n_steps", "n_stages", "n_estimates"]
+        f = self._now = self.module.function("run", names, exported=True)
+        memory, motions, parameters, controls, coefficients, extrapolations, results = f.arguments[:7]
+        vectors, steps, stages, estimates = f.arguments[7:]
+        solves, size = steps * stages, self._motion.stop - self._motion.start
+        rows = solves * (len(self.grid.nodes) * self.strands * e.numbers * P)
+        infos = solves * ((8 + e.k) * P)
+        state = f.pointer(memory, self._motion.start)
+        with f.loop(vectors) as vector:
+            k = vector.value
+            own = f.pointer(motions, k * size)
+            with f.loop(size, 0, L) as j:
+                f.store(f.load(own, j.value, L), state, j.value, L)
+            with f.loop(self.params.size * P, 0, P) as i:
+                value = f.load(parameters, k * (self.params.size * P) + i.value, P)
+                f.store(value, self._pointer(self.params, 0), i.value, P)
+            self._put(0.0, self.numbers, USABLE)
+            f.call(self.setup, memory)
+            result = f.pointer(results, k * (rows + infos + 2 * P))
+            info, acting = f.pointer(result, rows), f.pointer(controls, k * (solves * (e.nc * P)))
+            reached = f.pointer(info, infos)
+            arrays = memory, acting, coefficients, extrapolations, result, info, reached
+            f.call(self.steps, *arrays, steps, stages, estimates)
+            f.store(self._get(self.length, 0), reached, P, P)
+            least = f.splat(f.value(1.0), P) if self.batch else f.result(f"sitofp i64 {steps.name} to double")
+            moved = self._spread(f.load(reached, 0, P) >= least)
+            with f.loop(size, 0, L) as j:
+                f.store(f.select(moved, f.load(state, j.value, L), f.load(own, j.value, L)), own, j.value, L)
 
     def _write_evaluate(self) -> None:
         """The state at y and history terms; y is corrected at points between nodes, `n_most` a segment."""
@@ -688,8 +720,8 @@ class Core(EliminationCode):
             self._write_time_history()
         self._write_stage()
         self._write_guesses()
-        self._write_start()
         self._write_run()
+        self._write_vectors()
         if not self.batch:
             self._write_evaluate()
 

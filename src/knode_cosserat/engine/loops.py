@@ -78,7 +78,7 @@ def solve_steps(
     return jax.tree.map(lambda leaf: leaf[0], found) if alone else found
 
 
-def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions[Any]:
+def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions:
     """Return motions from states (robots, ...), of one system or of as many."""
     core = core_of(Pattern.of(system), steps.settings, robots=len(states[0]) > 1)
     return Motions(core, packed(system), states, steps)

@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
-from typing import Any, Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.engine.core import ANGLE, CORRECTIONS, ERROR, POSITION, TIME, USABLE, Core
+from knode_cosserat.engine.core import ANGLE, CORRECTIONS, ERROR, POSITION, TIME, Core
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.solvers.history import (
     COARSE_ANGLE,
     COARSE_SHARE,
-    StateHistory,
     StepCoefficients,
     StepRows,
 )
@@ -32,43 +31,33 @@ class Shape(NamedTuple):
     y: Float[np.ndarray, "points y"]
 
 
-States = TypeVar("States", bound=StateHistory | Shape)
-
-
-class Motions(Generic[States]):
+class Motions:
     """States of robots in the layout of the engine, from which steps are solved.
 
-    Vectors of robots take turns in one memory. A single vector stays there between calls.
+    Vectors of robots take turns in one memory.
     """
 
-    def __init__(self, core: Core, parameters: np.ndarray, states: States, steps: StepCoefficients):
+    def __init__(self, core: Core, parameters: np.ndarray, states: Any, steps: StepCoefficients):
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
-        self.core, self.steps, self.size = core, steps, len(states[0])
-        self._kind: Any = type(states)
+        self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
         self._shapes = [np.shape(values)[1:] for values in states]
-        self._memory, self._inside = core._empty_memory(), -1
+        self._memory = core._empty_memory()
         options = dataclasses.astuple(steps.settings.newton)
         for array, numbers in ((core.options, options), (core.tip_offset, steps.tip_offset)):
             self._view(self._memory[None], [array])[:] = numbers
-        self.parameters = parameters
-        #: lengths of the robots (m), and states of their vectors
-        self._lengths = np.zeros(self._parameters.shape[:2])
+        self.set_parameters(parameters)
+        #: states of the vectors of robots
         self.motions = np.empty((len(self._parameters), core._motion.stop - core._motion.start))
-        self.put(states, np.arange(len(self._parameters) * core.P))
+        self.put(states, np.arange(len(self.motions) * core.P))
 
-    @property
-    def parameters(self) -> np.ndarray:
-        """Parameters (vectors, lanes, n)."""
-        return self._parameters
+    def set_parameters(self, values: np.ndarray) -> None:
+        """Set the parameters (n,) of all robots, or (robots, n)."""
+        own = self._in_lanes(np.broadcast_to(values, (self.size, self.core.params.size)))
+        self._parameters = np.ascontiguousarray(np.swapaxes(own, 1, 2))
 
-    @parameters.setter
-    def parameters(self, values: np.ndarray) -> None:
-        self._parameters = self._in_lanes(np.broadcast_to(values, (self.size, self.core.params.size)))
-        self._inside = -1
-
-    def put(self, states: States, places: np.ndarray) -> None:
+    def put(self, states: Any, places: np.ndarray) -> None:
         """Write the states (n, ...) of robots at places (n,); the last one is that of all places beyond."""
-        core, self._inside = self.core, -1
+        core = self.core
         vectors, lanes = np.divmod(places, core.P)
         for arrays, values in zip(core._parts.values(), states, strict=True):
             values = np.asarray(values, float)
@@ -82,7 +71,6 @@ class Motions(Generic[States]):
     def set_times(self, t0: Float[np.ndarray, " robots"]) -> None:
         """Set the times (s) of row 0."""
         self._view(self.motions, [self.core.t0], self.core._motion.start)[:, :, 0, 0, 0] = self._in_lanes(t0)
-        self._inside = -1
 
     def _in_lanes(self, values: np.ndarray) -> np.ndarray:
         """Return values (vectors, lanes, ...) of robots; the last robot is repeated in the last vector."""
@@ -109,29 +97,31 @@ class Motions(Generic[States]):
         return shape, 8 * (one.offset - first), (8, 8 * apart, 8 * one.place, 8 * one.component)
 
     @functools.cached_property
-    def _places(self) -> list[Any]:
+    def _places(self) -> list[tuple[tuple[int, ...], int, tuple[int, ...]]]:
         """Shape, first place and strides of each part of the state of one robot of one strand."""
-        found = list[Any]()
+        found = []
         for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
             _, at, strides = self._place_of(arrays, self.core._motion.start)
             found.append((shape, at, strides[len(strides) - len(shape) :]))
         return found
 
-    def state_of(self, motions: np.ndarray) -> States:
+    def state_of(self, motions: np.ndarray) -> Any:
         """Return the state of one robot: views of its numbers, for a system of one strand."""
         if self.core.strands > 1:
             return self._kind(*(values[0] for values in self._states(motions)))
-        return self._kind(*(np.ndarray(shape, float, motions, *place) for shape, *place in self._places))
+        return self._kind(
+            *(np.ndarray(shape, float, motions, at, strides) for shape, at, strides in self._places)
+        )
 
     @property
-    def states(self) -> States:
+    def states(self) -> Any:
         """The states of all robots (robots, ...)."""
         motions = self.motions.copy()
         if self.core.batch:
             return self._states(motions)
         return self._kind(*(values[None] for values in self.state_of(motions)))
 
-    def _states(self, motions: np.ndarray) -> States:
+    def _states(self, motions: np.ndarray) -> Any:
         found = []
         for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
             count = math.prod(shape) // (len(arrays) * self.core._width(arrays[0]))
@@ -152,24 +142,20 @@ class Motions(Generic[States]):
         core, P, stages, (start, stop) = self.core, self.core.P, np.size(self.steps.ends), span
         e, count, vectors = core.equations, int(stop - start), len(self.motions)
         held = 1 if controls.shape[2] == e.nc else stages
-        own = self._in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc)
         acting = np.empty((vectors, count, stages, e.nc, P))
-        acting[:] = np.moveaxis(own, 1, -1)
+        acting[:] = np.moveaxis(
+            self._in_lanes(controls[:, start:stop]).reshape(vectors, P, count, held, e.nc), 1, -1
+        )
         table, shapes = coefficients_of(self.steps, span), self._shapes_of(count, stages)
-        sizes, done = [math.prod(shape) for shape in shapes], np.zeros(self.size, dtype=int)
+        size, done = sum(map(math.prod, shapes)), np.zeros(self.size, dtype=int)
         # results of some vectors at a time, which are copied while they are in the cache
-        block = max(1, BLOCK // (sum(sizes) + P))
-        results = np.zeros((min(vectors, block), sum(sizes) + P))
+        block = min(vectors, max(1, BLOCK // size))
+        results = np.zeros((block, size))
         for first in range(0, vectors, block):
             part, robots = results[: vectors - first], slice(first * P, (first + block) * P)
             part[:] = 0.0
-            for k, own in enumerate(part, first):
-                self._solve(k, acting[k], table, own, sizes)
-            reached = part[:, sum(sizes) :].reshape(-1)[: self.size - first * P]
-            done[robots] = reached
-            found = self._rows(
-                part, shapes, self._lengths[first : first + block].reshape(-1, 1), done[robots]
-            )
+            self._run(first, acting, table, part)
+            found, done[robots] = self._rows(part, shapes, min(len(part) * P, self.size - first * P))
             if rows is None and vectors <= block:
                 return start + done, found
             if rows is None:
@@ -179,124 +165,92 @@ class Motions(Generic[States]):
         assert rows is not None
         return start + done, rows
 
-    def _shapes_of(self, count: int, stages: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
-        """Return the shapes of the rows of a vector of robots, and of the numbers of their stages."""
+    def _shapes_of(self, count: int, stages: int) -> tuple[tuple[int, ...], ...]:
+        """Return the shapes of a vector's results: rows, numbers of stages, steps done and length."""
         core, e = self.core, self.core.equations
         numbers = core.strands * e.numbers
-        return (count, stages, len(core.grid.nodes), numbers, core.P), (count, stages, 8 + e.k, core.P)
+        shapes = (count, stages, len(core.grid.nodes), numbers), (count, stages, 8 + e.k), (2,)
+        return tuple((*shape, core.P) for shape in shapes)
 
-    def _solve(
-        self, k: int, acting: np.ndarray, table: np.ndarray, results: np.ndarray, sizes: list[int]
-    ) -> None:
-        """Solve steps of a vector of robots; results are rows, numbers of stages, and steps done."""
-        core, memory, motion, count = self.core, self._memory, self.core._motion, len(acting)
-        self._enter(k)
-        rows, infos = sizes
-        first = results.ctypes.data
+    def _run(self, first: int, acting: np.ndarray, table: np.ndarray, results: np.ndarray) -> None:
+        """Solve steps of vectors of robots from the first one on."""
+        core, (_, count, stages, *_) = self.core, acting.shape
+        own = (each[first:] for each in (self.motions, self._parameters, acting))
+        arrays = self._memory, *own, table, core._guesses, results
         core._functions["run"](
-            memory.ctypes.data, acting.ctypes.data, table.ctypes.data, core._guesses.ctypes.data, first,
-            first + 8 * rows, first + 8 * (rows + infos), count, acting.shape[1],
-            self.steps.settings.estimates,
-        )  # fmt: skip
-        done = results[rows + infos :]
-        if np.all(done == count):
-            self.motions[k] = memory[motion]
-            return
-        self._inside = -1
-        if core.batch:
-            before, after = (each.reshape(-1, core.P) for each in (self.motions[k], memory[motion]))
-            before[:, done > 0] = after[:, done > 0]
-        elif done[0] > 0:
+            *(each.ctypes.data for each in arrays), len(results), count, stages, self.steps.settings.estimates
+        )
+        if not core.batch and 0 < (done := int(results[0, -2])) < count:
             # again, for the state before the step that failed
-            self._solve(k, acting[: int(done[0])], table, np.zeros_like(results), sizes)
-
-    def _enter(self, k: int) -> None:
-        """Put the states of a vector of robots into memory if they are not there."""
-        if self._inside == k:
-            return
-        core, memory = self.core, self._memory[None]
-        self._memory[core._motion] = self.motions[k]
-        self._view(memory, [core.params])[0, :, 0, 0] = self._parameters[k]
-        self._view(memory, [core.numbers])[..., USABLE] = 0.0
-        core._functions["start"](memory.ctypes.data)
-        self._lengths[k] = self._view(memory, [core.length])[0, :, 0, 0, 0]
-        self._inside = k
+            again = np.zeros((1, sum(map(math.prod, self._shapes_of(done, stages)))))
+            self._run(0, np.ascontiguousarray(acting[:, :done]), table, again)
 
     # one step of one robot
 
     @functools.cached_property
     def _step(self) -> tuple[Any, ...]:
-        """Controls, coefficients and use of factors in a step, all addresses, and shapes of its results."""
+        """Controls, coefficients, addresses of what steps have in common, shapes and size of results."""
         stages = np.size(self.steps.ends)
         acting, table = np.empty((stages, self.core.equations.nc)), coefficients_of(self.steps, (0, 1))
-        arrays = self._memory, acting, table, self.core._guesses
-        shapes = [shape[1:-1] for shape in self._shapes_of(1, stages)]
-        usable = self._view(self._memory[None], [self.core.numbers])[0, 0, 0, :, USABLE]
-        return acting, table, usable, [each.ctypes.data for each in arrays], shapes
+        arrays, shapes = (self._parameters, acting, table, self.core._guesses), self._shapes_of(1, stages)
+        return acting, table, [each.ctypes.data for each in arrays], shapes, sum(map(math.prod, shapes))
 
-    def step(self, motions: np.ndarray, i: int, control: np.ndarray) -> tuple[np.ndarray | None, int]:
-        """Solve step i of one robot from a state in `motions`, under a control (c,) or (stages * c,).
+    def step(
+        self, before: np.ndarray, i: int, control: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray | None, int]:
+        """Solve step i of one robot from a state (`motions`), under a control (c,) or (stages * c,).
 
-        Return its numbers, for `row_of`, and its result; no numbers if it failed. The state after it is in
-        `motions` then, a new array. No factors are kept: the same state gives the same bits.
+        Return the state after it, its numbers for `row_of`, and its result; no numbers if it failed.
         """
-        if motions is not self.motions:
-            self.motions, self._inside = motions, -1
-        core, (acting, table, usable, addresses, (rows, infos)) = self.core, self._step
+        acting, table, addresses, shapes, size = self._step
         acting[:] = control.reshape(1 if len(control) == acting.shape[1] else len(acting), acting.shape[1])
         if i < len(self.steps.table):
             table[:] = coefficients_of(self.steps, (i, i + 1))
         table[0, :, -1] = (i + self.steps.ends) * self.steps.dt
-        size = math.prod(rows)
-        results = np.zeros(size + math.prod(infos) + 1)
-        first = results.ctypes.data
-        self._enter(0)
-        usable[:] = 0.0
-        core._functions["run"](
-            *addresses,
-            first,
-            first + 8 * size,
-            first + 8 * (len(results) - 1),
-            1,
-            len(acting),
+        after, results = before.copy(), np.zeros(size)
+        self.core._functions["run"](
+            self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, 1, 1, len(acting),
             self.steps.settings.estimates,
-        )
-        if not results[-1]:
-            self._inside = -1
-            return None, NOT_SOLVED
-        self.motions = self._memory[None, core._motion].copy()
-        last = len(results) - 1 - infos[-1]
-        fine = self._is_fine(results.item(last + POSITION), results.item(last + ANGLE), self._lengths.item())
-        return results, CONVERGED if fine else COARSE
+        )  # fmt: skip
+        if not results[-2]:
+            return before, None, NOT_SOLVED
+        last = size - 2 - shapes[1][2]
+        off, angle, length = (results.item(k) for k in (last + POSITION, last + ANGLE, size - 1))
+        fine = self._is_fine(off, angle, length)
+        return after, results, CONVERGED if fine else COARSE
 
     def row_of(self, results: np.ndarray) -> StepRows:
         """Return the row of a step from its numbers."""
-        shapes = self._shapes_of(1, np.size(self.steps.ends))
-        return StepRows(
-            *(leaf[0, 0] for leaf in self._rows(results[None], shapes, self._lengths, np.ones(1)))
-        )
+        rows, _ = self._rows(results[None], self._shapes_of(1, np.size(self.steps.ends)), 1)
+        return StepRows(*(leaf[0, 0] for leaf in rows))
 
-    def _rows(self, results: np.ndarray, shapes: Any, lengths: np.ndarray, done: np.ndarray) -> StepRows:
-        """Return rows (robots, steps, ...) of vectors of results; a step's row is that of its last stage."""
-        core, size = self.core, math.prod(shapes[0])
-        rows, infos = (
-            np.moveaxis(part.reshape(len(results), *shape), -1, 1).reshape(-1, *shape[:-1])[: len(done)]
-            for part, shape in zip((results[:, :size], results[:, size : -core.P]), shapes, strict=True)
+    def _rows(self, results: np.ndarray, shapes: Any, robots: int) -> tuple[StepRows, np.ndarray]:
+        """Return rows (robots, steps, ...) and steps done of vectors of results.
+
+        A step's row is that of its last stage.
+        """
+        core = self.core
+        parts = np.split(results, np.cumsum([math.prod(shape) for shape in shapes[:-1]]), axis=1)
+        rows, infos, ends = (
+            np.moveaxis(part.reshape(len(results), *shape), -1, 1).reshape(-1, *shape[:-1])[:robots]
+            for part, shape in zip(parts, shapes, strict=True)
         )
+        done = ends[:, 0].astype(int)
         if core.strands > 1:
             rows = core.equations.joined(rows.reshape(*rows.shape[:-1], core.strands, -1))
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]
-        result = np.where(self._is_fine(off, angle, lengths[: len(done)]), CONVERGED, COARSE)
+        result = np.where(self._is_fine(off, angle, ends[:, 1:]), CONVERGED, COARSE)
         result = np.where(error <= self.steps.settings.newton.acceptable, result, NOT_SOLVED)
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
         time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
-        return StepRows(
+        found = StepRows(
             rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,
             rows[:, :, :-1], unknowns[:, :, :-1],
         )  # fmt: skip
+        return found, done
 
     def _is_fine(self, off: Any, angle: Any, length: Any) -> Any:
         """True where no estimated error of positions (m) or orientations (rad) makes a row coarse."""

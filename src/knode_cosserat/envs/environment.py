@@ -246,7 +246,7 @@ class Episodes:
         self._motions = [self._motion(states.history) for states, _ in started]
         return self._joined([np.asarray(observations) for _, observations in started])
 
-    def _motion(self, history: Any, systems: Any = None) -> tuple[Pattern, Motions[Any]]:
+    def _motion(self, history: Any, systems: Any = None) -> tuple[Pattern, Motions]:
         """Return the motions of a part, and the pattern of its robots."""
         systems = self.environment.arrays.robot if systems is None else systems
         steps = dynamics.period(self.environment.spec).coefficients
@@ -282,7 +282,7 @@ class Episodes:
         if not spec.is_shared:
             if Pattern.of(systems) != pattern:
                 self._motions[part] = _, motions = self._motion(motions.states, systems)
-            motions.parameters = packed(systems)
+            motions.set_parameters(packed(systems))
         motions.set_times(np.asarray(before.count) * spec.dt)
         _, rows = motions.solve(np.asarray(acting), (0, 1))
         solution = rows.records[:, 0], rows.result[:, 0], valid

@@ -29,6 +29,8 @@ from knode_cosserat.solvers.problem import no_history
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.settings import Settings
 
+#: schemes of a simulated plant; nobody reads the errors of an observer's steps
+STEPS = Settings(errors=False)
 #: rows of any numbers by which the numbers are found on which an output depends
 ROWS = 3
 #: robots that are kept: that of the estimate, and earlier ones with which a rollback compares it
@@ -130,7 +132,7 @@ class MovedRobot(NamedTuple):
 class OnlineModel:
     """A robot with adapted parameters, and its steps with tangents; what several calls need is kept."""
 
-    def __init__(self, parameters: ParametrisedRobot, dt: float, settings: Settings = Settings()):
+    def __init__(self, parameters: ParametrisedRobot, dt: float, settings: Settings = STEPS):
         """Set the time step (s); by default the schemes are those of a simulated plant."""
         self.parameters, self.dt, self.settings = parameters, dt, settings
         self._structure = Structure.of(parameters.robot)

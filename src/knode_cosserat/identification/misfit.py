@@ -216,9 +216,11 @@ class Misfit:
         if start is None:
             return None
         acting, slope = _acting(system, data)
-        task: Any = TimeIntegration(data.settings, data.dt / data.steps, max(steps, 1), start.known, RECOVERY)
+        # a search does not read the errors of its motions
+        settings = dataclasses.replace(data.settings, errors=False)
+        task: Any = TimeIntegration(settings, data.dt / data.steps, max(steps, 1), start.known, RECOVERY)
         if data.static:
-            task = dataclasses.replace(task, settings=dataclasses.replace(data.settings, time=None), dt=0.0)
+            task = dataclasses.replace(task, settings=dataclasses.replace(settings, time=None), dt=0.0)
         else:
             acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
         solved_rows, _, cause = run_one(task, system, acting, (start.state, start.before), watch=None)

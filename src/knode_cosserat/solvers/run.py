@@ -94,7 +94,7 @@ class TimeIntegration:
         """
         return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps), rows)
 
-    def motions(self, system: System, state: Any) -> Motions[Any]:
+    def motions(self, system: System, state: Any) -> Motions:
         """Return the motion of one robot from a state, for steps one by one."""
         return engine.motions_of(
             system, self.coefficients, jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)

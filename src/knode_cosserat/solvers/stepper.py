@@ -92,7 +92,7 @@ class Stepper:
         # memories of the engine that no call uses, and the present state as an array of theirs
         engine = self._task.motions(self._bare, at_start.state.history)
         self._engines = [engine]
-        #: the engine's numbers of the present state; None in a copy, until it moves
+        #: None in a copy, until it moves
         self._motion: np.ndarray | None = engine.motions
         at_rest = jax.tree.map(np.asarray, at_start.state)
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
@@ -177,8 +177,8 @@ class Stepper:
             engine = self._engines.pop()
         except IndexError:  # another thread has it, or this is a copy
             engine = self._task.motions(self._bare, self._history)
-        motion = engine.motions if self._motion is None else self._motion
-        numbers, result = engine.step(motion, i, acting)
+        before = engine.motions if self._motion is None else self._motion
+        motion, numbers, result = engine.step(before, i, acting)
         if numbers is None:
             budget, pair = Budget(self._task.recovery_budget, stop), (self._control, acting)
             after, row, cause = self._task.recover(self._bare, self._history, pair, i, budget)
@@ -187,9 +187,10 @@ class Stepper:
                 self._engines.append(engine)
                 raise SimulationError(i + 1, self.time + self.dt, float(row.error), Result(result), cause)
             engine = self._task.motions(self._bare, after)
+            motion = engine.motions
         if result or self._result:
             result = int(carried_results(np.array([result]), self._result)[0])
-        motion, t = engine.motions, np.asarray(self._t0 + (i + 1) * self.dt)
+        t = np.asarray(self._t0 + (i + 1) * self.dt)
         self._engines.append(engine)
 
         def solved() -> tuple[StepRows, SolverState]:
