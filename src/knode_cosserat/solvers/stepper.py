@@ -92,6 +92,7 @@ class Stepper:
         # memories of the engine that no call uses, and the present state as an array of theirs
         engine = self._task.motions(self._bare, at_start.state.history)
         self._engines = [engine]
+        #: None in a copy, until it moves
         self._motion: np.ndarray | None = engine.motions
         at_rest = jax.tree.map(np.asarray, at_start.state)
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
