@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import gc
 import sys
 import threading
 from collections.abc import Callable, Iterable, Mapping
@@ -87,6 +88,9 @@ def compiled(
             patience = threading.Timer(PATIENCE, _say)
             patience.daemon = True
             patience.start()
+            # tracing makes many objects that live on: a tenth of its time was collections
+            collects = gc.isenabled()
+            gc.disable()
             try:
                 # also while JAX traces a caller: equations are traced by themselves
                 with jax.core.eval_context():
@@ -96,6 +100,8 @@ def compiled(
                 code = error.with_traceback(None)
             finally:
                 patience.cancel()
+                if collects:
+                    gc.enable()
         _CODES[key] = code
         if len(_CODES) > MOST_CODES:
             del _CODES[next(iter(_CODES))]
