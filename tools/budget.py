@@ -91,7 +91,7 @@ def system_members() -> int:
 def budgets() -> list[Budget]:
     """Return all figures."""
     return [
-        Budget("lines of the library", lines_of(LIBRARY), 37_000, 57_700),
+        Budget("lines of the library", lines_of(LIBRARY), 37_000, 57_720),
         Budget("lines of hardware", lines_of(ROOT / "hardware"), 7_500, 9_300),
         Budget("lines of studies", lines_of(ROOT / "studies"), 6_000, 8_770),
         Budget("lines of tests", lines_of(ROOT / "tests"), 25_000, 43_360),

@@ -389,19 +389,19 @@ def test_a_span_continues_another():
 @pytest.mark.parametrize("scheme", ["sdirk2", "bdf2"])
 def test_motions_without_estimates(scheme):
     """The solved rows are the same; errors are NaN, which is not coarse, and stay unknown."""
-    robot, settings, control = robot_of(PAPER), settings_of(scheme), tensions(1)
-    steps, past = StepCoefficients.of(settings, DT), resting_history(robot, settings)
-    pasts = jax.tree.map(lambda leaf: np.asarray(leaf)[None], past)
-    core = loops.core_of(Pattern.of(robot), settings, robots=False)
-    given = pattern.parameters_of(robot), control, steps
-    _, wanted, with_estimates = core.integrate(*given, pasts, (0, STEPS))
-    _, state, rows = core.integrate(*given, pasts, (0, STEPS), estimates=False)
+    robot, settings, control = robot_of(PAPER), settings_of(scheme), tensions(1)[0]
+    past = resting_history(robot, settings)
+    steps, unestimated = (
+        StepCoefficients.of(dataclasses.replace(settings, errors=errors), DT) for errors in (True, False)
+    )
+    _, wanted, with_estimates = loops.solve_steps(robot, steps, control, past, (0, STEPS))
+    _, state, rows = loops.solve_steps(robot, unestimated, control, past, (0, STEPS))
     for field in ("records", "unknowns", "corrections", "result", "error"):
         np.testing.assert_array_equal(getattr(rows, field), getattr(with_estimates, field), field)
     np.testing.assert_array_equal(state.y, wanted.y)
     assert np.all(np.isnan(rows.position_error)) and np.all(np.isnan(rows.time_error))
     assert np.all(np.isnan(state.error)) and not np.any(np.isnan(state.records))
-    _, _, later = core.integrate(*given, state, (0, 2))
+    _, _, later = loops.solve_steps(robot, steps, control, state, (0, 2))
     assert np.all(np.isnan(later.position_error)) and np.max(later.error) <= 1e-10
 
 

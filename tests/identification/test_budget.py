@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification.search import OutOfTime, Search
+from knode_cosserat.identification.search import OutOfTimeError, Search
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
 from tests.identification.test_journal import FREE, Curve
@@ -52,7 +52,7 @@ def test_nothing_is_solved_after_the_deadline(use):
     end = search.run(np.zeros(3), FREE)
     assert search.last is end
     use(Clock(calls=2))
-    with pytest.raises(OutOfTime):
+    with pytest.raises(OutOfTimeError):
         search.run(np.zeros(3), FREE)
     assert search.last is end
 

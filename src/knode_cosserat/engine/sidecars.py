@@ -26,9 +26,10 @@ from typing import Any
 import jax
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Module
+from knode_cosserat.engine.codegen import Function, Module, Variable
 from knode_cosserat.engine.equations import Elimination, Sizes
 from knode_cosserat.engine.machine_code import MachineCode, computer, store, stored
+from knode_cosserat.errors import KnodeCosseratError
 
 PACKAGE = "knode_cosserat"
 #: packages described by their versions
@@ -38,11 +39,13 @@ _GENERATED = frozenset(
     ("__init__", "__repr__", "__eq__", "__hash__", "__setattr__", "__delattr__", "__replace__")
 )
 #: what writes code, and is not needed to run it
-_WRITERS = Elimination, Function, Module
+_WRITERS = Elimination, Function, Module, Variable
 
 
-class UnknownError(Exception):
+class UnknownError(KnodeCosseratError):
     """A value that cannot be described or stored."""
+
+    code = "sidecar"
 
 
 # names

@@ -22,7 +22,7 @@ from knode_cosserat.identification.next_experiment import next_experiment
 from knode_cosserat.identification.posterior import SURE, Posterior
 from knode_cosserat.identification.result import Identified, estimates_of
 from knode_cosserat.identification.samples import sampled
-from knode_cosserat.identification.search import OutOfTime, Point, Search, SearchError, clock
+from knode_cosserat.identification.search import OutOfTimeError, Point, Search, SearchError, clock
 from knode_cosserat.identification.selection import (
     WORSE,
     Selection,
@@ -154,7 +154,7 @@ def identify(
             return _with_parameters(search)
         wanted = None if effects is None else [*effects, *(it.name for it in plain)]
         found = _with_effects(search, course, wanted, space, searched)
-    except OutOfTime:
+    except OutOfTimeError:
         return course.best("the time is over")
     except KeyboardInterrupt as stop:
         stop.best = course.best("interrupted")  # type: ignore[attr-defined]
@@ -195,7 +195,7 @@ class _Course:
         self.stage = stage
         self.tell_left(f"stage {STAGES.index(stage) + 1} of {len(STAGES)}, {stage}")
         if clock() > self.deadline:
-            raise OutOfTime
+            raise OutOfTimeError
 
     def best(self, reason: str) -> Identified:
         """Return the best robot so far: of the last search, or else the nominal one."""

@@ -56,8 +56,10 @@ UNSEEN = 0.8
 LARGEST = 10.0
 
 
-class OutOfTime(Exception):  # noqa: N818
+class OutOfTimeError(KnodeCosseratError):
     """The time of an identification is over."""
+
+    code = "out-of-time"
 
 
 class SearchError(KnodeCosseratError, RuntimeError):
@@ -388,10 +390,10 @@ class Search:
         """Return the rollouts at a point; None if one failed. Whole ones are refined without `offsets`.
 
         Raises:
-            OutOfTime: the deadline is over.
+            OutOfTimeError: the deadline is over.
         """
         if clock() > self.deadline:
-            raise OutOfTime
+            raise OutOfTimeError
         if offsets is None and subset.rows is None:
             rollouts = self.misfit.whole(x, subset.which)
         else:
