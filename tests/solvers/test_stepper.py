@@ -153,3 +153,16 @@ def test_a_row_is_a_whole_trajectory_before_any_of_it_is_used(robot, sine):
     np.testing.assert_array_equal(copy.copy(rows[2]).y, wanted.y[1:])
     after = kc.simulate(robot, sine[1:3], DT, initial=rows[3])
     np.testing.assert_allclose(after.y[-1], kc.simulate(robot, sine[:3], DT).y[-1], rtol=0, atol=1e-7)
+
+
+def test_another_robot_takes_over_the_state():
+    """The same robot as a new object gives the same motion, after the first steps of the scheme too."""
+    robot = kc.load_robot("delrin-tendon-robot")
+    one, other = (kc.solvers.Stepper(robot, 0.05, time="bdf2") for _ in range(2))
+    for _ in range(4):
+        other.robot = robot.replace(length=float(robot.length))
+        wanted, found = (each.step([4.0, 6.0, 5.0, 5.0]) for each in (one, other))
+        np.testing.assert_allclose(found.y, wanted.y, atol=1e-9)
+    other.robot = robot.replace(youngs_modulus=2.0 * float(robot.youngs_modulus))
+    moved = [each.step([4.0, 6.0, 5.0, 5.0]).tip_position[-1] for each in (one, other)]
+    assert np.linalg.norm(np.subtract(*moved)) > 1e-3

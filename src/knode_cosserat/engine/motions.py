@@ -204,9 +204,7 @@ class Motions:
         """
         acting, table, addresses, shapes, size = self._step
         acting[:] = control.reshape(1 if len(control) == acting.shape[1] else len(acting), acting.shape[1])
-        if i < len(self.steps.table):
-            table[:] = coefficients_of(self.steps, (i, i + 1))
-        table[0, :, -1] = (i + self.steps.ends) * self.steps.dt
+        table[:] = coefficients_of(self.steps, (i, i + 1))
         after, results = before.copy(), np.zeros(size)
         self.core._functions["run"](
             self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, 1, 1, len(acting),

@@ -40,6 +40,10 @@ class Stepper:
             row.tip_position[0], row.time[0]
     """
 
+    _engines: list[Any]
+    #: the engine's numbers of the present state; None in a copy and of another robot, until it moves
+    _motion: np.ndarray | None
+
     def __init__(
         self,
         robot: System,
@@ -83,7 +87,6 @@ class Stepper:
         else:
             check_initial(robot, initial, None)
             at_start = continued_state(robot, initial, settings, self.dt)
-        self._bare = without_range(robot)
         known = at_start.state.known(settings)
         self._task = TimeIntegration(settings, self.dt, 1, known, recovery_budget)
         self._t0, self._steps, self._result = float(at_start.state.history.t0), 0, int(at_start.result)
@@ -92,8 +95,7 @@ class Stepper:
         # memories of the engine that no call uses, and the present state as an array of theirs
         engine = self._task.motions(self._bare, at_start.state.history)
         self._engines = [engine]
-        #: None in a copy, until it moves
-        self._motion: np.ndarray | None = engine.motions
+        self._motion = engine.motions
         at_rest = jax.tree.map(np.asarray, at_start.state)
         stages = np.full((settings.stages - 1, *np.shape(at_start.record)), np.nan)
         row = StepRows(np.asarray(at_start.record), np.zeros(0), 0.0, 0, 0.0, 0, 0.0, stages, np.zeros(0))
@@ -101,6 +103,17 @@ class Stepper:
 
     def __repr__(self) -> str:
         return f"Stepper of a {robot_text(self.robot)}: t = {self.time:g} s, dt = {self.dt:g} s"
+
+    @property
+    def robot(self) -> System:
+        """The robot; another one of the same layouts takes over its state."""
+        return self._robot
+
+    @robot.setter
+    def robot(self, robot: System) -> None:
+        self._robot, self._bare = robot, without_range(robot)
+        # memories and machine code were those of the robot before; no state until it moves, as in a copy
+        self._engines, self._motion = [], None
 
     @property
     def time(self) -> float:

@@ -72,10 +72,12 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
     system, y, _, control = checked_equilibrium(equilibrium, row)
     found = linearised_modes(system, y, control)
     apart = np.abs(found.values - found.coarse)
-    # not motions of the whole robot, which cost nothing
-    agreed = np.flatnonzero(apart <= RESOLVED * np.abs(found.values))
-    slowest = agreed[np.argsort(np.abs(found.values[agreed]), kind="stable")][:count]
-    values, error = found.values[slowest], apart[slowest] / np.abs(found.values[slowest]) / 15.0
+    # not motions of the whole robot: double eigenvalues of zero, known to the square root of rounding only
+    sizes = np.abs(found.values)
+    moves = sizes > np.sqrt(np.finfo(float).eps) * np.max(sizes, initial=0.0)
+    agreed = np.flatnonzero(moves & (apart <= RESOLVED * sizes))
+    slowest = agreed[np.argsort(sizes[agreed], kind="stable")][:count]
+    values, error = found.values[slowest], apart[slowest] / sizes[slowest] / 15.0
     shapes = list[np.ndarray]()
     for value, motion in zip(values, found.motions[slowest], strict=True):
         shape = displacements(system, motion)
