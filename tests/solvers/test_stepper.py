@@ -163,6 +163,7 @@ def test_another_robot_takes_over_the_state():
         other.robot = robot.replace(length=float(robot.length))
         wanted, found = (each.step([4.0, 6.0, 5.0, 5.0]) for each in (one, other))
         np.testing.assert_allclose(found.y, wanted.y, atol=1e-9)
+    row, before = other.state, float(robot.youngs_modulus)
     other.robot = robot.replace(youngs_modulus=2.0 * float(robot.youngs_modulus))
     moved = [each.step([4.0, 6.0, 5.0, 5.0]).tip_position[-1] for each in (one, other)]
-    assert np.linalg.norm(np.subtract(*moved)) > 1e-3
+    assert np.linalg.norm(np.subtract(*moved)) > 1e-3 and float(row.system.youngs_modulus) == before

@@ -298,7 +298,7 @@ def period(spec: Spec) -> TimeIntegration:
 def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Any:
     """Return systems, states with the commands of actions, acting controls (B, 1, c), and valid actions."""
 
-    def each(state: EpisodeState, action: Any) -> Any:
+    def move(state: EpisodeState, action: Any) -> Any:
         before, action = state.commands[0], jnp.asarray(action, dtype=float)
         valid = jnp.all(jnp.isfinite(action))
         command = commanded(spec, arrays, before, jnp.where(valid, action, 0.0))
@@ -307,7 +307,7 @@ def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, 
         system = None if spec.is_shared else system_of(spec, arrays, state)
         return system, state, commands[state.delay][None], valid
 
-    systems, *rest = jax.vmap(each)(states, actions)
+    systems, *rest = jax.vmap(move)(states, actions)
     return arrays.robot if spec.is_shared else systems, *rest
 
 
@@ -319,7 +319,7 @@ def arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solu
     is the one before.
     """
 
-    def each(system: System, state: EpisodeState, record: Any, result: Any, valid: Any) -> Any:
+    def arrive(system: System, state: EpisodeState, record: Any, result: Any, valid: Any) -> Any:
         solved, coarse = result >= 0, result == int(Result.COARSE)
         y, z = split_record(system, jnp.where(solved, record, 0.0))
         key, noise_key = jax.random.split(state.key)
@@ -350,7 +350,7 @@ def arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solu
         return state, transition
 
     axes = (None if spec.is_shared else 0, *[0] * 4)
-    return jax.vmap(each, in_axes=axes)(systems, states, *solution)
+    return jax.vmap(arrive, in_axes=axes)(systems, states, *solution)
 
 
 @functools.partial(jax.jit, static_argnames="spec")

@@ -215,13 +215,14 @@ class Stepper:
 
     def _row(self, solved: Solved, control: np.ndarray, time: float) -> Trajectory:
         """Return a solved row as a trajectory, put together when it is first used."""
+        robot = self.robot  # which another one may have replaced by then
 
         def fields() -> dict[str, Any]:
             row, state = solved()
             row = StepRows(*(np.asarray(leaf)[None] for leaf in row))
             found = Trajectory(
-                self.robot, self._task.settings, np.array([time]), control=control[None],
-                **rows_of(self.robot, row), initial_state=state, final_state=state,
+                robot, self._task.settings, np.array([time]), control=control[None],
+                **rows_of(robot, row), initial_state=state, final_state=state,
             )  # fmt: skip
             return vars(marked(found, None))
 
