@@ -155,8 +155,6 @@ def seconds_in_period(controller: Any, clock: Callable[[], float] = time.perf_co
 @contextlib.contextmanager
 def no_garbage_collection() -> Iterator[None]:
     """Suspend Python's garbage collector, which interrupts a period for some milliseconds."""
-    gc.collect()
-    gc.freeze()
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -164,4 +162,3 @@ def no_garbage_collection() -> Iterator[None]:
     finally:
         if enabled:
             gc.enable()
-        gc.unfreeze()

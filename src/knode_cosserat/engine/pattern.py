@@ -116,15 +116,15 @@ def _kept_on_disk(
     from knode_cosserat.engine import sidecars  # which need all of the engine
 
     name = sidecars.name_of([each.system if isinstance(each, Pattern) else each for each in key])
-    if name is None:
-        return build()
-    attributes = sidecars.restored(name)
-    if attributes is None:
-        code = build()
-        sidecars.keep(name, code, given)
-    else:
+    attributes = None if name is None else sidecars.restored(name)
+    if attributes is not None:
         code = kind.__new__(kind)
         vars(code).update(attributes, **given)
+        return code
+    code = build()
+    sidecars.forget_writers(code)
+    if name is not None:
+        sidecars.keep(name, code, given)
     return code
 
 

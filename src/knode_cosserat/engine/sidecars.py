@@ -185,7 +185,7 @@ def _plain(value: Any) -> Any:
         return {"shape": value.shape}
     if isinstance(value, MachineCode):
         return {"code": [value.name, value.kinds]}
-    kind = Sizes if isinstance(value, Sizes) else type(value)
+    kind = type(value)
     if kind.__module__.startswith(f"{PACKAGE}.") and (names := _fields(kind)) is not None:
         at = kind.__module__, kind.__qualname__
         return {"object": [*at, {each: _plain(getattr(value, each)) for each in names}]}
@@ -244,6 +244,15 @@ def _writes(value: Any) -> bool:
     return isinstance(value, _WRITERS) or (type(value) is list and bool(value) and all(map(_writes, value)))
 
 
+def forget_writers(found: Any) -> None:
+    """Delete the attributes that wrote an object's code: programs of some 10 MB."""
+    for key, value in list(vars(found).items()):
+        if _writes(value):
+            delattr(found, key)
+        elif isinstance(value, Sizes):
+            setattr(found, key, Sizes(*(getattr(value, each) for each in _fields(Sizes) or ())))
+
+
 def restored(name: str) -> dict[str, Any] | None:
     """Return the attributes of an object from its sidecar; None if it is not complete on disk."""
     content = stored(name)
@@ -254,14 +263,7 @@ def restored(name: str) -> dict[str, Any] | None:
 
 
 def keep(name: str, found: Any, given: Collection[str]) -> None:
-    """Store the attributes of an object, but for those given and the writers of its code.
-
-    Nothing is stored if one of them is no data.
-    """
+    """Store the attributes of an object, but for those given; nothing is stored if one of them is no data."""
     with contextlib.suppress(UnknownError):
-        attributes = {
-            key: _plain(value)
-            for key, value in vars(found).items()
-            if key not in given and not _writes(value)
-        }
+        attributes = {key: _plain(value) for key, value in vars(found).items() if key not in given}
         store(name, json.dumps({"dict": attributes}).encode())
