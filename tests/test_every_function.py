@@ -274,7 +274,9 @@ def calls() -> Iterator[Any]:
     for kind in ROBOTS:
         for name in FUNCTIONS:
             often = (kind in OFTEN and name not in SLOW | LONG_FOR_MODELS) or (kind == "own" and name in OWN)
-            quick = ((name, kind) in LACKING and "fit" in name) or (kind in OFTEN and name == "equilibrium")
+            quick = ((name, kind) in LACKING and name == "fit, passive") or (
+                kind in OFTEN and name == "equilibrium"
+            )
             marks = [] if quick else [pytest.mark.slow if often else pytest.mark.campaign]
             yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
 
