@@ -483,3 +483,72 @@ def test_random_expressions(values, steps):
     with np.errstate(all="ignore"):
         hypothesis.assume(np.all(np.isfinite(jax.jacfwd(expression)(jnp.array(values)))))
     check(expression, np.array(values), tolerance=1e-9)
+
+
+#: functions of what users' laws have: scalars, vectors and matrices; each takes one or two of the kinds named
+OF_SHAPES = [
+    ("v v", jnp.dot), ("v v", jnp.vdot), ("v v", jnp.inner), ("v v", jnp.outer), ("v v", jnp.cross),
+    ("v v", lambda x, y: jnp.einsum("i,i->", x, y)), ("v v", lambda x, y: jnp.tensordot(x, y, 1)),
+    ("v v", lambda x, y: jnp.where(jnp.vdot(x, y) > 0.0, x, y)),
+    ("v v", lambda x, y: jnp.stack([x, y, x - y])), ("v v", jnp.subtract), ("s s", jnp.multiply),
+    ("v v", lambda x, y: jnp.concatenate([x[:1], y[1:]])), ("v v", jnp.kron),
+    ("m v", jnp.matmul), ("v m", jnp.matmul), ("m v", lambda A, x: jnp.linalg.solve(4.0 * jnp.eye(3) + A, x)),
+    ("m v", lambda A, x: jnp.einsum("i,ij,j", x, A, x)), ("m v", lambda A, x: A.at[1].add(x)),
+    ("m m", jnp.matmul), ("m m", lambda A, B: jnp.einsum("ij,ij->", A, B)), ("m m", jnp.vdot),
+    ("m m", lambda A, B: jnp.einsum("ij,kj->ik", A, B)), ("m m", lambda A, B: jnp.tensordot(A, B, 2)),
+    ("v", lambda x: jnp.sqrt(jnp.sum(x**2) + 1.0)), ("v", lambda x: jnp.linalg.norm(x + 3.0)),
+    ("v", jnp.sum), ("v", jnp.mean), ("v", jnp.prod), ("v", jnp.max), ("v", jnp.cumsum), ("v", jnp.flip),
+    ("v", lambda x: jnp.roll(x, 1)), ("v", lambda x: jnp.clip(x, -0.9, 1.1)), ("v", jnp.diag),
+    ("v", lambda x: jnp.interp(x[0], jnp.array([-1.0, 0.0, 1.0]), jnp.array([1.0, 2.0, 1.5]))),
+    ("v", lambda x: jnp.linalg.inv(jnp.eye(3) + jnp.outer(x, x))), ("v", lambda x: x[::-1] * x[0]),
+    ("m", jnp.trace), ("m", jnp.diagonal), ("m", lambda A: A.T), ("m", jnp.linalg.det), ("m", jnp.var),
+    ("m", lambda A: jnp.sum(A, axis=0)), ("m", lambda A: jnp.min(A, axis=1)), ("m", lambda A: A[:, 1]),
+    ("m", lambda A: jnp.linalg.norm(A + 3.0)), ("m", lambda A: jnp.ravel(A)[2:5]), ("s", jnp.square),
+    ("s s", jnp.add), ("s v", jnp.multiply), ("s m", jnp.multiply),
+    ("m m", jnp.add), ("s", lambda a: a * jnp.ones(3)), ("s", lambda a: jnp.tanh(a) * jnp.eye(3)),
+]  # fmt: skip
+
+
+def check_shapes(steps, values, is_batch):
+    """Compare functions `OF_SHAPES`, of what is known or found before by its number, with JAX."""
+
+    def expression(x):
+        known = {"s": [x[0]], "v": [x[:3], x[3:]], "m": [jnp.outer(x[3:], x[:3]) + 0.5 * jnp.eye(3)]}
+        found = []
+        for (kinds, function), *which in steps:
+            own = [known[kind] for kind in kinds.split()]
+            made = function(*(values[k % len(values)] for values, k in zip(own, which, strict=False)))
+            found.append(jnp.ravel(made))
+            kind = {(): "s", (3,): "v", (3, 3): "m"}.get(made.shape)
+            if kind:
+                known[kind].append(made)
+        return jnp.concatenate(found)
+
+    x, function = np.array(values), expression
+    if is_batch:
+        x, function = np.stack([x, 0.7 * x[::-1]]), jax.vmap(expression)
+    with np.errstate(all="ignore"):
+        exact = jax.jit(jax.jacfwd(function))(jnp.array(x))
+    if not np.all(np.abs(exact) < 1e4):
+        hypothesis.reject()
+    check(function, x, tolerance=1e-9)
+
+
+@pytest.mark.parametrize("is_batch", [False, True])
+def test_functions_of_vectors_and_matrices(is_batch):
+    """Each by itself, in value and derivative, and as JAX batches them."""
+    check_shapes([(form, 0, 1) for form in OF_SHAPES], [0.3, -0.7, 0.45, 0.9, 0.2, -0.55], is_batch)
+
+
+@hypothesis.given(
+    values=st.lists(
+        st.floats(-1.0, 1.0).filter(lambda x: abs(x) > 1e-2), min_size=6, max_size=6, unique=True
+    ),
+    steps=st.lists(
+        st.tuples(st.sampled_from(OF_SHAPES), st.integers(0, 9), st.integers(0, 9)), min_size=3, max_size=8
+    ),
+    is_batch=st.booleans(),
+)
+@hypothesis.settings(max_examples=8, deadline=None, derandomize=True)
+def test_random_expressions_of_vectors_and_matrices(values, steps, is_batch):
+    check_shapes(steps, values, is_batch)

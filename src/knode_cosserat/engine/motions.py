@@ -189,11 +189,17 @@ class Motions:
 
     @functools.cached_property
     def _step(self) -> tuple[Any, ...]:
-        """Controls, coefficients, addresses of what steps have in common, shapes and size of results."""
-        stages = np.size(self.steps.ends)
-        acting, table = np.empty((stages, self.core.equations.nc)), coefficients_of(self.steps, (0, 1))
+        """Controls, coefficients of all steps and of one, and the times of its stages in steps.
+
+        Then addresses of what steps have in common, shapes and size of results.
+        """
+        ends = np.reshape(self.steps.ends, -1)
+        stages = len(ends)
+        every = coefficients_of(self.steps, (0, len(self.steps.table)))
+        acting, table = np.empty((stages, self.core.equations.nc)), every[0].copy()
         arrays, shapes = (self._parameters, acting, table, self.core._guesses), self._shapes_of(1, stages)
-        return acting, table, [each.ctypes.data for each in arrays], shapes, sum(map(math.prod, shapes))
+        addresses = [each.ctypes.data for each in arrays]
+        return acting, every, table, ends, addresses, shapes, sum(map(math.prod, shapes))
 
     def step(
         self, before: np.ndarray, i: int, control: np.ndarray
@@ -202,9 +208,10 @@ class Motions:
 
         Return the state after it, its numbers for `row_of`, and its result; no numbers if it failed.
         """
-        acting, table, addresses, shapes, size = self._step
+        acting, every, table, ends, addresses, shapes, size = self._step
         acting[:] = control.reshape(1 if len(control) == acting.shape[1] else len(acting), acting.shape[1])
-        table[:] = coefficients_of(self.steps, (i, i + 1))
+        table[:] = every[min(i, len(every) - 1)]
+        table[:, -1] = (i + ends) * self.steps.dt
         after, results = before.copy(), np.zeros(size)
         self.core._functions["run"](
             self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, 1, 1, len(acting),

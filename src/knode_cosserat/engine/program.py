@@ -1520,9 +1520,9 @@ class _Evaluation:
                 own = np.broadcast_to(positions, (*rows, count)).reshape(*(n for n in rows if n > 1), count)
                 views.append(program.view(program.array(x), own))
             total = program.total(self.apply("mul", *views), count)
-            return program.entries(total).reshape(*batch, *free_a, *free_b)
+            return program.entries(total).reshape((*batch, *free_a, *free_b))
         products = self.elementwise("mul", a[:, :, None, :], b[:, None, :, :])
-        return self._reduced("add", products, (3,)).reshape(*batch, *free_a, *free_b)
+        return self._reduced("add", products, (3,)).reshape((*batch, *free_a, *free_b))
 
     def _nonzero(self, x: Nodes) -> Any:
         """Return 1 for entries that are not structural zeros."""
