@@ -15,7 +15,7 @@ import numpy as np
 from matplotlib.ticker import NullLocator
 
 import knode_cosserat as kc
-from benchmarks import beams, closed_forms, motions
+from benchmarks import beams, closed_forms, motions, sorosim
 from benchmarks.buckling import tip_response
 
 DOCS = Path(__file__).parents[1] / "docs"
@@ -168,13 +168,16 @@ def main() -> None:
     }
     families = beams.STATICS, beams.BUCKLING, beams.VIBRATION, motions.MOTIONS
     names = {key: case.name for family in families for key, case in family.items()}
-    written(DOCS / "validation.md", {name: table(found, names) for name, found in every.items()})
+    tables = {name: table(found, names) for name, found in every.items()}
+    compared = sorosim.statics(), sorosim.vibrations()
+    written(DOCS / "validation.md", {**tables, "sorosim": sorosim.table(*compared)})
+    sorosim.picture(*compared, DOCS / "images" / "validation-sorosim.png")
     convergence(
         {
-            "statics, RK4": every["statics"],
+            "statics, order 4": every["statics"],
             "statics, Euler": every["euler"],
-            "buckling and vibration, RK4": {**every["buckling"], **every["vibration"]},
-            "damped motion, RK4": every["motion"],
+            "buckling and vibration, order 4": {**every["buckling"], **every["vibration"]},
+            "damped motion, order 4": every["motion"],
         },
         DOCS / "images" / "validation-convergence.png",
     )
