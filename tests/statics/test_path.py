@@ -5,6 +5,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Driven
+from knode_cosserat.statics import path
 
 L, RADIUS, E = 1.0, 2e-3, 1e9
 
@@ -18,16 +19,37 @@ def test_a_twisted_ring_stays_a_circle_and_has_no_limit_points():
     )  # fmt: skip
     s, r = 2.0 * np.pi * np.linspace(0.0, 1.0, 41), L / (2.0 * np.pi)
     circle = np.stack([r * (1.0 - np.cos(s)), 0.0 * s, r * np.sin(s)], axis=1)
-    path = kc.statics.equilibrium_path(
+    followed = kc.statics.equilibrium_path(
         ring, [0.0], [3.0], initial=circle, space="lobatto4", points=60, with_stability=False
     )
-    assert path.complete and not len(path.limit_points)
-    assert np.all(np.diff(path.part) > 0.0)
+    assert followed.complete and not len(followed.limit_points)
+    assert np.all(np.diff(followed.part) > 0.0)
     # the turn about the tangent, which costs nothing, is not made
-    assert np.max(np.abs(path.trajectory.position[:, :, 1])) < 1e-3 * L
-    moment = path.trajectory.y[:, 0, ring.y_layout.slice("m")]
+    assert np.max(np.abs(followed.trajectory.position[:, :, 1])) < 1e-3 * L
+    moment = followed.trajectory.y[:, 0, ring.y_layout.slice("m")]
     stiffness = float(ring.Kbt[2, 2])
-    assert moment[:, 2] == pytest.approx(stiffness * 3.0 * path.part / L, abs=0.02 * stiffness / L)
+    assert moment[:, 2] == pytest.approx(stiffness * 3.0 * followed.part / L, abs=0.02 * stiffness / L)
     for row in (0, -1):
-        found = kc.statics.stability(path.trajectory, row)
+        found = kc.statics.stability(followed.trajectory, row)
         assert found.kind == "neutral" and found.neutral_directions == 1 and found.unstable_directions == 0
+
+
+def test_an_interrupted_path_is_kept(monkeypatch):
+    """Each point that was found is an equilibrium; nothing is said of their stability."""
+    robot = kc.load_robot("delrin-tendon-robot").replace(nodes=5)
+    advance = path._Walk.advance
+
+    def advance_thrice(walk):
+        if len(walk.parts) > 3:
+            raise KeyboardInterrupt
+        return advance(walk)
+
+    monkeypatch.setattr(path._Walk, "advance", advance_thrice)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        kc.statics.equilibrium_path(robot, [0.0] * 4, [4.0, 0.0, 0.0, 2.0], progress=True)
+    found = caught.value.best
+    assert len(found.part) == 4 and not found.complete
+    assert found.unstable_directions.tolist() == [-1] * 4
+    for part, tip in zip(found.part, found.trajectory.tip_position, strict=True):
+        wanted = kc.equilibrium(robot, part * np.array([4.0, 0.0, 0.0, 2.0])).tip_position[0]
+        np.testing.assert_allclose(tip, wanted, atol=1e-8)

@@ -1,6 +1,7 @@
 """Poses of many equilibria: each is `kc.equilibrium`'s, and none is wrong in silence."""
 
 import csv
+import importlib
 import subprocess
 import sys
 
@@ -27,6 +28,28 @@ def test_every_sample_is_the_equilibrium_of_its_control(found):
         assert found.peak("u")[i] == pytest.approx(bent, rel=1e-7)
     assert found.unsolved == 0
     assert np.all(found.residual <= 1e-8)
+
+
+def test_interrupted_samples_are_kept(found, monkeypatch):
+    """Those of the chunks that were computed, with their own controls."""
+    module = importlib.import_module("knode_cosserat.statics.workspace")
+    solve, calls = module.equilibrium_poses, []
+
+    def solve_twice(*arguments):
+        calls.append(None)
+        if len(calls) > 2:
+            raise KeyboardInterrupt
+        return solve(*arguments)
+
+    monkeypatch.setattr(module, "equilibrium_poses", solve_twice)
+    monkeypatch.setattr(module, "usable_cores", lambda: 5)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        kc.workspace(ROBOT, 0.0, [10.0, 8.0, 6.0, 4.0], 40, seed=3)
+    best = caught.value.best
+    assert len(best.controls) == 16 and best.unsolved == 0
+    places = [int(np.flatnonzero(np.all(found.controls == each, axis=1))[0]) for each in best.controls]
+    assert len(set(places)) == 16
+    np.testing.assert_allclose(best.position, found.position[places], atol=1e-9)
 
 
 def test_samples_fill_the_box_and_follow_the_seed(found):

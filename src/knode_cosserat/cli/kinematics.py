@@ -20,7 +20,7 @@ from knode_cosserat.cli.arguments import (
     parse_numbers,
     require_writable,
 )
-from knode_cosserat.cli.output import vector_text, write_output
+from knode_cosserat.cli.output import best_so_far, vector_text, write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.robots import Held
 from knode_cosserat.cli.summaries import stability_summary
@@ -226,9 +226,12 @@ def workspace(
 
     system = model.load()
     began = perf_counter()
-    found = kc.workspace(
-        system, *limits.of(system), count, seed=seed, space=space, progress=report.shows_progress
+    found = best_so_far(
+        lambda: kc.workspace(
+            system, *limits.of(system), count, seed=seed, space=space, progress=report.shows_progress
+        )
     )
+    count = len(found.controls)
     seconds = perf_counter() - began
     found.save(out)
     if drawing:

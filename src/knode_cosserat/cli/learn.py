@@ -29,7 +29,7 @@ from knode_cosserat.cli.arguments import (
     option,
     require_writable,
 )
-from knode_cosserat.cli.output import write_output
+from knode_cosserat.cli.output import best_so_far, write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.summaries import residual_summary
 from knode_cosserat.recordings.formats import read_suffixes
@@ -159,9 +159,11 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
     validation = [load_trajectory_file(path) for path in data.held_out or ()]
     began = perf_counter()
     try:
-        result = learn(
-            system, training, config, held_out=validation, checkpoint=files.checkpoint, log_dir=files.log,
-            progress=report.shows_progress,
+        result = best_so_far(
+            lambda: learn(
+                system, training, config, held_out=validation, checkpoint=files.checkpoint,
+                log_dir=files.log, progress=report.shows_progress,
+            )
         )  # fmt: skip
     except DataError as error:
         # files' names instead of the numbers of trajectories
@@ -255,15 +257,12 @@ def identify(
     ]
     began = perf_counter()
     progress = functools.partial(print, file=sys.stderr, flush=True) if report.shows_progress else None
-    try:
-        identified = find(
+    identified = best_so_far(
+        lambda: find(
             system, samples, search.effects or None, space=sampling.space, progress=progress,
             checkpoint=search.checkpoint, minutes=search.minutes,
-        )  # fmt: skip
-    except KeyboardInterrupt as stop:
-        if not hasattr(stop, "best"):
-            raise
-        identified = stop.best
+        )
+    )  # fmt: skip
     kc.save_robot(identified.robot, search.out)
     facts = identified.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
     write_output(report.as_json, facts, str(identified).splitlines(), out=search.out)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,18 @@ def write_output(as_json: bool, facts: dict[str, Any], lines: list[str], **writt
         return
     for line in [*lines, *(f"wrote {path}" for path in written.values() if path)]:
         typer.echo(printable(line))
+
+
+def best_so_far(compute: Callable[[], Any]) -> Any:
+    """Return what a function computes; at Ctrl-C its best result so far, if it has one, which is said."""
+    try:
+        return compute()
+    except KeyboardInterrupt as stop:
+        best = getattr(stop, "best", None)
+        if best is None:
+            raise
+        typer.echo("interrupted; this is the best so far", err=True)
+        return best
 
 
 def printable(text: str) -> str:

@@ -83,7 +83,8 @@ def fit_states(
         step), "versions", "date" and "seconds". Each stage of gradient training, "segments" and "rollouts",
         has the "loss" before every step, the "learning_rate", and the "held_out_error" (step, m) at every
         check. The final "held_out_error" (m) is that of the model. "rollout_errors" are those of the nominal
-        model and of the model, if they were verified (`rollout_errors`).
+        model and of the model, if they were verified (`rollout_errors`). An interruption of the training by
+        Ctrl-C is a `KeyboardInterrupt`, whose `best` is the model so far; its facts have "interrupted".
 
     Raises:
         DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
@@ -102,22 +103,30 @@ def fit_states(
         kept = Checkpoints(checkpoint, Identity.of(knowledge, trajectories, held_out, config))
     learned = dict(zip(config.seeds, initial, strict=True))
     histories: dict[int, dict[str, Any]] = {seed: {} for seed in config.seeds}
+    interrupted: KeyboardInterrupt | None = None
     with ProgressMonitor(progress, log_dir) as watch:
         for stage in (_segment_runs, _rollout_runs):
             runs = stage(data, learned)
             if not runs:
                 continue
-            run_all(runs, kept, checkpoint_every, watch)
+            try:
+                run_all(runs, kept, checkpoint_every, watch)
+            except KeyboardInterrupt as stop:
+                interrupted = stop
             for run in runs:
                 learned |= dict(zip(run.seeds, run.residuals(), strict=True))
                 for seed in run.seeds:
                     histories[seed][run.stage] = run.report(seed)
+            if interrupted:
+                break
     facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
     if verify is None:
         verify = not type(nominal_model(knowledge)).__module__.startswith("knode_cosserat.")
     models = []
     for seed, residual in learned.items():
         model, about = KNODE(knowledge, residual), {**facts, "seed": seed, **histories[seed]}
+        if interrupted:
+            about["interrupted"] = True
         if data.held_out is not None:
             about["held_out_error"] = rollouts.tip_error(model, data.held_out)
         if verify:
@@ -125,7 +134,11 @@ def fit_states(
         about["seconds"] = time.perf_counter() - began
         models.append(KNODE(knowledge, residual, About(about), trained))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), about["seconds"], seed)
-    return Ensemble(models) if isinstance(config.seed, tuple) else models[0]
+    found = Ensemble(models) if isinstance(config.seed, tuple) else models[0]
+    if interrupted:
+        interrupted.best = found  # type: ignore[attr-defined]
+        raise interrupted
+    return found
 
 
 def _check(knowledge: Any, config: Any, held_out: Any, checkpoint_every: Any) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.equilibrium import equilibrium
@@ -78,6 +79,7 @@ class EquilibriumPath:
 def equilibrium_path(
     robot: System, first: Any, last: Any, *, initial: Any = None, space: str | SpaceScheme = "lobatto2",
     newton: NewtonOptions = NewtonOptions(), points: int = 200, with_stability: bool = True,
+    progress: bool = False,
 ) -> EquilibriumPath:  # fmt: skip
     """Follow the equilibria of a robot from one control to another, through limit points.
 
@@ -90,10 +92,11 @@ def equilibrium_path(
         newton: tolerances of the solve.
         points: largest number of points.
         with_stability: compute the stability of every point (`stability`).
+        progress: show a progress bar.
 
     Returns:
         An `EquilibriumPath`. It ends at `last`, or earlier if `points` is reached or no further point is
-        found.
+        found. An interruption by Ctrl-C is a `KeyboardInterrupt`, whose `best` is the path so far.
 
     Raises:
         SimulationError: there is no equilibrium at the first control.
@@ -105,19 +108,33 @@ def equilibrium_path(
         raise ValueError("first and last are the same control; there is no path between them")
     settings = static_settings(space, newton)
     found = equilibrium(system, first, space=settings.space, initial=initial, newton=newton)
-    nodes = [np.asarray(found.y[0])]
-    walk = _Walk(system, settings, (first, last), nodes[0])
-    while len(walk.parts) < points and not walk.complete:
-        if not walk.advance():
-            break
-    trajectory = _trajectory(system, settings, walk)
-    directions = np.full(len(walk.parts), -1)
-    for row in range(len(directions)) if with_stability else ():
+    walk = _Walk(system, settings, (first, last), np.asarray(found.y[0]))
+    directions: list[int] = []
+
+    def path() -> EquilibriumPath:
+        trajectory, unknown = _trajectory(system, settings, walk), [-1] * (len(walk.parts) - len(directions))
+        return EquilibriumPath(
+            np.array(walk.parts), trajectory, np.array([*directions, *unknown]), walk.complete
+        )
+
+    with tqdm(total=points, initial=1, disable=not progress, unit="point", leave=False) as bar:
         try:
-            directions[row] = stability(trajectory, row).unstable_directions
-        except ValueError:  # not decided
-            continue
-    return EquilibriumPath(np.array(walk.parts), trajectory, directions, walk.complete)
+            while len(walk.parts) < points and not walk.complete and walk.advance():
+                bar.set_postfix_str(f"part {walk.parts[-1]:.3g}", refresh=False)
+                bar.update()
+            bar.reset(total=len(walk.parts))
+            bar.set_postfix_str("stability")
+            trajectory = path().trajectory
+            for row in range(len(walk.parts)) if with_stability else ():
+                try:
+                    directions.append(stability(trajectory, row).unstable_directions)
+                except ValueError:  # not decided
+                    directions.append(-1)
+                bar.update()
+        except KeyboardInterrupt as stop:
+            stop.best = path()  # type: ignore[attr-defined]
+            raise
+    return path()
 
 
 class _Walk:

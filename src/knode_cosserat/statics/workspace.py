@@ -184,7 +184,8 @@ def workspace(
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
         pose: pose function, as for `kc.statics.configuration`.
-        progress: show a progress bar.
+        progress: show a progress bar. An interruption by Ctrl-C is a `KeyboardInterrupt`, whose `best` are
+            the samples so far.
 
     Raises:
         ValueError: arguments of a wrong shape.
@@ -215,30 +216,52 @@ def workspace(
 def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray, progress: bool) -> Workspace:
     total = len(controls)
     chunk = min(CHUNK, 2 ** int(np.ceil(np.log2(max(1, -(-total // usable_cores()))))))
+    #: samples and their poses, residuals and strains, by the number of the first
+    chunks: dict[int, list[Any]] = {}
+    found: Workspace | None = None
     with tqdm(total=total, disable=not progress, unit="sample", leave=False) as bar:
 
-        def work(first: int) -> Any:
+        def work(first: int) -> None:
             # the last chunk is padded with its last sample: one shape, one program
             index = np.minimum(np.arange(first, first + chunk), total - 1)
-            found = equilibrium_poses(system, settings, pose, controls[index])
+            poses = equilibrium_poses(system, settings, pose, controls[index])
             count = min(chunk, total - first)
+            chunks[first] = [None if leaf is None else np.asarray(leaf)[:count] for leaf in (index, *poses)]
             bar.update(count)
-            return [None if leaf is None else np.asarray(leaf)[:count] for leaf in found]
 
         firsts = range(0, total, chunk)
-        # the first chunk alone: JAX may crash if two threads compile the same program
-        chunks = [work(firsts[0])]
-        with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
-            chunks += pool.map(work, firsts[1:])
-    joined: list[Any] = [
-        None if parts[0] is None else np.concatenate(parts) for parts in zip(*chunks, strict=True)
-    ]
-    position, quaternion, residual, strain = joined
-    result = ResultCodes.of(np.full(total, int(Result.CONVERGED)))
-    found = Workspace(system, controls, position, quaternion, result, residual, strain)
-    for i in np.flatnonzero(~(residual <= settings.newton.acceptable)):
-        _recovered(found, int(i), settings, pose)
+        try:
+            # the first chunk alone: JAX may crash if two threads compile the same program
+            work(firsts[0])
+            with concurrent.futures.ThreadPoolExecutor(usable_cores()) as pool:
+                try:
+                    for each in [pool.submit(work, first) for first in firsts[1:]]:
+                        each.result()
+                except KeyboardInterrupt:
+                    pool.shutdown(cancel_futures=True)
+                    raise
+            found = _joined(system, settings, controls, chunks)
+            for i in np.flatnonzero(~found.valid):
+                _recovered(found, int(i), settings, pose)
+        except KeyboardInterrupt as stop:
+            if chunks:
+                stop.best = found or _joined(system, settings, controls, chunks)  # type: ignore[attr-defined]
+            raise
     return found
+
+
+def _joined(
+    system: System, settings: Settings, controls: np.ndarray, chunks: dict[int, list[Any]]
+) -> Workspace:
+    """Return the samples of all chunks that were computed."""
+    joined: list[Any] = [
+        None if parts[0] is None else np.concatenate(parts)
+        for parts in zip(*(chunks[first] for first in sorted(chunks)), strict=True)
+    ]
+    index, position, quaternion, residual, strain = joined
+    solved = residual <= settings.newton.acceptable
+    result = np.where(solved, int(Result.CONVERGED), int(Result.NO_CONVERGENCE))
+    return Workspace(system, controls[index], position, quaternion, ResultCodes.of(result), residual, strain)
 
 
 def _recovered(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:

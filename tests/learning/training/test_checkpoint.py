@@ -55,6 +55,22 @@ def _members(found):
     return [found] if hasattr(found, "residual") else list(found)
 
 
+def test_an_interrupted_training_keeps_its_weights(monkeypatch):
+    """The model so far predicts better than the nominal model, and says that it was interrupted."""
+    bars, steps = [pulled(1.0)], ProgressMonitor.steps
+
+    def interrupt(monitor, *arguments):
+        steps(monitor, *arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ProgressMonitor, "steps", interrupt)
+    with pytest.raises(KeyboardInterrupt) as caught:
+        fit_states(WRONG, bars, CONFIG, checkpoint_every=100)
+    found = caught.value.best
+    losses = found.about.facts["segments"]["loss"]
+    assert found.about.facts["interrupted"] and 1 < len(losses) <= 130 and losses[-1] < losses[0]
+
+
 class Interruption(Exception):  # noqa: N818
     pass
 
