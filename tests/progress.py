@@ -2,7 +2,8 @@
 
 `costs.json` has the CPU time (s) of each file, and of each slow test by itself, in a run that compiles
 everything. It serves two purposes: the costliest files start first, so that all processes finish together,
-and the time left is estimated from the share of the cost that is done. `pytest --write-costs` writes it anew.
+and the time left is estimated from the share of the cost that is done. `pytest --write-costs` writes those
+of the tests that it runs.
 """
 
 import json
@@ -121,8 +122,10 @@ class Progress:
 
     def pytest_sessionfinish(self):
         if self.config.option.write_costs:
-            table = {name: round(cost, 1) for name, cost in sorted(self.recorder.costs.items())}
-            COSTS.write_text(json.dumps(table, indent=0) + "\n", encoding="utf-8")
+            files = COSTS.parents[1]
+            kept = {name: cost for name, cost in read_costs().items() if (files / file_of(name)).exists()}
+            table = kept | {name: round(cost, 1) for name, cost in self.recorder.costs.items()}
+            COSTS.write_text(json.dumps(dict(sorted(table.items())), indent=0) + "\n", encoding="utf-8")
 
 
 def sort_by_cost(items):
