@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import logging
 import os
 import time
@@ -25,7 +26,7 @@ from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.guess import materials
+from knode_cosserat.solvers.guess import are_far, materials
 from knode_cosserat.solvers.history import (
     SolverState,
     StepCoefficients,
@@ -106,9 +107,14 @@ class TimeIntegration:
             return StaticRecovery(system, self.settings, state, budget).recover(controls)
         step = TimeStep.of(self.coefficients, state, i)
         recovery = StepRecovery(system, self.settings, step, self.dt, budget)
-        return (
-            recovered_stages(recovery, controls) if self.settings.stages > 1 else recovery.recover(controls)
-        )
+        recover = functools.partial(recovered_stages, recovery) if self.settings.stages > 1 else recovery.recover
+        found = recover(controls)
+        rows = tuple(np.asarray(each)[-system.control_layout.size :] for each in controls)
+        if recovery.largest_part(rows) == 1.0:
+            return found
+        # an extrapolation from before a far turn would lose turns in the next steps
+        y = found.state.y
+        return found._replace(state=found.state._replace(y=np.stack([y[0]] * len(y))))
 
 
 def run_one(
@@ -127,13 +133,16 @@ def run_one(
     budget = Budget(task.recovery_budget)
     rows = no_rows(system, (total,), task.settings.stages) if rows is None else rows
     done, cause = 0, ""
+    # steps for recovery alone; equilibria are already in small parts
+    far = np.flatnonzero(are_far(system, controls, before)) if task.settings.time else []
     with _bar(watch, total, "step") as advance:
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
-            reached, state, _ = task.solve(
-                system, controls, state, (done, stop), _picked(rows, slice(done, stop))
-            )
+            reached, last = done, min([stop, *(k for k in far if k >= done)])
+            if last > done:
+                span = slice(done, last)
+                reached, state, _ = task.solve(system, controls, state, (done, last), _picked(rows, span))
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
             if watch:
@@ -328,7 +337,8 @@ def run_batch(
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
             list(pool.map(work, range(0, size, chunk)))
     causes = {}
-    for i in np.flatnonzero(done < task.steps):
+    far = task.settings.time is not None and np.any(are_far(system, controls, before), axis=-1)
+    for i in np.flatnonzero((done < task.steps) | far):
         *solved, cause = run_one(task, robot(i), controls[i], (_picked(states, i), before[i]))
         _put((every, lasts), i, solved)
         if cause:

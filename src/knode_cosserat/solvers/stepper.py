@@ -12,6 +12,7 @@ from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.solvers.guess import are_far
 from knode_cosserat.solvers.history import SolverState, StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
@@ -191,7 +192,9 @@ class Stepper:
         except IndexError:  # another thread has it, or this is a copy
             engine = self._task.motions(self._bare, self._history)
         before = engine.motions if self._motion is None else self._motion
-        motion, numbers, result = engine.step(before, i, acting)
+        numbers = None
+        if not are_far(self.robot, control[None], self._control)[0]:
+            motion, numbers, result = engine.step(before, i, acting)
         if numbers is None:
             budget, pair = Budget(self._task.recovery_budget, stop), (self._control, acting)
             after, row, cause = self._task.recover(self._bare, self._history, pair, i, budget)
