@@ -112,15 +112,15 @@ def _turning(system: System) -> list[list[int]]:
     return list(found.values())
 
 
-def are_far(system: System, controls: Any, before: Any) -> Any:
-    """True for each control (..., T, c) that turns an end too far from the one before to keep its turns.
+def turns_within(system: System, controls: Any, before: Any) -> Any:
+    """Return the largest angles (..., T) (rad) by which each of controls (..., T, c) turns an end.
 
     `before` (..., c) precedes the first one. Controls at several stages of a step count as the last one.
     """
     numeric: Any = jnp if is_traced((controls, before)) else np
     rows = controls[..., -system.control_layout.size :]
     earlier = numeric.concatenate([numeric.asarray(before)[..., None, :], rows[..., :-1, :]], axis=-2)
-    return largest_turns(system, rows - earlier) > LARGEST_JUMP
+    return largest_turns(system, rows - earlier)
 
 
 def turns_between(system: System, before: Any, after: Any) -> int:

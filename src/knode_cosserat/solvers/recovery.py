@@ -22,6 +22,7 @@ from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import history
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import (
     LARGEST_JUMP,
     LARGEST_TURN,
@@ -52,6 +53,13 @@ LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
 EASE_BELOW = 1.0 / 16.0
 #: part of the distance that a tip is moved in one step of relaxation
 DRAWN = 0.05
+
+
+#: likely cause of a failure where an end turns too far in one step
+FAR_TURN = (
+    "Likely cause: the control turns an end too far in one step, and turns would be lost; turn it over more "
+    "rows, or use a smaller time step."
+)
 
 
 class Budget:
@@ -178,7 +186,8 @@ class Recovery(abc.ABC):
         if least is None:
             least = self.solve(controls[1], self.guesses()[0])
         result = Result.NO_CONVERGENCE if np.isfinite(least.row.error) else Result.NOT_FINITE
-        cause = f"{likely_cause(result, self.system, self.settings, controls[1])} {cause}".strip()
+        likely = likely_cause(result, self.system, self.settings, controls[1])
+        cause = f"{likely if self.largest_part(controls) == 1.0 else FAR_TURN} {cause}".strip()
         return self._outcome(result, least)._replace(state=self.state, cause=cause)
 
     def _given_up(self, control: Any) -> SolvedStep:
@@ -204,7 +213,7 @@ class Recovery(abc.ABC):
         for guess in self.first_guesses(controls[1]) if at_once else ():
             found = self.solve(controls[1], guess)
             best.append(found)
-            if self.solved(found):
+            if self.solved(found) and self.keeps_turns(found):
                 return Result.CONVERGED, found
         continued = self.continue_load(*controls)
         if continued is not None:
@@ -247,12 +256,13 @@ class Recovery(abc.ABC):
         """
         for guess in self.guesses():
             found = first(guess)
-            reached, part = 0.0, min(0.25, most) if self.solved(found) else 0.0
+            fits = self.solved(found) and self.keeps_turns(found)
+            reached, part = 0.0, min(0.25, most) if fits else 0.0
             while reached < 1.0 and part >= LEAST_PART:
                 target = min(1.0, reached + part)
                 y = found.state if self.step is None else found.state.y[0]
                 following = solve(target, y)
-                if self.solved(following) and not self._lost_turns(found, following):
+                if self.solved(following) and self.keeps_turns(following, found.row.records):
                     found, reached, part = following, target, min(2.0 * part, most)
                 else:
                     part /= 4.0
@@ -260,10 +270,12 @@ class Recovery(abc.ABC):
                 return found
         return None
 
+    def keeps_turns(self, found: SolvedStep, before: Any = None) -> bool:
+        """True if a solution has the turns of the records before, by default of the state before the step.
 
-    def _lost_turns(self, before: SolvedStep, after: SolvedStep) -> bool:
-        """True if a solution has other turns than the one before."""
-        return bool(turns_between(self.system, before.row.records, after.row.records))
+        The ends must have turned by less than half a turn.
+        """
+        return before is None or not turns_between(self.system, before, found.row.records)
 
 
 class StepRecovery(Recovery):
@@ -285,6 +297,11 @@ class StepRecovery(Recovery):
         """Return 1 for all but far turns of an end."""
         angle = float(largest_turns(self.system, np.subtract(controls[1], controls[0])))
         return LARGEST_TURN / angle if angle > LARGEST_JUMP else 1.0
+
+    def keeps_turns(self, found: SolvedStep, before: Any = None) -> bool:
+        """True if a solution has the turns of the records before."""
+        before = self.step.past.y[0][grid_of(self.system).nodes] if before is None else before
+        return super().keeps_turns(found, before)
 
     def guesses(self) -> list[Any]:
         """Return the last state, and its linear extrapolation."""
@@ -336,7 +353,7 @@ class StepRecovery(Recovery):
         """Return a solution from the guesses, or by easing."""
         for guess in self.guesses():
             found = self.solve(control, guess)
-            if self.solved(found):
+            if self.solved(found) and self.keeps_turns(found):
                 return found
         return self.ease(control) if ease else None
 

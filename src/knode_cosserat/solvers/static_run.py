@@ -187,9 +187,7 @@ class _Walk:
         for guess in guesses:
             rows = self.task.solve(self.system, np.asarray(control)[None], guess, (0, 1))[2]
             row = StepRows(*(leaf[0] for leaf in rows))
-            if row.result < 0 or turns_between(
-                self.system, np.asarray(guess)[self.grid.nodes], row.records
-            ):
+            if row.result < 0 or turns_between(self.system, np.asarray(guess)[self.grid.nodes], row.records):
                 continue
             if not self.is_unstable(row.records, control):
                 return guess, row
