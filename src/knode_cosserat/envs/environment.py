@@ -93,8 +93,8 @@ class Environment:
         turn = float(largest_turns(robot, np.minimum(within.rate * dt, within.high - within.low)))
         if turn > LARGEST_JUMP:
             raise TaskError(
-                f"limits let a control turn an end by {turn:.3g} rad in one period of {dt:g} s; allowed is up "
-                f"to {LARGEST_JUMP:.3g} rad. Give a lower rate, or a smaller dt"
+                f"limits let a control turn an end by {turn:.3g} rad in one period of {dt:g} s; allowed is "
+                f"up to {LARGEST_JUMP:.3g} rad. Give a lower rate, or a smaller dt"
             )
         if actions == "increment" and not np.all(np.isfinite(within.rate)):
             raise TaskError("increments need a finite rate of the limits")
