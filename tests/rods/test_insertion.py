@@ -18,7 +18,7 @@ from knode_cosserat.rods.magnets import Magnet, UniformField
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.routing import Helical, Straight, Tapered
-from knode_cosserat.rods.section import TabulatedSection
+from knode_cosserat.rods.section import Stretch, TabulatedSection
 from knode_cosserat.solvers.damping import UndampedWarning
 
 L, RADIUS, DENSITY = 0.5, 0.005, 1000.0
@@ -108,9 +108,10 @@ def test_a_hanging_rod_is_stretched_by_its_exposed_weight(insertion):
     assert down.tip_position[-1, 2] == pytest.approx(expected, abs=1e-10)
 
 
-# the material moves through the hole: of the same stretch of material, a fed rod and a rod of that length agree
+# the material moves through the hole: a fed rod agrees with a rod of the exposed stretch of material
 
-PRECURVED = (8.0, 0.0, 3.0)
+PRECURVED, SAG = (8.0, 0.0, 3.0), (0.3, 0.0, 1.0)
+SOFT = {"stiffness": (0.4,), "curvature": (0.0, 3.0, 0.0)}
 
 
 def table(at, values):
@@ -127,7 +128,7 @@ def bare(**changes):
 
 
 def curved(begin, **changes):
-    sections = (kc.robots.Stretch(begin=begin, curvature=PRECURVED),)
+    sections = (Stretch(begin=begin, curvature=PRECURVED),)
     return rod(nodes=21, gravity=(0.3, 0.0, 1.0), sections=sections, **changes)
 
 
@@ -153,10 +154,9 @@ FED_AND_CUT = {
     "curved all along, and behind": (0.1, [], curved(0.0), curved(0.0, length=0.6, effects=())),
     "two sections, one of them hidden": (
         -0.25, [],
-        rod(nodes=21, gravity=(0.3, 0.0, 1.0), sections=(
-            kc.robots.Stretch(end=0.4, curvature=PRECURVED), kc.robots.Stretch(begin=0.8, stiffness=(0.4,), curvature=(0.0, 3.0, 0.0)))),
-        rod(nodes=21, gravity=(0.3, 0.0, 1.0), length=0.25, effects=(), sections=(
-            kc.robots.Stretch(begin=0.6, stiffness=(0.4,), curvature=(0.0, 3.0, 0.0)),)),
+        rod(nodes=21, gravity=SAG,
+            sections=(Stretch(end=0.4, curvature=PRECURVED), Stretch(begin=0.8, **SOFT))),
+        rod(nodes=21, gravity=SAG, length=0.25, effects=(), sections=(Stretch(begin=0.6, **SOFT),)),
     ),
     "taper": (
         -0.25, [], rod(tip_radius=0.003, gravity=(0.3, 0.0, 0.0)),

@@ -1,11 +1,11 @@
 """Insertion: a rod that is fed through a hole at its base, so that the length beyond the hole changes.
 
-The material of the rod is measured from the base of the rod that is not fed, of length L. With the exposed
-length ℓ, its place at the hole is X_h = L - ℓ, and its tip is at L. Sections, shape at rest, routing and loads
-belong to the material. The grid's places are those of the unfed rod, but the first stretch between two
-discontinuities that is exposed begins at the hole, and all before it have no length. At the fraction ξ of
-that stretch, the material moves along the grid at the speed c = ℓ_t (1 - ξ). Beyond it the grid moves with the
-material, c = 0. All rates along the grid are multiplied by X_s. With q and ω of the grid's places,
+A place of the material is measured from the base of the rod that is not fed, of length L. With the exposed
+length ℓ, it is X_h = L - ℓ at the hole and L at the tip. Sections, shape at rest, routing and loads along the
+rod belong to the material. The grid's places are those of the unfed rod. But the first stretch between two
+discontinuities that is exposed begins at the hole, and those before it have no length. At the fraction ξ of
+that stretch, the material moves along the grid at the speed c = ℓ_t (1 - ξ). Beyond it the grid moves with
+the material, c = 0. Rates along the grid are multiplied by X_s. With q and ω of the grid's places,
 
     q_a = q + c v,     ω_a = ω + c u                                      motion of the material
     q_s = v_t + γ v - u × q + ω × v,     ω_s = u_t + γ u - u × ω          compatibility, γ = -c_X
@@ -16,7 +16,7 @@ the force and the moment of the rod less c R P and c R H, so that no strain is d
     n_s = R (P_t + ω × P + γ P) - f,     m_s = R (H_t + ω × H + γ H) - p_s × (n + c R P) - l
     (K - c² ρA) v + … = Rᵀn + K v* + c ρA q,     (Kbt - c² ρJ) u + … = Rᵀm + Kbt u* + c ρJ ω
 
-P_t and H_t include the rates of ρA and ρJ at the grid's places, -c times their derivatives along the material.
+P_t and H_t include the rates of ρA and ρJ at the grid's places, which are -c times their derivatives by X.
 This is the balance of an axially moving beam (Stylianou & Tabarrok 1994) at large deflection. The rates of
 strain in the material's damping, and accelerations in loads along the rod, such as the added mass of water,
 are those of the grid's places. Their relative error is γ times the time in which they change. A control that
@@ -57,8 +57,8 @@ class _FedPlace(NamedTuple):
 class Insertion(Effect):
     """A hole at the base, through which a control feeds the rod; it is gripped there.
 
-    The exposed length is the robot's `length` plus the control. Material behind the base is as that at the base;
-    only routing continues there.
+    The exposed length is the robot's `length` plus the control. Material behind the base is as that at the
+    base; only routing continues there.
     """
 
     kind: ClassVar[str] = "insertion"
