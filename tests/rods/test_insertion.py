@@ -225,13 +225,14 @@ def test_a_tapered_rod_carries_its_momentum_through_the_hole():
 
 @pytest.mark.slow
 def test_a_curved_tip_that_is_pushed_out_slowly_passes_through_equilibria():
-    catheter = curved(0.6)
+    """The place where the curved tip begins passes the hole at an insertion of -0.2 m."""
+    catheter = curved(0.4)
     way = -0.29 + eased(np.arange(1, 101) / 100.0, 0.2) * 0.29 / 0.9
     start = rest(catheter, -0.29)
     found = kc.simulate(catheter, way[:, None], 1.0, space="lobatto4", initial=start, between="linear")
     for k in (30, 60, 100):
         np.testing.assert_allclose(
-            found.tip_position[k], rest(catheter, way[k - 1]).tip_position[-1], atol=2e-4
+            found.tip_position[k], rest(catheter, way[k - 1]).tip_position[-1], atol=5e-5
         )
 
 

@@ -6,6 +6,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.envs import TaskError
+from knode_cosserat.rods.assembly import Assembly, RigidBody
 from knode_cosserat.solvers.guess import largest_turns
 from knode_cosserat.solvers.run import refuse_far_turns
 
@@ -89,6 +90,22 @@ def test_batches_steppers_and_runs_are_the_same():
     for control in held(7.0):
         row = stepper.step(control)
     np.testing.assert_allclose(row.moment[-1], batch.moment[1, -1], rtol=1e-6, atol=1e-9)
+
+
+def test_an_assembly_keeps_them_too():
+    """Two halves of the shaft, joined by a body."""
+    half = shaft(length=L / 2.0, nodes=10)
+    driven = ends.Driven(axes=("rz",), position=(0.0, 0.0, L), orientation=(1.0, 0.0, 0.0, 0.0))
+    robot = Assembly(
+        rods=(
+            half.replace(name="lower", tip_end=ends.Clamped(body="joint")),
+            half.replace(name="upper", base_end=ends.Clamped(body="joint"), tip_end=driven),
+        ),
+        bodies=(RigidBody(name="joint", mass=0.01, inertia=1e-6 * np.eye(3)),), gravity=(0.0, 0.0, 0.0),
+        nodes=11,
+    )  # fmt: skip
+    found = kc.simulate(robot, held(7.0), 0.05)
+    assert twist(found.part("lower_m")[-1, -1]) == pytest.approx(7.0, rel=0.02)
 
 
 def test_a_turn_beyond_any_part_is_one_clear_error():

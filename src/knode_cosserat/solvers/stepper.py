@@ -192,7 +192,8 @@ class Stepper:
         except IndexError:  # another thread has it, or this is a copy
             engine = self._task.motions(self._bare, self._history)
         before = engine.motions if self._motion is None else self._motion
-        numbers, angle = None, turns_within(self.robot, control[None], self._control)[0]
+        angle = turns_within(self.robot, control[None], self._control)[0] if self._linear else 0.0
+        numbers = None
         if angle <= LARGEST_JUMP:
             motion, numbers, result = engine.step(before, i, acting)
         # from the first large turn on, turns are counted
