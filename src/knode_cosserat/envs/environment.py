@@ -23,6 +23,7 @@ from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.guess import LARGEST_JUMP, largest_turns
 from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
@@ -89,6 +90,12 @@ class Environment:
             within = (limits or TENSIONS).of(robot)
         except ValueError as error:
             raise TaskError(f"limits: {error}") from None
+        turn = float(largest_turns(robot, np.minimum(within.rate * dt, within.high - within.low)))
+        if turn > LARGEST_JUMP:
+            raise TaskError(
+                f"limits let a control turn an end by {turn:.3g} rad in one period of {dt:g} s; allowed is "
+                f"up to {LARGEST_JUMP:.3g} rad. Give a lower rate, or a smaller dt"
+            )
         if actions == "increment" and not np.all(np.isfinite(within.rate)):
             raise TaskError("increments need a finite rate of the limits")
         equipped = task.equipped(robot)

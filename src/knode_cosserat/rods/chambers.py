@@ -138,7 +138,7 @@ class Chambers(Stretched, Effect):
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
         """Return the law with the chambers' push."""
-        r, r_s = self.paths(point.rod).routes(point.s)
+        r, r_s = self.paths(point.rod).routes(point.material_place)
         p, (by_stretch, slope) = self.pressure(point), self._area_changes(point, r, r_s)
         pushed = self.indicator(point) * self.rest_area * p
         tension = -pushed * (1.0 - by_stretch + 0.5 * self.area_by_pressure * p)
@@ -194,13 +194,15 @@ class Chambers(Stretched, Effect):
             return path_lengths(self.paths(rod).routings, at, rod.length, rod.strains_at_rest)
 
         begin, end = self.begin * rod.length, self.end * rod.length
-        return self.rest_area * (path(jnp.clip(s, begin, end)) - path(begin))
+        # what begins at the base continues before it, in a rod that is fed
+        s = jnp.clip(s, begin, end) if self.begin else jnp.minimum(s, end)
+        return self.rest_area * (path(s) - path(begin))
 
     def rates(self, point: RodPoint) -> Fields:
         """Return the rate of the volume."""
         if self.drive == "pressure":
             return {}
-        r, r_s = map(jnp.asarray, self.paths(point.rod).routes(point.s))
+        r, r_s = map(jnp.asarray, self.paths(point.rod).routes(point.material_place))
         stretch = stretches(point.get("v"), point.get("u"), r, r_s)
         by_stretch, slope = self._area_changes(point, r, r_s)
         area = 1.0 - by_stretch + slope * stretch + self.area_by_pressure * self.pressure(point)

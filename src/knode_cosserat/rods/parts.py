@@ -52,6 +52,11 @@ class RodPoint(NamedTuple):
     #: control of the part that is asked
     input: Any = None
 
+    @property
+    def material_place(self) -> Any:
+        """Place of the material (m), as `s` of the rod that is not fed; see `Contribution.material_place`."""
+        return self.rod.material_place(self.s, self.control)
+
     def get(self, name: str) -> Any:
         """Return a field of y or z by its name."""
         layout = self.rod.y_layout
@@ -149,6 +154,13 @@ class Contribution:
         """Return the rate of arclength along the grid, from the controls."""
         return 1.0
 
+    def material_place(self, rod: Any, s: Any, input: Any) -> Any:
+        """Return the place (m) of the material at s of the grid, measured from the base of the unfed rod.
+
+        All that belongs to the material depends on it: section, shape at rest, routing, loads.
+        """
+        return s
+
     def tip_rows(self, point: RodPoint) -> Any:
         """Return the residuals of the part's conditions at the tip, one number a row; None without any."""
         return None
@@ -245,5 +257,7 @@ class Stretched(Part):
         """Return 1 at a point of its stretch, 0 elsewhere."""
         if (self.begin, self.end) == (0.0, 1.0):
             return 1.0
-        length = point.rod.length
-        return jnp.where((point.s >= self.begin * length) & (point.s <= self.end * length), 1.0, 0.0)
+        place, length = point.material_place, point.rod.length
+        within = place <= self.end * length
+        # what begins at the base also covers the material that is fed behind it
+        return jnp.where(within & (place >= self.begin * length) if self.begin else within, 1.0, 0.0)

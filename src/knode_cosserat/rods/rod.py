@@ -298,8 +298,8 @@ class SlenderRod(System):
         return np.zeros(3)
 
     def material(self, s: Any, control: Any) -> Material:
-        """Return section and material at arclength s (m)."""
-        part = s / self.length
+        """Return section and material at s (m) of the grid."""
+        part = self._part(s, control)
         section = self.section_at(part)
         plain = Material(
             self.Kse_at(part), self.shear_damping, self.Kbt_at(part), self.bending_damping, self.u_star,
@@ -316,8 +316,19 @@ class SlenderRod(System):
         )  # fmt: skip
 
     def differences(self, s: Any, control: Any) -> Differences:
-        """Return the sections' changes at s (m)."""
-        return differences_at(self.changes, s / self.length, self.section_controls(control))
+        """Return the sections' changes at s (m) of the grid."""
+        return differences_at(self.changes, self._part(s, control), self.section_controls(control))
+
+    def material_place(self, s: Any, control: Any) -> Any:
+        """Return the place (m) of the material at s of the grid: s itself unless the rod is fed."""
+        for part, input in self.inputs(control):
+            s = part.material_place(self, s, input)
+        return s
+
+    def _part(self, s: Any, control: Any) -> Any:
+        """Return the place of the material as a fraction of the length; before the base it is as there."""
+        place = self.material_place(s, control)
+        return place / self.length if place is s else jnp.maximum(place, 0.0) / self.length
 
     # the law of the strains
 
@@ -490,6 +501,11 @@ class SlenderRod(System):
         held = self.base_end.pose(AT_ORIGIN, self.end_controls(control)[0])
         y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
         y = self.y_layout.replaced(y, self.base_unknowns, unknowns)
+        place = self.material_place(0.0, control)
+        for part in () if isinstance(place, float) else self.parts.values():
+            # lengths and volumes of the material before the base
+            for name, value in part.rest_y(self, place).items():
+                y = self.y_layout.replaced(y, (name,), value)
         for part, point in self.at_parts(RodPoint(self, 0.0, t, y, None, control)):
             for name, value in part.base_y(point).items():
                 y = self.y_layout.replaced(y, (name,), value)

@@ -248,7 +248,7 @@ class _VirtualTendons(PulledTendons):
 
     def load(self, point: RodPoint) -> Wrench:
         """Return weight less inertia of the ribs per length, each spread along the rod."""
-        away = (point.s / point.rod.length - np.array(RIBS)) * point.rod.length / RIB_WIDTH
+        away = (point.material_place / point.rod.length - np.array(RIBS)) * point.rod.length / RIB_WIDTH
         # a Gaussian, with half of the last one beyond the tip
         lump = jnp.exp(-0.5 * away**2) / (RIB_WIDTH * np.sqrt(2.0 * np.pi))
         _, R, q, w, q_t, _ = point.motion

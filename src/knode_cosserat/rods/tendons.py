@@ -267,11 +267,11 @@ class RoutedTendons(PulledTendons):
         """Return the values with zero beyond the tendons' anchors."""
         if min(self.ends) >= 1.0:
             return values
-        return jnp.where(point.s < np.array(self.ends) * point.rod.length, values, 0.0)
+        return jnp.where(point.material_place < np.array(self.ends) * point.rod.length, values, 0.0)
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
         """Return the law with the tendons' coupling of v and u."""
-        r, r_s = point.rod.routes_at(point.s)
+        r, r_s = point.rod.routes_at(point.material_place)
         nominal = running(point, self.base_tension(point))
         return law._replace(coupling=Tendons(r, r_s, tension(point), nominal))
 
@@ -339,7 +339,7 @@ class ReeledTendons(RoutedTendons):
 
     def rates(self, point: RodPoint) -> Fields:
         """Return the rate of the path length."""
-        routes = map(jnp.asarray, point.rod.routes_at(point.s))
+        routes = map(jnp.asarray, point.rod.routes_at(point.material_place))
         return {"path": running(point, stretches(point.get("v"), point.get("u"), *routes))}
 
     def tip_rows(self, point: RodPoint) -> Float[Any, " c"]:
@@ -375,7 +375,7 @@ class EarlyAnchors(Part):
 
     def running(self, point: RodPoint, values: Float[Any, " c"]) -> Float[Any, " c"]:
         """Return each tendon's share of the values beyond that place."""
-        return values * jnp.where(point.s < self.at * point.rod.length, 1.0, self.share)
+        return values * jnp.where(point.material_place < self.at * point.rod.length, 1.0, self.share)
 
 
 #: curvature (1/m) of the regularisation of |u| in friction, so that it has a derivative everywhere
@@ -413,7 +413,7 @@ class TendonFriction(Part):
         """Return the law with that of fᵢ; in an equilibrium the bending determines it."""
 
         def evolutions(strains: Fields, rates: Fields) -> dict[str, Evolution]:
-            directions = point.rod.bending_directions(point.s)
+            directions = point.rod.bending_directions(point.material_place)
             return {"f": self.evolution(directions, rates["u"], strains["u"] - point.material.u_star)}
 
         return law.with_internal(evolutions)
@@ -548,7 +548,7 @@ class RibSpacing(Part):
         # apart by more than rounding, for the derivative of equal ones
         separation = jnp.sqrt(half**2 + Kbt[0, 1] ** 2 + (1e-8 * mean) ** 2)
         principal = mean + separation * np.array([1.0, -1.0])
-        softening = self.softening + self.softening_at(point.s / length) * length**2
+        softening = self.softening + self.softening_at(point.material_place / length) * length**2
         lost = principal * (1.0 - pressed(3.0 * softening * jnp.sum(tension(point)) / principal))
         deviator = half * (ABOUT_X - ABOUT_Y) + Kbt[0, 1] * COUPLED
         loss = 0.5 * jnp.sum(lost) * ACROSS + 0.5 * (lost[0] - lost[1]) / separation * deviator

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -11,11 +12,11 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.aspects import Ends
-from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose
+from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose, Universal
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.strands import strand_count
-from knode_cosserat.rods.system import System
+from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import rest_record
@@ -24,6 +25,12 @@ from knode_cosserat.solvers.history import rest_record
 FEWEST, POINTS = 2, 65
 #: reaches of the curves between held ends, as multiples of the natural reach
 REACHES = (1.0, 0.3, 3.0)
+#: largest rotation (rad) of an end from one solution to the next where turns are kept by small parts
+LARGEST_TURN = 1.0
+#: a time step that turns an end by more (rad) is solved in parts: Newton's method loses turns from about 2.3
+LARGEST_JUMP = 0.5 * np.pi
+#: where tangents of two shapes are more opposite than this cosine, the turns between them are not determined
+OPPOSITE = -0.9
 
 
 class _HeldEnd(NamedTuple):
@@ -80,6 +87,62 @@ def turn_columns(system: System) -> Int[np.ndarray, "2 3"]:
             if f"{prefix}_{axis}" in layout.names:
                 found[end, k] = layout.slice(f"{prefix}_{axis}").start
     return found
+
+
+def largest_turns(system: System, changes: Any) -> Any:
+    """Return the largest angle (rad) by which changes of control (..., c) turn an end of a rod.
+
+    It is zero for one rod with an end that cannot hold its turns, such as a free tip.
+    """
+    numeric: Any = jnp if is_traced(changes) else np
+    angles = [numeric.sum(changes[..., columns] ** 2, axis=-1) ** 0.5 for columns in _turning(system)]
+    return functools.reduce(numeric.maximum, angles, np.zeros(np.shape(changes)[:-1]))
+
+
+def _turning(system: System) -> list[list[int]]:
+    """Return the indices in a control of each driven end's rotations, if rods between ends hold turns."""
+    layout, rod, found = system.control_layout, nominal_model(system), dict[str, list[int]]()
+    held = isinstance(rod, SlenderRod) and (
+        isinstance(rod.base_end, Clamped) and isinstance(rod.tip_end, Clamped | Universal)
+    )
+    for name in layout.names if held or not isinstance(rod, SlenderRod) else ():
+        end, _, axis = name.rpartition("_")
+        if axis in AXES[3:]:
+            found.setdefault(end, []).append(layout.slice(name).start)
+    return list(found.values())
+
+
+def turns_within(system: System, controls: Any, before: Any) -> Any:
+    """Return the largest angles (..., T) (rad) by which each of controls (..., T, c) turns an end.
+
+    `before` (..., c) precedes the first one. Controls at several stages of a step count as the last one.
+    """
+    numeric: Any = jnp if is_traced((controls, before)) else np
+    rows = controls[..., -system.control_layout.size :]
+    earlier = numeric.concatenate([numeric.asarray(before)[..., None, :], rows[..., :-1, :]], axis=-2)
+    return largest_turns(system, rows - earlier)
+
+
+def turns_between(system: System, before: Any, after: Any) -> int:
+    """Return the number of turns by which two shapes differ beyond the rotation of the ends.
+
+    The shapes are records at the nodes. The frames of the first are rotated to the tangents of the other. The
+    angle between frames is then counted along the rod, and compared with its value at the tip within half a
+    turn. It is zero unless both ends of a rod are clamped.
+    """
+    if not are_clamped(system):
+        return 0
+    h = system.y_layout.slice("h")
+    one, other = (rotations(continuous(records[:, h])) for records in (before, after))
+    t, r = one.apply([0.0, 0.0, 1.0]), other.apply([0.0, 0.0, 1.0])
+    cosine = np.sum(t * r, axis=1)
+    if np.min(cosine) < OPPOSITE:
+        return 0
+    # the shortest rotation from one tangent to the other
+    swing = np.concatenate([1.0 + cosine[:, None], np.cross(t, r)], axis=1)
+    over = ((rotations(swing) * one).inv() * other).as_quat()
+    angle = np.unwrap(2.0 * np.arctan2(over[:, 2], over[:, 3]))
+    return int(np.round((angle[-1] - angle[0]) / (2.0 * np.pi)))
 
 
 def are_clamped(system: System) -> bool:

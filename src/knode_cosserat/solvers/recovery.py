@@ -22,7 +22,14 @@ from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import history
-from knode_cosserat.solvers.guess import curve_guesses
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.guess import (
+    LARGEST_JUMP,
+    LARGEST_TURN,
+    curve_guesses,
+    largest_turns,
+    turns_between,
+)
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
@@ -46,6 +53,13 @@ LEAST_SUBSTEP, MOST_SUBSTEPS = 2.0**-14, 400
 EASE_BELOW = 1.0 / 16.0
 #: part of the distance that a tip is moved in one step of relaxation
 DRAWN = 0.05
+
+
+#: likely cause of a failure where an end turns too far in one step
+FAR_TURN = (
+    "Likely cause: the control turns an end too far in one step, and turns would be lost; turn it over more "
+    "rows, or use a smaller time step."
+)
 
 
 class Budget:
@@ -110,6 +124,10 @@ class Recovery(abc.ABC):
     def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
         """Return the result of the last method, which may change the problem on the way."""
 
+    def largest_part(self, controls: tuple[Any, Any]) -> float:
+        """Return the largest part of a change of control in which turns of the ends are kept."""
+        return 1.0
+
     def solve(
         self, control: Any, guess: Any, tip_offset: Any = 0.0, system: System | None = None
     ) -> SolvedStep:
@@ -168,7 +186,8 @@ class Recovery(abc.ABC):
         if least is None:
             least = self.solve(controls[1], self.guesses()[0])
         result = Result.NO_CONVERGENCE if np.isfinite(least.row.error) else Result.NOT_FINITE
-        cause = f"{likely_cause(result, self.system, self.settings, controls[1])} {cause}".strip()
+        likely = likely_cause(result, self.system, self.settings, controls[1])
+        cause = f"{likely if self.largest_part(controls) == 1.0 else FAR_TURN} {cause}".strip()
         return self._outcome(result, least)._replace(state=self.state, cause=cause)
 
     def _given_up(self, control: Any) -> SolvedStep:
@@ -190,15 +209,16 @@ class Recovery(abc.ABC):
         self, controls: tuple[Any, Any], best: list[SolvedStep]
     ) -> tuple[Result, SolvedStep] | None:
         """Try guesses, load continuation and easing; attempts from guesses are added to `best`."""
-        for guess in self.first_guesses(controls[1]):
+        at_once = self.largest_part(controls) == 1.0
+        for guess in self.first_guesses(controls[1]) if at_once else ():
             found = self.solve(controls[1], guess)
             best.append(found)
-            if self.solved(found):
+            if self.solved(found) and self.keeps_turns(found):
                 return Result.CONVERGED, found
         continued = self.continue_load(*controls)
         if continued is not None:
             return Result.RECOVERED_LOAD_CONTINUATION, continued
-        eased = self.ease(controls[1])
+        eased = self.ease(controls[1]) if at_once else None
         return None if eased is None else (Result.RECOVERED_EASING, eased)
 
     def continue_load(self, before: Any, now: Any) -> SolvedStep | None:
@@ -210,7 +230,9 @@ class Recovery(abc.ABC):
         def at_part(part: float, y: Any) -> SolvedStep:
             return self.solve(before + part * (now - before), y)
 
-        return self._in_parts(lambda guess: self.solve(before, guess), at_part)
+        return self._in_parts(
+            lambda guess: self.solve(before, guess), at_part, self.largest_part((before, now))
+        )
 
     def ease(self, control: Any) -> SolvedStep | None:
         """Continue from eased friction and contact to the system's own."""
@@ -226,23 +248,34 @@ class Recovery(abc.ABC):
         return self._in_parts(lambda guess: self.solve(control, guess, system=easiest), at_part)
 
     def _in_parts(
-        self, first: Callable[[Any], SolvedStep], solve: Callable[[float, Any], SolvedStep]
+        self, first: Callable[[Any], SolvedStep], solve: Callable[[float, Any], SolvedStep], most: float = 1.0
     ) -> SolvedStep | None:
-        """Continue from a solution at part 0 to part 1, with adaptive steps, each from the last solution."""
+        """Continue from a solution at part 0 to part 1, with adaptive steps, each from the last solution.
+
+        A step is at most the part `most`, and keeps the turns between the ends.
+        """
         for guess in self.guesses():
             found = first(guess)
-            reached, part = 0.0, 0.25 if self.solved(found) else 0.0
+            fits = self.solved(found) and self.keeps_turns(found)
+            reached, part = 0.0, min(0.25, most) if fits else 0.0
             while reached < 1.0 and part >= LEAST_PART:
                 target = min(1.0, reached + part)
                 y = found.state if self.step is None else found.state.y[0]
                 following = solve(target, y)
-                if self.solved(following):
-                    found, reached, part = following, target, 2.0 * part
+                if self.solved(following) and self.keeps_turns(following, found.row.records):
+                    found, reached, part = following, target, min(2.0 * part, most)
                 else:
                     part /= 4.0
             if reached == 1.0:
                 return found
         return None
+
+    def keeps_turns(self, found: SolvedStep, before: Any = None) -> bool:
+        """True if a solution has the turns of the records before, by default of the state before the step.
+
+        The ends must have turned by less than half a turn.
+        """
+        return before is None or not turns_between(self.system, before, found.row.records)
 
 
 class StepRecovery(Recovery):
@@ -260,13 +293,24 @@ class StepRecovery(Recovery):
         """History before the step."""
         return self.step.past
 
+    def largest_part(self, controls: tuple[Any, Any]) -> float:
+        """Return 1 for all but far turns of an end."""
+        angle = float(largest_turns(self.system, np.subtract(controls[1], controls[0])))
+        return LARGEST_TURN / angle if angle > LARGEST_JUMP else 1.0
+
+    def keeps_turns(self, found: SolvedStep, before: Any = None) -> bool:
+        """True if a solution has the turns of the records before."""
+        before = self.step.past.y[0][grid_of(self.system).nodes] if before is None else before
+        return super().keeps_turns(found, before)
+
     def guesses(self) -> list[Any]:
         """Return the last state, and its linear extrapolation."""
         return [np.einsum("p,pny->ny", w, self.step.past.y) for w in history.EXTRAPOLATIONS[:2]]
 
     def last_method(self, controls: tuple[Any, Any]) -> tuple[Result, SolvedStep] | None:
         """Divide the step into substeps: with a constant control first, then with a ramp."""
-        for before in (controls[1], controls[0]):
+        ramp_only = self.largest_part(controls) < 1.0
+        for before in controls[:1] if ramp_only else controls[::-1]:
             found = self._in_substeps(before, controls[1])
             if found is not None:
                 return Result.RECOVERED_STEP_HALVING, found
@@ -279,7 +323,8 @@ class StepRecovery(Recovery):
         """
         settings, past, dt = self.settings, self.step.past, self.dt
         before, now = np.asarray(before, dtype=float), np.asarray(now, dtype=float)
-        reached, part, memory = 0.0, 0.5, settings.memory
+        most, memory = self.largest_part((before, now)), settings.memory
+        reached, part = 0.0, min(0.5, most)
         #: lengths of earlier steps, the last one first
         previous = [dt] * (memory - 1)
         assert settings.time is not None
@@ -301,14 +346,14 @@ class StepRecovery(Recovery):
                 return found._replace(state=self._whole(found.state))
             past, scheme = found.state, regular
             previous = [(until - reached) * dt, *previous[:-1]]
-            reached, part = until, 2.0 * (until - reached)
+            reached, part = until, min(2.0 * (until - reached), most)
         return None
 
     def direct(self, control: Any, ease: bool) -> SolvedStep | None:
         """Return a solution from the guesses, or by easing."""
         for guess in self.guesses():
             found = self.solve(control, guess)
-            if self.solved(found):
+            if self.solved(found) and self.keeps_turns(found):
                 return found
         return self.ease(control) if ease else None
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import dataclasses
+import functools
 import logging
 import os
 import time
@@ -25,8 +26,11 @@ from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.guess import materials
+from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, materials, turns_between, turns_within
 from knode_cosserat.solvers.history import (
+    COARSE_ANGLE,
+    COARSE_SHARE,
     SolverState,
     StepCoefficients,
     StepRows,
@@ -106,9 +110,16 @@ class TimeIntegration:
             return StaticRecovery(system, self.settings, state, budget).recover(controls)
         step = TimeStep.of(self.coefficients, state, i)
         recovery = StepRecovery(system, self.settings, step, self.dt, budget)
-        return (
-            recovered_stages(recovery, controls) if self.settings.stages > 1 else recovery.recover(controls)
+        recover = (
+            functools.partial(recovered_stages, recovery) if self.settings.stages > 1 else recovery.recover
         )
+        found = recover(controls)
+        last, now = (np.asarray(each)[-system.control_layout.size :] for each in controls)
+        if recovery.largest_part((last, now)) == 1.0:
+            return found
+        # an extrapolation from before a far turn would lose turns in the next steps
+        y = found.state.y
+        return found._replace(state=found.state._replace(y=np.stack([y[0]] * len(y))))
 
 
 def run_one(
@@ -127,13 +138,26 @@ def run_one(
     budget = Budget(task.recovery_budget)
     rows = no_rows(system, (total,), task.settings.stages) if rows is None else rows
     done, cause = 0, ""
+    # equilibria are already in small parts
+    angles = turns_within(system, controls, before) if task.settings.time else np.zeros(total)
+    far, watched = (np.flatnonzero(angles > limit) for limit in (LARGEST_JUMP, LARGEST_TURN))
+    first_state = state
     with _bar(watch, total, "step") as advance:
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
-            reached, state, _ = task.solve(
-                system, controls, state, (done, stop), _picked(rows, slice(done, stop))
-            )
+            reached, last = done, min([stop, *(int(k) for k in far if k >= done)])
+            while last > done:
+                span, earlier = slice(done, last), state
+                reached, state, _ = task.solve(system, controls, earlier, (done, last), _picked(rows, span))
+                if not len(watched) or reached <= watched[0]:
+                    break
+                previous = rows.records[done - 1] if done else _nodes(system, first_state)
+                last = _turns_kept(system, previous, rows.records[done:reached]) + done
+                if last == reached:
+                    break
+                # again, up to the step that loses turns
+                reached, state = done, earlier
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
             if watch:
@@ -150,6 +174,32 @@ def run_one(
             advance(reached - done)
             done = reached
     return rows, state, cause
+
+
+def refuse_far_turns(system: System, results: Any, controls: Any, before: Any) -> Any:
+    """Return results (..., T) where no step after one that turns an end too far is solved.
+
+    For runs without recovery; arguments as in `turns_within`.
+    """
+    numeric: Any = jnp if is_traced((results, controls, before)) else np
+    far = numeric.cumsum(turns_within(system, controls, before) > LARGEST_JUMP, axis=-1) > 0
+    first = numeric.cumsum(far, axis=-1) == 1
+    codes = numeric.where(first, int(Result.NO_CONVERGENCE), int(Result.NOT_REACHED))
+    return numeric.where(far & (results >= 0), codes, results)
+
+
+def _nodes(system: System, state: Any) -> Any:
+    """Return y at the nodes of the newest state of a history."""
+    return state.y[0][grid_of(system).nodes]
+
+
+def _turns_kept(system: System, before: Any, records: Any) -> int:
+    """Return the number of rows up to the first with other turns than the row before."""
+    for k, record in enumerate(records):
+        if turns_between(system, before, record):
+            return k
+        before = record
+    return len(records)
 
 
 @contextlib.contextmanager
@@ -188,17 +238,34 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
     if not np.any(coarse) or isinstance(settings.space, Euler):
         return
     errors, length = np.asarray(rows.position_error)[coarse], float(np.max(system.length))
-    said = "there is no estimate of the positions' error"
-    if not np.all(np.isnan(errors)):
-        worst = float(np.nanmax(errors))
-        said = f"positions are off by up to about {worst:.2g} m ({worst / length:.0%} of the length)"
-        lost = np.count_nonzero(np.isnan(errors))
-        said += f", without an estimate in {lost} rows," if lost else ""
+    lost, worst = (
+        np.count_nonzero(np.isnan(errors)),
+        float(np.max(errors, initial=0.0, where=~np.isnan(errors))),
+    )
+    causes = []
+    if worst > COARSE_SHARE * length:
+        causes.append(f"positions are off by up to about {worst:.2g} m ({worst / length:.0%} of the length)")
+    elif lost < len(errors):
+        causes.append(f"orientations are off by more than about {COARSE_ANGLE:g} rad")
+    causes += [f"{lost} rows have no estimate of the error"] if lost else []
+    turn = _turn_of_segments(system, np.asarray(rows.records)[coarse])
+    causes += [f"frames turn by up to {turn:.2g} rad from node to node"] if turn > LARGEST_TURN else []
+    said = ", ".join(causes)
     warnings.warn(
         f"the grid is too coarse in {np.count_nonzero(coarse)} of {coarse.size} rows: {said} with "
         f"{system.nodes} nodes. Use more nodes, or position_tolerance.",
         stacklevel=4,
     )
+
+
+def _turn_of_segments(system: System, records: Any) -> float:
+    """Return the largest angle (rad) between frames of neighbouring nodes; 0 for several rods."""
+    if strand_count(system) > 1 or "h" not in system.y_layout.names:
+        return 0.0
+    h = records[..., system.y_layout.slice("h")]
+    cosine = np.abs(np.sum(h[..., 1:, :] * h[..., :-1, :], axis=-1))
+    sizes = np.linalg.norm(h, axis=-1)
+    return float(np.max(2.0 * np.arccos(np.minimum(cosine / (sizes[..., 1:] * sizes[..., :-1]), 1.0))))
 
 
 def warn_outside_rod_theory(system: System, rows: StepRows) -> None:
@@ -328,7 +395,10 @@ def run_batch(
         with concurrent.futures.ThreadPoolExecutor(workers) as pool:
             list(pool.map(work, range(0, size, chunk)))
     causes = {}
-    for i in np.flatnonzero(done < task.steps):
+    # a run in chunks does not count turns
+    turned = np.max(turns_within(system, controls, before), axis=-1) > LARGEST_TURN
+    far = turned if task.settings.time else False
+    for i in np.flatnonzero((done < task.steps) | far):
         *solved, cause = run_one(task, robot(i), controls[i], (_picked(states, i), before[i]))
         _put((every, lasts), i, solved)
         if cause:

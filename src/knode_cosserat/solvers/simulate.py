@@ -26,6 +26,7 @@ from knode_cosserat.solvers.run import (
     TimeIntegration,
     carried_results,
     failure,
+    refuse_far_turns,
     rows_of,
     run_batch,
     run_one,
@@ -369,7 +370,8 @@ def _traced(system, controls, initial, settled, spec):  # type: ignore[no-untype
     if np.ndim(controls) == 3:
         solve = jax.vmap(solve, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     rows, history = solve(system, acting, at_start.state.history)
-    rows = rows._replace(result=carried_results(rows.result, at_start.result))
+    result = refuse_far_turns(system, rows.result, acting, at_start.control)
+    rows = rows._replace(result=carried_results(result, at_start.result))
     axis = np.ndim(controls) - 2
     every, size = _initial_rows(system, task, (*np.shape(controls)[:axis], 1)), np.shape(at_start.record)[-1]
     records = jnp.asarray(every.records).at[..., 0, :, :size].set(at_start.record)

@@ -20,23 +20,18 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import (
-    are_clamped,
-    continuous,
+    LARGEST_TURN,
     curve_guesses,
     held_ends,
-    rotations,
-    turn_columns,
+    largest_turns,
+    turns_between,
 )
 from knode_cosserat.solvers.history import StepRows, unloaded_shape
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import TimeIntegration, run_batch, run_one
 
-#: largest rotation (rad) of an end from one equilibrium to the next
-LARGEST_TURN = 1.0
 #: number of times that a change of control is divided where turns are lost, and parts of each division
 DIVISIONS, PARTS = 8, 4
-#: where tangents of two shapes are more opposite than this cosine, the turns between them are not determined
-OPPOSITE = -0.9
 #: chord over length of the unloaded rod from which it counts as straight
 STRAIGHT = 0.999
 #: part of the length by which a chord is shorter before a rod counts as compressed
@@ -110,7 +105,7 @@ class _Walk:
             guess = self._best(controls[0], curve_guesses(self.system, controls[0]))[0]
         if guess is None:
             rows, state, cause = self.along(controls, y, before, fits=False)
-            if np.any(rows.result < 0) and np.all(self._angles(controls) <= np.pi):
+            if np.any(rows.result < 0) and np.all(largest_turns(self.system, controls) <= np.pi):
                 # no turns can be lost: at once, where recovery starts from curves between the ends
                 rows, state, cause = run_one(self.task, self.system, controls, (y, before))
         else:
@@ -135,7 +130,7 @@ class _Walk:
             new, y, cause = run_one(task, self.system, path[len(rows) :], start)
             for row in map(StepRows._make, zip(*new, strict=True)):
                 control, solved = path[len(rows)], row.result >= 0
-                turns = self._turns(last, row.records) if solved and last is not None else 0
+                turns = turns_between(self.system, last, row.records) if solved and last is not None else 0
                 if turns and rows and divisions < DIVISIONS:
                     # again from the row before, in smaller parts
                     parts = np.linspace(path[len(rows) - 1], control, PARTS + 1)[1:-1]
@@ -159,20 +154,12 @@ class _Walk:
         If an end is turned in parts, the path begins with `before`, unless y already fits it.
         """
         every = np.concatenate([np.asarray(before)[None], controls])
-        counts = np.ones(len(controls), dtype=int)
-        if are_clamped(self.system):
-            angles = np.max(self._angles(np.diff(every, axis=0)), axis=1)
-            counts = np.maximum(counts, np.ceil(angles / LARGEST_TURN - 1e-9).astype(int))
+        angles = largest_turns(self.system, np.diff(every, axis=0))
+        counts = np.maximum(1, np.ceil(angles / LARGEST_TURN - 1e-9).astype(int))
         first = [] if fits or np.all(counts == 1) else [every[:1]]
         pairs = zip(every[:-1], controls, counts, strict=True)
         parts = [np.linspace(start, end, n + 1)[1:] for start, end, n in pairs]
         return np.concatenate([*first, *parts]), np.cumsum(counts) - 1 + len(first)
-
-    def _angles(self, controls: np.ndarray) -> np.ndarray:
-        """Return the angles (T, 2) (rad) by which controls (T, c) turn base and tip."""
-        columns = turn_columns(self.system)
-        turns = np.where(columns < 0, 0.0, np.pad(controls, ((0, 0), (0, 1)))[:, columns])
-        return np.asarray(np.linalg.norm(turns, axis=-1))
 
     def is_unstable(self, records: Any, control: Any) -> bool:
         """True if an equilibrium is unstable; false where that is not tested."""
@@ -192,26 +179,6 @@ class _Walk:
         """Return y at all points from records at the nodes."""
         return self.grid.spread(np.asarray(records)[:, : self.system.y_layout.size])
 
-    def _turns(self, before: Any, after: Any) -> int:
-        """Return the number of turns by which two shapes differ beyond the rotation of the ends.
-
-        The frames of the first are rotated to the tangents of the other. The angle between frames is then
-        counted along the rod, and compared with its value at the tip within half a turn.
-        """
-        if not are_clamped(self.system):
-            return 0
-        h = self.system.y_layout.slice("h")
-        one, other = (rotations(continuous(records[:, h])) for records in (before, after))
-        t, r = one.apply([0.0, 0.0, 1.0]), other.apply([0.0, 0.0, 1.0])
-        cosine = np.sum(t * r, axis=1)
-        if np.min(cosine) < OPPOSITE:
-            return 0
-        # the shortest rotation from one tangent to the other
-        swing = np.concatenate([1.0 + cosine[:, None], np.cross(t, r)], axis=1)
-        over = ((rotations(swing) * one).inv() * other).as_quat()
-        angle = np.unwrap(2.0 * np.arctan2(over[:, 2], over[:, 3]))
-        return int(np.round((angle[-1] - angle[0]) / (2.0 * np.pi)))
-
     # stable equilibria of compressed rods
 
     def _best(self, control: Any, guesses: list[Any]) -> tuple[Any, StepRows | None]:
@@ -220,7 +187,7 @@ class _Walk:
         for guess in guesses:
             rows = self.task.solve(self.system, np.asarray(control)[None], guess, (0, 1))[2]
             row = StepRows(*(leaf[0] for leaf in rows))
-            if row.result < 0 or self._turns(np.asarray(guess)[self.grid.nodes], row.records):
+            if row.result < 0 or turns_between(self.system, np.asarray(guess)[self.grid.nodes], row.records):
                 continue
             if not self.is_unstable(row.records, control):
                 return guess, row

@@ -12,6 +12,7 @@ from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, turns_between, turns_within
 from knode_cosserat.solvers.history import SolverState, StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.recovery import Budget
@@ -72,7 +73,7 @@ class Stepper:
         self.robot, self.dt = robot, checked_dt(dt)
         # layouts are put together anew in each call
         self._layout, self._control_shape = robot.control_layout, (robot.control_layout.size,)
-        self._linear = bool(self._layout.moving.any())
+        self._linear, self._counts = bool(self._layout.moving.any()), False
         # an infinite number is beyond them, and NaN too
         most = np.finfo(float).max
         self._limits = [
@@ -191,7 +192,15 @@ class Stepper:
         except IndexError:  # another thread has it, or this is a copy
             engine = self._task.motions(self._bare, self._history)
         before = engine.motions if self._motion is None else self._motion
-        motion, numbers, result = engine.step(before, i, acting)
+        angle = turns_within(self.robot, control[None], self._control)[0] if self._linear else 0.0
+        numbers = None
+        if angle <= LARGEST_JUMP:
+            motion, numbers, result = engine.step(before, i, acting)
+        # from the first large turn on, turns are counted
+        self._counts = self._counts or angle > LARGEST_TURN
+        if self._counts and numbers is not None:
+            y = (self._state.y[-1], engine.row_of(numbers).records)
+            numbers = None if turns_between(self.robot, *y) else numbers
         if numbers is None:
             budget, pair = Budget(self._task.recovery_budget, stop), (self._control, acting)
             after, row, cause = self._task.recover(self._bare, self._history, pair, i, budget)

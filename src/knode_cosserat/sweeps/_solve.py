@@ -26,7 +26,14 @@ from knode_cosserat.solvers.initial import initial_state
 from knode_cosserat.solvers.recovery import likely_cause
 from knode_cosserat.solvers.replay import at_one_state, history_settings
 from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.run import InitialState, TimeIntegration, carried_results, run_one, usable_cores
+from knode_cosserat.solvers.run import (
+    InitialState,
+    TimeIntegration,
+    carried_results,
+    refuse_far_turns,
+    run_one,
+    usable_cores,
+)
 from knode_cosserat.sweeps._plan import Cases, Plan
 
 #: robots that one call solves
@@ -110,7 +117,9 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
     start, marks, reasons = _equilibria(plan, system, values)
     task = TimeIntegration(settings, plan.sweep.dt, steps)
     systems, record, history = _started(system, values, start, settings, CHUNK)
-    done, _, rows = task.solve(systems, cases.controls[index], history)
+    _, _, rows = task.solve(systems, cases.controls[index], history)
+    zero = np.zeros((CHUNK, system.control_layout.size))
+    rows = rows._replace(result=refuse_far_turns(system, rows.result, cases.controls[index], zero))
     stored = _stored(systems, record, rows, plan.sweep.store)
     columns: dict[str, Any] = jax.tree.map(lambda leaf: np.array(leaf[:count]), stored)
     for k in range(count):
@@ -118,7 +127,7 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
             reasons[k] = cause
             for name, column in columns.items():
                 column[k] = int(Result.NOT_REACHED) if name == "result" else np.nan
-        elif done[k] < steps:
+        elif np.any(columns["result"][k] < 0):
             case = system.replace(**{name: array[k] for name, array in values.items()}) if values else system
             rows_of_case = {name: column[k] for name, column in columns.items()}
             reasons[k] = _failed(plan, case, task, cases.controls[first + k], rows_of_case)
