@@ -14,6 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.control.commands import Command, Controller, ControlLimits
 from knode_cosserat.control.plants import Plant
@@ -450,6 +451,7 @@ def run_loop(
         KnodeCosseratError: the plant failed, such as hardware with a fault. The error's attribute `log` is
             the log of the periods before, None if there are none. Interruptions (Ctrl-C) have it too.
     """
+    check_arguments(run_loop, locals())
     steps = round(seconds / controller.dt)
     if steps < 1:
         raise ValueError(f"seconds is {seconds:g}; allowed is at least one period, {controller.dt:g} s")

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import (
-    DT,
     experiments_of,
     measured_rows,
     names_of,
@@ -30,7 +30,7 @@ from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import Passive, passive
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.learning.states import BEST, fit_states, require_allowed
-from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.segments import DataError
@@ -84,6 +84,7 @@ def fit(
         FitError: data without anything to learn, or a config that needs full states.
         IdentificationError: the robot cannot be identified.
     """
+    check_arguments(fit, locals())
     listed: Any = data
     several = isinstance(listed, Iterable) and not isinstance(listed, str | Trajectory)
     listed = list(listed) if several else listed
@@ -149,6 +150,7 @@ def with_residual(
     Raises:
         DataError: there is one recording only, or they cannot be used.
     """
+    check_arguments(with_residual, locals())
     measured = measured_rows(recordings)
     if len(measured) < 2:
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")

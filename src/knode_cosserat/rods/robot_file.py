@@ -24,6 +24,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
@@ -80,6 +81,7 @@ def load_robot(name_or_path: str | Path) -> System:
     Raises:
         RobotFileError: there is no such robot, or its file is invalid.
     """
+    check_arguments(load_robot, locals())
     robot, source = parse_robot(_text_of(name_or_path), str(name_or_path)), str(name_or_path)
     if source not in _catalog_files():
         warn_of_paper_tendons(robot, source)
@@ -112,6 +114,7 @@ def save_robot(robot: System, path: str | Path, *, description: str = "") -> Non
     Raises:
         RobotFileError: the robot's class has no kind, it is a batch, or the file cannot be written.
     """
+    check_arguments(save_robot, locals())
     text = format_robot(robot, description)
     try:
         with replacing(Path(path)) as temporary:
