@@ -222,7 +222,7 @@ def of_measurements(
         raise DataError(f"{name}: nothing was measured after the first row")
     control = measured.tension[:-1]
     held = np.asarray(control[0] if measured.initial_tension is None else measured.initial_tension)
-    swing = np.max(np.abs(control - held), axis=1)
+    swing = np.max(np.abs(control - held), axis=1, initial=0.0)  # a robot may have no controls
     moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
     scheme = time_scheme(measured.dt, measured.continuous)
     settings = dataclasses.replace(Settings.of(None, space, "paper", NewtonOptions()), time=scheme)
