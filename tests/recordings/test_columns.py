@@ -399,3 +399,22 @@ def test_columns_by_number_and_tensions_of_no_use_count_as_read_or_not(tmp_path)
     recording = load_recording(path, written(tmp_path, by_number))
     agrees(recording)
     assert [each.message.partition(":")[0] for each in recording.findings] == ["1 column is not read"]
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("Pa", 1.0), ("kPa", 1e3), ("bar", 1e5)])
+def test_pressures_are_not_judged_as_tensions(tmp_path, unit, factor):
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(columns()))
+    settings = (
+        FILES["a plain file"][1] + f"tension: {{topic: tension, order: [1, 2, 3, 4, 5, 6], unit: {unit}}}\n"
+    )
+    recording = load_recording(path, written(tmp_path, settings))
+    agrees(recording, factor * PULLS)
+    assert recording.findings == ()
+
+
+def test_tensions_of_that_size_are_judged(tmp_path):
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(columns() | {f"T{k + 1}": 1e4 * PULLS[:, k] for k in range(6)}))
+    recording = load_recording(path, written(tmp_path, FILES["a plain file"][1]))
+    assert any("N are not plausible" in each.message for each in recording.findings)

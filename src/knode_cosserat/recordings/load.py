@@ -14,7 +14,7 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.limits import MORE
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings import checks, frame, streams, table
-from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.config import PRESSURE_UNITS, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
 from knode_cosserat.recordings.formats import format_of
 from knode_cosserat.recordings.formats.csv_table import read_csv
@@ -202,8 +202,11 @@ def _assembled(
     bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
     at_rest = frame.rest_positions(bodies, rest)
     findings += about_tensions + about_frame
-    both = (None if config.motors else tension, commanded)
-    findings += checks.implausible_sizes(bodies, both, at_rest, is_static=config.static)
+    both = [
+        pulls if isinstance(source, TensionSource) and source.unit not in PRESSURE_UNITS else None
+        for source, pulls in ((config.measured, tension), (config.command, commanded))
+    ]
+    findings += checks.implausible_sizes(bodies, (both[0], both[1]), at_rest, is_static=config.static)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
     return Recording(

@@ -25,14 +25,13 @@ def checked_system(robot: Any) -> System:
     return robot
 
 
-def checked_vectors(
-    name: str, given: Any, size: int, allowed: str, most: int = 2, layout: Layout | None = None
-) -> np.ndarray:
+def checked_vectors(name: str, given: Any, size: int | Layout, allowed: str, most: int = 2) -> np.ndarray:
     """Return finite numbers (size,), or with `most` 2 also (B, size); tables by the names of a layout."""
     try:
-        numbers = real_array(given) if layout is None else layout.numbers_of(given)
+        numbers = size.numbers_of(given) if isinstance(size, Layout) else real_array(given)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not numbers ({error}); allowed is {allowed}") from None
+    size = size.size if isinstance(size, Layout) else size
     # zero rows are refused; a row of size zero is the control of a robot without controls
     if not 1 <= numbers.ndim <= most or numbers.shape[-1] != size or 0 in numbers.shape[:-1]:
         raise ValueError(f"{name} has shape {numbers.shape}; allowed is {allowed}")
@@ -49,7 +48,7 @@ def checked_control(system: System, control: Any, name: str = "control") -> np.n
     if control is None and not size:
         control = np.zeros(0)
     allowed = f"({size},): {names or 'there are no controls'}"
-    numbers = checked_vectors(name, control, size, allowed, 1, system.control_layout)
+    numbers = checked_vectors(name, control, system.control_layout, allowed, 1)
     return within_limits(system, numbers, name)
 
 

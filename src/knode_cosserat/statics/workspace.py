@@ -207,9 +207,7 @@ def workspace(
         samples = sample(*limits, int(number), seed)
     else:
         size = system.control_layout.size
-        samples = arguments.checked_vectors(
-            "controls", controls, size, f"(B, {size})", 2, system.control_layout
-        )
+        samples = arguments.checked_vectors("controls", controls, system.control_layout, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
         arguments.within_limits(system, samples, "controls")
