@@ -100,8 +100,8 @@ def warn_of_places_in_metres(robot: System, source: str) -> None:
         end = max(ends, default=1.0)
         if end < 1.0 and np.isclose(end, length, rtol=1e-9, atol=0.0):
             warnings.warn(
-                f"{source}: the last of {name} ends at {end:g} of the length, {1e3 * end * length:.4g} mm from "
-                f"the base; the robot is {length:g} m long, places are fractions. Did you mean end: 1?",
+                f"{source}: the last of {name} ends at {end:g} of the length, {1e3 * end * length:.4g} mm "
+                f"from the base; the robot is {length:g} m long, places are fractions. Did you mean end: 1?",
                 stacklevel=3,
             )
 
