@@ -14,13 +14,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.identification.evaluate import Evaluation, evaluate
-from knode_cosserat.identification.experiments import DT
 from knode_cosserat.identification.fit import with_residual
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.recordings.load import load_recording
-from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.virtual import record_virtual
 from knode_cosserat.solvers.result import SimulationError
 from studies.report import Report, as_json, markdown_table, write_texts

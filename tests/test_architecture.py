@@ -14,7 +14,18 @@ ROOT = Path(knode_cosserat.__file__).parent
 
 #: packages and modules, each line depends on lines above it and on itself only. The longest prefix counts
 LAYERS = (
-    ("errors", "_files", "_jax", "_lazy", "_numbers", "_processes", "_program_cache", "_reprs", "rotation"),
+    (
+        "errors",
+        "_arguments",
+        "_files",
+        "_jax",
+        "_lazy",
+        "_numbers",
+        "_processes",
+        "_program_cache",
+        "_reprs",
+        "rotation",
+    ),
     ("io",),
     ("rods", "robots"),
     ("controls",),

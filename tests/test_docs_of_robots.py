@@ -35,3 +35,95 @@ def test_every_kind_is_on_the_page():
     kinds = {kind for family in families for kind in kinds_of(family)}
     assert not [kind for kind in {*kinds, *KINDS} - {"virtual-robot"} if f"`{kind}`" not in PAGE]
     assert not [name for name in kc.catalog() if f"`{name}`" not in PAGE]
+
+
+# claims of absence
+
+#: words by which a page says that something is not there
+ABSENCE = re.compile(
+    r"\b(?:is|are) (?:not (?:yet )?(?:available|supported|possible|implemented|modelled)|refused)\b"
+    r"|\bno support for\b|\bunsupported\b"
+)
+#: claims that name a part of the package and are right: what they say is not there is another thing
+RIGHT = (
+    "inertia by the speed of insertion are not modelled", "The fluid's own mass and its flow resistance",
+    "parts with states, or at places within it, are refused", "Friction has no linearisation",
+)  # fmt: skip
+#: words of users for what a control or a kind is called
+SYNONYMS = {
+    "insertion": ("fed", "feed", "feeding"),
+    "reel": ("reels", "wound"),
+    "pressure": ("chambers", "pneumatic"),
+}
+
+
+def there() -> set[str]:
+    """Return the words for what is there: kinds of robots and parts, controls, public names."""
+    families = ends.End, loads.Load, surroundings.Obstacle, section.SectionChange, routing.Routing
+    names = (
+        {kind for family in families for kind in kinds_of(family)} | set(KINDS) | {*kc.catalog(), *kc.__all__}
+    )
+    names |= {name for robot in kc.catalog() for name in kc.load_robot(robot).control_layout.names}
+    words = {word for name in names for word in name.replace("_", "-").lower().split("-")} | {"reel"}
+    words -= {
+        "end",
+        "load",
+        "free",
+        "robot",
+        "system",
+        "result",
+        "save",
+        "section",
+        "point",
+        "force",
+        "field",
+    }
+    return words | {one for word in words for one in SYNONYMS.get(word, ())}
+
+
+def wrong_claims(page: str) -> list[str]:
+    """Return the sentences of a page that deny what is there."""
+    sentences = (" ".join(it.split()) for it in re.split(r"(?<=[.;|])\s+", page))
+    words = there()
+    return [
+        it for it in sentences
+        if ABSENCE.search(it)
+        and words & set(re.findall(r"[a-z]+", it.lower()))
+        and not any(right in it for right in RIGHT)
+    ]  # fmt: skip
+
+
+def test_no_page_on_robots_denies_what_is_there():
+    for name in (
+        "robots",
+        "kinematics",
+        "how-it-works",
+        "robot-file",
+        "two-sections",
+        "your-own-robot",
+        "solver",
+    ):
+        page = (Path(__file__).parent.parent / "docs" / f"{name}.md").read_text(encoding="utf-8")
+        assert not wrong_claims(page), name
+
+
+def test_claims_of_absence_are_found():
+    for claim in (
+        "A rod whose length is a control (a rod fed through a hole) is not available; it is pushed.",
+        "Robots on reels are refused.", "There is no support for a magnetic field.",
+        "Concentric tubes are not yet supported.", "Pneumatic drives are not implemented.",
+    ):  # fmt: skip
+        assert wrong_claims(claim), claim
+    assert not wrong_claims(
+        "Robots on reels are decided by their motion. A wall that is too thin is refused."
+    )
+
+
+def test_figures_that_pages_cite_from_the_readme_are_there():
+    root = Path(__file__).parent.parent
+    readme = (root / "README.md").read_text(encoding="utf-8")
+    for page in (root / "docs").glob("*.md"):
+        for sentence in re.split(r"(?<=\.)\s+", page.read_text(encoding="utf-8")):
+            if re.search(r"\(README\)|in the README|the README's", sentence):
+                figures = re.findall(r"\d[\d,]*\.?\d*", sentence.partition("README")[0])
+                assert not [it for it in figures if it not in readme], f"{page.name}: {sentence}"

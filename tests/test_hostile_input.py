@@ -54,7 +54,7 @@ def test_a_masked_array_without_masked_values_is_an_array():
 
 @pytest.mark.parametrize("dt", [5e-324, 10**400, -1.0, 0, np.nan, True, "0.05", 1e9])
 def test_time_steps_that_are_none(dt):
-    with pytest.raises(ValueError, match="allowed is a positive number of seconds, 1e-09 to 1e"):
+    with pytest.raises(ValueError, match=r"^dt is .*; allowed is a (positive )?number"):
         kc.simulate(ROBOT, TENSIONS, dt)
 
 

@@ -39,11 +39,16 @@ def real_array(values: Any) -> np.ndarray:
     Raises:
         ValueError: they are no numbers, or some are masked; a phrase that follows "they".
     """
+    if values is None:
+        raise ValueError("None")
     if isinstance(values, np.ma.MaskedArray):
         if np.ma.is_masked(values):
             raise ValueError(f"{int(np.ma.count_masked(values))} of them are masked")
         values = values.data
-    array = np.asarray(values)
+    try:
+        array = np.asarray(values)
+    except ValueError:
+        raise ValueError("their rows have different lengths") from None
     kind = array.dtype.kind
     if kind == "O":
         words = next((one for one in array.ravel() if isinstance(one, (str, bytes, bool))), None)
@@ -52,4 +57,13 @@ def real_array(values: Any) -> np.ndarray:
     elif kind in _NO_NUMBERS:
         such = f", {reprlib.repr(array.ravel()[0].item())}" if array.size else ""
         raise ValueError(f"they are {_NO_NUMBERS[kind]}{such}")
-    return np.asarray(array, dtype=float)
+    try:
+        return np.asarray(array, dtype=float)
+    except (TypeError, ValueError):
+        other = next((one for one in array.ravel() if not np.isscalar(one)), None)
+        raise ValueError(f"one of them is {with_article(type(other).__name__)}") from None
+
+
+def with_article(noun: str) -> str:
+    """Return a noun with its indefinite article."""
+    return f"{'an' if noun[0] in 'AEIOUaeiou' else 'a'} {noun}"

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.csv_rows import SAME_TIME, Column, CSVTextError, held_rows, read_rows
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import did_you_mean
@@ -67,11 +68,7 @@ class Controls(NamedTuple):
 
 def labels(layout: Layout) -> list[str]:
     """Return the name of every number of a control: its field's, numbered from 1 in a field of several."""
-    return [
-        field.name if field.size == 1 else f"{field.name}_{k + 1}"
-        for field in layout.fields
-        for k in range(field.size)
-    ]
+    return layout.labels
 
 
 def units(layout: Layout) -> list[str]:
@@ -93,6 +90,7 @@ def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
     Raises:
         ControlsError: an argument is not possible; likewise in every function here.
     """
+    check_arguments(constant, locals(), ControlsError)
     _require_numbers(tension=tension)
     _require_counts(steps=steps, tendons=tendons)
     return _checked_tensions(np.full((steps, tendons), float(tension)), "constant")
@@ -103,6 +101,7 @@ def sine(
     sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
+    check_arguments(sine, locals(), ControlsError)
     _require_numbers(base=base, amplitude=amplitude)
     _require_counts(tendons=tendons)
     phase = 2 * np.pi * np.arange(tendons) / tendons
@@ -119,6 +118,7 @@ def step(
     tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
 ) -> Tensions:  # fmt: skip
     """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
+    check_arguments(step, locals(), ControlsError)
     _require_numbers(height=height, base=base, at=at)
     t = step_times(steps, dt, sampled)
     return _in_tendons("step", step_values(t, height, base, at, dt), base, tendons, count)
@@ -132,6 +132,7 @@ def ramp(
 
     The rise is from `start` to `end` (s), by default until the last step. The tension is constant after.
     """
+    check_arguments(ramp, locals(), ControlsError)
     t = step_times(steps, dt, sampled)
     if end is None:
         end = float(t[-1])
@@ -151,6 +152,7 @@ def random(
     steps: int, *, low: float = 5.0, high: float = 10.0, seed: int = 0, tendons: int = 4, hold: int = 1
 ) -> Tensions:
     """Return independent uniform samples between `low` and `high` (N), each held for `hold` steps."""
+    check_arguments(random, locals(), ControlsError)
     _require_counts(steps=steps, tendons=tendons, hold=hold)
     _require_counts(least=0, seed=seed)
     _require_numbers(low=low, high=high)
@@ -284,6 +286,7 @@ def save(path: str | Path, tensions: Any, dt: float) -> None:
 
     The file is written completely or not at all.
     """
+    check_arguments(save, locals(), ControlsError)
     try:
         tensions = real_array(tensions)
     except (TypeError, ValueError) as error:
@@ -318,6 +321,7 @@ def load(path: str | Path, dt: float | None = None) -> Controls:
     Raises:
         ControlsError: the file cannot be read; the message names the line and the column.
     """
+    check_arguments(load, locals(), ControlsError)
     if dt is not None:
         _require_positive("dt", dt)
     time, tensions = _read(Path(path))
@@ -448,6 +452,7 @@ def parse(
         ControlsError: the specification is not understood, the file is invalid or too short, or the signal
             has no effect during the run, such as a step after its end.
     """
+    check_arguments(parse, locals(), ControlsError)
     # its import takes long, and readers of recordings use the units of this module
     from knode_cosserat.rods.layout import Layout
 

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.evaluation.animation import animate
 from knode_cosserat.evaluation.comparison import REFERENCE
 from knode_cosserat.evaluation.comparison import comparison as compare
@@ -78,6 +79,7 @@ def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, c
 
     The view is in space ("xyz"), or along an axis: "xy", "xz", "yz". Views along an axis show obstacles too.
     """
+    check_arguments(shape, locals())
     curves = curves_of(one_of(trajectory))
     view = checked_view(view, curves[0].shape[-1])
     points = np.concatenate([curve.reshape(-1, curve.shape[-1]) for curve in curves])
@@ -127,6 +129,7 @@ def path(
 
     Paths may also be arrays (points, 3) in m. A path whose label begins with "wanted" is drawn wide and pale.
     """
+    check_arguments(path, locals())
     motions = dict(trajectories) if isinstance(trajectories, Mapping) else {"": trajectories}
     if not motions:
         raise ValueError("there are no trajectories to draw; at least one is needed")
@@ -150,6 +153,7 @@ def path(
 
 def tips(trajectories: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure:
     """Return a figure of x, y and z of the tips over time, of trajectories or recordings."""
+    check_arguments(tips, locals())
     motions = by_label(trajectories)
     paths = {label: (one.time, tips_of(one)) for label, one in motions.items()}
     size = min(tip.shape[1] for _, tip in paths.values())
@@ -179,6 +183,7 @@ def states(
         KeyError: a field does not exist.
         ValueError: the node does not exist.
     """
+    check_arguments(states, locals())
     motions = by_label(trajectories)
     first = one_of(next(iter(motions.values())))
     layouts = (first.system.y_layout, first.system.z_layout, first.system.control_layout)
@@ -225,6 +230,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
     Raises:
         ValueError: a prediction's rows differ from the truth's.
     """
+    check_arguments(error, locals())
     motions, true = by_label(predictions, "predictions"), tips_of(truth)
     with style():
         figure = new_figure(width_of(columns), 2.4)
@@ -248,6 +254,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
 
 def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
     """Return a figure of every tendon's tension over time, held from row to row; or of the controls."""
+    check_arguments(tensions, locals())
     one_of(trajectory)
     with style():
         figure = new_figure(width_of(columns), 2.4)
@@ -257,6 +264,7 @@ def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
 
 def overview(trajectory: Trajectory, count: int = 12) -> Figure:
     """Return one figure of shapes, tip path and tensions of a trajectory, two columns wide."""
+    check_arguments(overview, locals())
     curves = curves_of(one_of(trajectory))
     with style():
         figure = new_figure(TWO_COLUMNS, 4.2)
@@ -277,6 +285,7 @@ def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
     Raises:
         ValueError: the trajectory is not a batch.
     """
+    check_arguments(spread, locals())
     if not isinstance(batch, Trajectory):
         raise TypeError(f"batch is a {type(batch).__name__}; allowed is a Trajectory of several robots")
     if np.ndim(batch.y) != 4:
@@ -315,6 +324,7 @@ def curves(
     Raises:
         ValueError: a curve's number of values differs from x's, or `log` is not allowed.
     """
+    check_arguments(curves, locals())
     if log not in ("", "x", "y", "xy"):
         raise ValueError(f"log is {log!r}; allowed is '', 'x', 'y' or 'xy'")
     at = np.asarray(x, dtype=float)
@@ -344,6 +354,7 @@ def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
     The largest displacement is drawn as a quarter of the robot's extent. Titles have frequency and damping,
     or the growth rate of a motion without oscillation.
     """
+    check_arguments(vibration, locals())
     if count < 1 or not len(modes.values):
         raise ValueError(f"count is {count} of {len(modes.values)} modes; allowed is 1 or more")
     still = modes.position.reshape(len(modes.position), -1, 3)
@@ -379,6 +390,7 @@ def workspace(samples: Workspace) -> Figure:
     Raises:
         ValueError: no sample is solved, or positions do not have three coordinates.
     """
+    check_arguments(workspace, locals())
     require_matplotlib()
     if not (hasattr(samples, "position") and hasattr(samples, "valid")):
         raise TypeError(f"samples is a {type(samples).__name__}; allowed is a Workspace")
@@ -405,6 +417,7 @@ def closed_loop(log: LoopLog) -> Figure:
     Periods without a solution are marked. Without adapted parameters the last panel has the times of the
     computation.
     """
+    check_arguments(closed_loop, locals())
     wanted, tip = log.reference[:, :2], log.tip[:, :2]
     fallback = np.array([status != "optimal" for status in log.status])
     with style():

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from knode_cosserat import trajectory
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
 
@@ -24,6 +25,7 @@ def load_trajectory(
     Raises:
         TrajectoryFileError: the file cannot be read, is not a trajectory, or has invalid contents.
     """
+    check_arguments(load_trajectory, locals())
 
     def read_model(content: bytes) -> System:
         from knode_cosserat.learning.knode import decoded_model

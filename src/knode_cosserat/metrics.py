@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike, NDArray
 
+from knode_cosserat._arguments import check_arguments, numbers_of
 from knode_cosserat.trajectory import Trajectory
 
 __all__ = [
@@ -228,7 +229,7 @@ def _poses(name: str, history: PoseHistory) -> tuple[Array, Array | None]:
 
 
 def _path(name: str, points: ArrayLike) -> Array:
-    points = np.asarray(points, dtype=float)
+    points = numbers_of(name, points, "(T, 3) in m, or (T, 2)")
     if points.ndim != 2 or points.shape[1] not in (2, 3) or len(points) == 0:
         raise ValueError(
             f"{name} has shape {points.shape}; it must be (T, 3), or (T, 2) in a plane, with at least one row"
@@ -274,6 +275,7 @@ def state_errors(
     Raises:
         ValueError: the truth has no row at a time of the estimate, or no node at a place.
     """
+    check_arguments(state_errors, locals())
     for name, it in (("estimate", estimate), ("truth", truth)):
         if not isinstance(it, Trajectory):
             raise ValueError(f"the {name} is a {type(it).__name__}; allowed is a Trajectory")

@@ -366,3 +366,55 @@ def test_the_settings_in_the_documentation_are_valid(tmp_path):
         config = written(tmp_path, block)
         (tmp_path / "map.yaml").write_text(config.to_yaml(brief=True))
         assert RecordingConfig.load(tmp_path / "map.yaml") == config
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        ({}, None),
+        ({"vx": TIME}, "1 column is not read: vx"),
+        ({"note": ["a"] * len(TIME)}, "1 column is not read: note"),
+        ({"Temp [C]": TIME, "P1": TIME}, "2 columns are not read: Temp [C], P1"),
+        ({"T7": TIME, "qw": TIME}, "2 columns are not read: T7, qw"),
+        ({f"a{k}": TIME for k in range(9)}, "9 columns are not read: a0, a1, a2, a3, a4, a5, a6, a7, …"),
+    ],
+)
+def test_columns_that_nothing_reads_are_listed(tmp_path, more, message):
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(columns() | more))
+    recording = load_recording(path, written(tmp_path, FILES["a plain file"][1]))
+    agrees(recording)
+    assert [each.message for each in recording.findings if "not read" in each.message] == [message] * bool(
+        message
+    )
+    if message:
+        config = tmp_path / "map.yaml"
+        assert message in succeeded("inspect", path, "--config", config)
+
+
+def test_columns_by_number_and_tensions_of_no_use_count_as_read_or_not(tmp_path):
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(columns() | {"y ": POSITION[:, 1]}))
+    by_number = "columns: {time: '1', tensions: ['2', '3', '4', '5', '6', '7'], tip: ['8', '9', '10']}\n"
+    recording = load_recording(path, written(tmp_path, by_number))
+    agrees(recording)
+    assert [each.message.partition(":")[0] for each in recording.findings] == ["1 column is not read"]
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("Pa", 1.0), ("kPa", 1e3), ("bar", 1e5)])
+def test_pressures_are_not_judged_as_tensions(tmp_path, unit, factor):
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(columns()))
+    settings = (
+        FILES["a plain file"][1] + f"tension: {{topic: tension, order: [1, 2, 3, 4, 5, 6], unit: {unit}}}\n"
+    )
+    recording = load_recording(path, written(tmp_path, settings))
+    agrees(recording, factor * PULLS)
+    assert recording.findings == ()
+
+
+def test_tensions_of_that_size_are_judged(tmp_path):
+    path = tmp_path / "it.csv"
+    path.write_bytes(table(columns() | {f"T{k + 1}": 1e4 * PULLS[:, k] for k in range(6)}))
+    recording = load_recording(path, written(tmp_path, FILES["a plain file"][1]))
+    assert any("N are not plausible" in each.message for each in recording.findings)

@@ -4,6 +4,7 @@ import dataclasses
 import re
 import subprocess
 import sys
+import warnings
 from pathlib import Path
 
 import hypothesis.strategies as st
@@ -339,3 +340,46 @@ def test_files_are_read_by_a_fresh_process_with_every_kind():
     listed = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     own = {name for name, cls in kinds_of(Part).items() if cls.__module__.startswith("knode_cosserat.rods")}
     assert own <= {*listed.split()}
+
+
+#: a rod 0.125 m long, with tendons that end at the places
+PLACES = """format: 1
+kind: routed-tendon-robot
+parameters:
+  length: {length}
+  radius: 0.002
+  density: 1500.0
+  youngs_modulus: 1.0e+9
+  routing:
+    - {{kind: straight, x: 0.01, y: 0.0, end: {one}}}
+    - {{kind: straight, x: -0.01, y: 0.0, end: {other}}}
+"""
+
+
+@pytest.mark.parametrize(
+    ("length", "one", "other", "warned"),
+    [
+        (0.125, 0.125, 0.125, True), (0.125, 0.0625, 0.125, True), (0.3, 0.3, 0.1, True),
+        (0.125, 0.125, 1.0, False), (0.5, 0.5, 1.0, False), (0.125, 0.5, 0.75, False), (1.0, 1.0, 1.0, False),
+    ],
+)  # fmt: skip
+def test_places_in_metres_are_warned_of(tmp_path, length, one, other, warned):
+    path = tmp_path / "robot.yaml"
+    path.write_text(PLACES.format(length=length, one=one, other=other))
+    with warnings.catch_warnings(record=True) as found:
+        warnings.simplefilter("always")
+        kc.load_robot(path)
+    said = [str(each.message) for each in found if "did you mean end: 1" in str(each.message).lower()]
+    assert len(said) == warned
+    if warned:
+        assert f"{1e3 * length**2:.4g} mm from the base; the robot is {length:g} m long" in said[0]
+        assert str(path) in said[0]
+
+
+@pytest.mark.parametrize("name", kc.catalog())
+def test_no_robot_of_the_catalog_has_places_in_metres(name, tmp_path):
+    path = tmp_path / "robot.yaml"
+    kc.save_robot(kc.load_robot(name), path)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("error", message=".*Did you mean end: 1")
+        kc.load_robot(path)

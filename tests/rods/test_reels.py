@@ -61,6 +61,10 @@ def test_reels_come_back_from_a_file(tmp_path):
         ({"motors": (1, 3), "radius": (0.1,)}, "one whole number for each tendon"),
         ({"motors": (1, -1)}, "radius is missing"),
         ({"motors": (1, -1), "radius": (0.1, 0.2)}, "radius has 2 numbers; allowed is 1, one for each motor"),
+        (
+            {"motors": (1, 2, 3), "radius": (0.1,) * 6},
+            r"6 numbers.*motors, \[1, 2, 3\], has one number for each ten",
+        ),
         ({"motors": (1, 2), "taken_in": (0.0,)}, "taken_in has 1 numbers; allowed is 2, one for each tendon"),
     ],
 )

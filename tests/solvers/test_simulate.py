@@ -248,7 +248,7 @@ def test_the_past_keeps_the_newest_first(robot):
         ({"space": "bdf2"}, 'space is \'bdf2\'; allowed is "lobatto2", "lobatto4", "euler"'),
         ({"start": "cold"}, "start is 'cold'"),
         ({"on_failure": "ignore"}, "on_failure is 'ignore'"),
-        ({"robot": "delrin-tendon-robot"}, "robot is str; allowed is a robot"),
+        ({"robot": "delrin-tendon-robot"}, "robot is a str 'delrin-tendon-robot'; allowed is a robot"),
         ({"robot": []}, "non-empty list"),
     ],
 )

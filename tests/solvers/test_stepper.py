@@ -108,7 +108,7 @@ def test_rows_that_follow_a_coarse_one_are_coarse_too(robot):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"robot": []}, "a stepper is of one robot"),
+        ({"robot": []}, "robot is a list; allowed is a robot"),
         ({"dt": 0.0}, "dt is 0.0"),
         ({"time": "bdf9"}, "time is 'bdf9'"),
         ({"newton": "long"}, "newton is 'long'"),

@@ -133,5 +133,5 @@ def test_wrong_arguments_are_named():
         kc.statics.configuration(ROBOT, [1.0, 2.0, 3.0])
     with pytest.raises(ValueError, match=r"control is nan at index \(1,\)"):
         kc.statics.configuration(ROBOT, [1.0, np.nan, 3.0, 0.0])
-    with pytest.raises(ValueError, match="robot is list"):
+    with pytest.raises(ValueError, match="robot is a list; allowed is a robot"):
         kc.statics.configuration([ROBOT], CONTROL)

@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from knode_cosserat.control import ControlLimits
     from knode_cosserat.rods.system import System
 
-#: distance from the nearest tip at rest at which a warning is given, as part of the length
-OUT_OF_REACH = 2e-3
 #: plants of other simulators by the word before the colon: functions of the rest of the text, dt and sensor
 PLANTS: dict[str, Callable[[str, float, Any], Any]] = {}
 
@@ -179,7 +177,6 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
     for path in (output.out, output.recording, output.states, output.figure, viewer.export):
         require_writable(path)
     from knode_cosserat import control as kcc
-    from knode_cosserat.control.loop import distance_out_of_reach
     from knode_cosserat.estimation import TipPosition
 
     model = nominal.load()
@@ -188,18 +185,8 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
         method.name, model, method.dt, limits, method.adapt or (), TipPosition(sigma=method.deviation)
     )
     plant = task.plant_of(model, method.dt)
-    beyond = None  # with --live, the target moves
     if task.reference is not None:
         wanted, seconds = parsed_reference(task.reference), task.seconds
-        beyond, time = distance_out_of_reach(model, limits, wanted, seconds)
-        if beyond > OUT_OF_REACH * length:
-            typer.echo(
-                f"warning: the {wanted.name} is {1e3 * beyond:.3g} mm out of reach at t = {time:.3g} s: no "
-                "controls within the limits were found that bring the tip nearer at rest",
-                err=True,
-            )
-        else:
-            beyond = 0.0
         log = kcc.run_loop(controller, plant, wanted, seconds)
     else:
         from knode_cosserat.viewer import control_live
@@ -234,6 +221,7 @@ def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, vie
         closed_loop(log).savefig(output.figure)
     choice = getattr(controller, "choice", None)
     again = ",".join(f"{name}={value}" for name, value in log.settings.items())
+    beyond = log.out_of_reach  # None with --live, where the target moves
     facts = log.summary() | {"tip_rmse_percent": 100.0 * log.tip_rmse() / length, "out_of_reach": beyond}
     lines = [
         f"tip RMSE {facts['tip_rmse']:.3g} m over the second half, "

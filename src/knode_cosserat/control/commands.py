@@ -13,6 +13,7 @@ from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
@@ -211,6 +212,7 @@ def controller_named(
         ValueError: an unknown name or option, or parameters for a controller that adapts none.
         SimulationError: the model has no equilibrium that the controller needs.
     """
+    check_arguments(controller_named, locals())
     name, _, text = name.partition(":")
     if name not in CONTROLLERS:
         raise ValueError(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time as clock
+import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.control.commands import Command, Controller, ControlLimits
 from knode_cosserat.control.plants import Plant
@@ -33,6 +35,8 @@ from knode_cosserat.trajectory import Trajectory
 CHECKED, SAMPLING = 60.0, 0.02
 #: distance from the base, in lengths of the rod, which a rod that stretches or a moving base may reach
 STRETCH = 1.5
+#: distance out of reach, as a part of the length, from which on it is reported
+OUT_OF_REACH = 2e-3
 #: points of a reference whose nearest tips are searched, initial controls of each search, and the part of the
 #: length within which a point is reached
 POINTS, STARTS, REACHED = 12, 2, 1e-4
@@ -47,8 +51,13 @@ def check_reference(controller: Any, reference: Reference, seconds: float = CHEC
     Controllers of other outputs, such as curvatures, are not checked.
     """
     robot, target = getattr(controller, "robot", None), getattr(controller, "target", None)
-    if robot is not None and (target is None or isinstance(target, BodyPositions | BodyPoses)):
+    if robot is not None and _is_position(target):
         _check_within_length(robot, reference, seconds)
+
+
+def _is_position(target: Any) -> bool:
+    """True for the target of a controller of positions, the tip's by default."""
+    return target is None or isinstance(target, BodyPositions | BodyPoses)
 
 
 def _check_within_length(robot: System, reference: Reference, seconds: float) -> None:
@@ -149,6 +158,8 @@ class LoopLog:
         compiled: number of programs that were compiled during the loop; each may have delayed a period.
         initial_control: (c,) control before the first row, if the log begins at the start.
         settings: settings of the controller that were chosen or given, as plain numbers by name.
+        out_of_reach: largest distance (m) from the reference to the nearest tip at rest within the limits;
+            0 if it is below 0.2 % of the length, or the tip follows as closely; None: not known.
         estimated: estimated states, a trajectory that can be saved, drawn and viewed; None without an
             observer. Its robot has the parameters that the model had at first.
     """
@@ -169,6 +180,7 @@ class LoopLog:
     initial_control: Float[np.ndarray, " c"] | None = None
     settings: dict[str, int] = dataclasses.field(default_factory=dict)
     estimated: Trajectory | None = None
+    out_of_reach: float | None = None
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -253,6 +265,11 @@ class LoopLog:
             f"LoopLog: {len(self.time)} periods, tip RMSE {1e3 * self.tip_rmse():.2f} mm over the second "
             f"half, {self.fallbacks} fallbacks, {self.missed} missed deadlines, feedback "
             f"{1e3 * float(np.median(self.feedback)):.2f} ms (median)"
+            + (
+                f"; the reference is up to {1e3 * self.out_of_reach:.3g} mm out of reach"
+                if self.out_of_reach
+                else ""
+            )
         )
 
 
@@ -450,6 +467,7 @@ def run_loop(
         KnodeCosseratError: the plant failed, such as hardware with a fault. The error's attribute `log` is
             the log of the periods before, None if there are none. Interruptions (Ctrl-C) have it too.
     """
+    check_arguments(run_loop, locals())
     steps = round(seconds / controller.dt)
     if steps < 1:
         raise ValueError(f"seconds is {seconds:g}; allowed is at least one period, {controller.dt:g} s")
@@ -469,7 +487,25 @@ def run_loop(
         # measurements of a robot are not lost
         error.log = loop.log() if loop.time > 0.0 else None  # type: ignore[union-attr]
         raise
-    return loop.log()
+    return _with_reach(loop.log(), controller, reference, seconds)
+
+
+def _with_reach(log: LoopLog, controller: Controller, reference: Reference, seconds: float) -> LoopLog:
+    """Return the log with the distance of the reference out of reach, and warn of it."""
+    robot, limits = getattr(controller, "robot", None), getattr(controller, "limits", None)
+    if robot is None or limits is None or not _is_position(getattr(controller, "target", None)):
+        return log
+    least = OUT_OF_REACH * float(nominal_model(robot).length)
+    beyond = 0.0
+    if not log.tip_rmse() < least:
+        beyond, time = distance_out_of_reach(robot, limits, reference, seconds)
+        if beyond > least:
+            warnings.warn(
+                f"the {reference.name} is {1e3 * beyond:.3g} mm out of reach at t = {time:.3g} s: no "
+                "controls within the limits were found that bring the tip nearer at rest",
+                stacklevel=3,
+            )
+    return dataclasses.replace(log, out_of_reach=beyond if beyond > least else 0.0)
 
 
 def warm_up(controller: Controller, plant: Plant, reference: Reference, periods: int = 2) -> None:

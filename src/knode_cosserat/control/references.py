@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments, numbers_of
 from knode_cosserat.errors import KnodeCosseratError
 
 
@@ -54,7 +55,10 @@ class Reference:
 
 def constant(value: Sequence[float]) -> Reference:
     """Return a reference that does not change."""
-    one = np.asarray(value, dtype=float)
+    check_arguments(constant, locals())
+    one = numbers_of("value", value, "a list of numbers, such as the tip's position (m)")
+    if one.ndim != 1:
+        raise ReferenceFormatError(f"value has shape {one.shape}; allowed is (p,); see `steps` and `table`")
     return Reference(lambda t: np.tile(one, (len(t), 1)), len(one), f"constant {one.tolist()}")
 
 
@@ -74,6 +78,7 @@ def circle(
     Raises:
         ReferenceFormatError: a radius, period, centre or plane that is not allowed.
     """
+    check_arguments(circle, locals())
     return _closed_path("circle", lambda a: (np.cos(a), np.sin(a)), (radius, period, rise), (plane, centre))
 
 
@@ -81,6 +86,7 @@ def figure_eight(
     radius: float, period: float, centre: Sequence[float] | None = None, rise: float = 2.0, plane: str = "xy"
 ) -> Reference:
     """Return a figure of eight (Gerono's lemniscate) of half-width `radius` (m); see `circle`."""
+    check_arguments(figure_eight, locals())
     eight = "figure of eight"
     return _closed_path(
         eight, lambda a: (np.sin(a), np.sin(a) * np.cos(a)), (radius, period, rise), (plane, centre)
@@ -102,7 +108,7 @@ def _closed_path(
     middle = np.full(3, np.nan)
     middle[axes] = 0.0
     if centre is not None:
-        middle = np.asarray(centre, dtype=float)
+        middle = numbers_of("centre", centre, "three numbers (m)")
         if middle.shape != (3,) or np.any(np.isinf(middle)):
             raise ReferenceFormatError(f"centre is {centre}; allowed is three numbers (m), NaN if free")
 
@@ -124,8 +130,9 @@ def steps(points: Sequence[Sequence[float]], hold: float, announced: bool = Fals
 
     A predictive controller leaves a point before an `announced` step, for the mean error is then smaller.
     """
+    check_arguments(steps, locals())
     _require_positive(hold=hold)
-    table = np.asarray(points, dtype=float)
+    table = numbers_of("points", points, "(points, p) in m")
     if table.ndim != 2:
         raise ReferenceFormatError(f"points have shape {table.shape}; allowed is (points, p)")
 
@@ -142,7 +149,8 @@ def table(time: Sequence[float], values: Any) -> Reference:
     Raises:
         ReferenceFormatError: times that do not increase, or a wrong shape.
     """
-    t, rows = np.asarray(time, dtype=float), np.asarray(values, dtype=float)
+    check_arguments(table, locals())
+    t, rows = numbers_of("time", time, "(T,) in s"), numbers_of("values", values, "(T, numbers)")
     if t.ndim != 1 or rows.ndim != 2 or len(rows) != len(t) or not len(t):
         raise ReferenceFormatError(
             f"time has shape {t.shape} and values {rows.shape}; allowed is (T,) and (T, numbers)"

@@ -5,12 +5,13 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import UInt8
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.envs.dynamics import EpisodeState
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.policy import Policy
@@ -52,7 +53,9 @@ def picture(environment: Environment, state: EpisodeState) -> UInt8[np.ndarray, 
     return (255 * imread(data)[:, :, :3]).round().astype(np.uint8)
 
 
-def animate_episode(environment: Environment, policy: Policy, key: Any, path: str | Path) -> Path:
+def animate_episode(
+    environment: Environment, policy: Policy, key: jax.Array | np.ndarray, path: str | Path
+) -> Path:
     """Write a GIF or MP4 of a policy's episode in real time, and return its path.
 
     Args:
@@ -65,6 +68,7 @@ def animate_episode(environment: Environment, policy: Policy, key: Any, path: st
         ImportError: matplotlib is missing, the extra `viz`.
         ValueError: another name.
     """
+    check_arguments(animate_episode, locals())
     require_matplotlib()
     from PIL import Image
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.control import Command, Controller, Plant, Reference, controller_named, run_loop
 from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.control.planning import PlanController
@@ -108,7 +109,7 @@ class _EpisodePlant(Plant):
 
 
 def controller_scores(
-    environment: Environment, keys: Any, name: str = "predictive"
+    environment: Environment, keys: jax.Array | np.ndarray, name: str = "predictive"
 ) -> Float[np.ndarray, " n"]:
     """Return the mean reward of a controller in the episode of each key (n, 2).
 
@@ -116,6 +117,7 @@ def controller_scores(
     tip, and adapts the parameters that the task names. An episode that ends early counts zero for the rest of
     its time.
     """
+    check_arguments(controller_scores, locals())
     arrays, spec = environment.arrays, environment.spec
     middle = {key: 0.5 * (arrays.least[key] + arrays.greatest[key]) for key in spec.names}
     adapt = [key for key in spec.task.adapted if CONTROLLERS[name].has_observer and key in spec.names]
@@ -133,8 +135,11 @@ def controller_scores(
     return np.array(scores)
 
 
-def policy_scores(environment: Environment, policy: Policy, keys: Any) -> Float[np.ndarray, " n"]:
+def policy_scores(
+    environment: Environment, policy: Policy, keys: jax.Array | np.ndarray
+) -> Float[np.ndarray, " n"]:
     """Return the mean reward of a policy in the episode of each key (n, 2), as in `controller_scores`."""
+    check_arguments(policy_scores, locals())
     states, observations = environment.reset_many(jnp.asarray(keys))
     running, total = np.ones(len(keys), dtype=bool), np.zeros(len(keys))
     for _ in range(environment.steps):

@@ -20,6 +20,7 @@ from jaxtyping import Bool, Float
 from knode_cosserat.rods.parameters import ParameterError, owner_at, parameters_of, value_at
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
+from knode_cosserat.rotation import quaternion_of, quaternion_product
 
 #: change of a robot by the values of an effect's numbers; equal for all robots of the same parts
 Change = Callable[[Any, list[Any]], Any]
@@ -102,11 +103,12 @@ class Replace:
 
     Numbers of one parameter are its components ("vector"), its diagonal (one number or three), the
     coefficients of a residual, or the first entry of a matrix or list that is multiplied as a whole
-    ("multiple").
+    ("multiple"), or the rotation vector (rad, global frame) that turns a quaternion ("turn"): the size of
+    a quaternion has no effect.
     """
 
     parameters: tuple[str, ...]
-    kind: Literal["numbers", "vector", "diagonal", "coefficients", "multiple"] = "numbers"
+    kind: Literal["numbers", "vector", "diagonal", "coefficients", "multiple", "turn"] = "numbers"
 
     def __call__(self, robot: Any, values: list[Any]) -> Any:
         """Return the robot with these values."""
@@ -117,6 +119,8 @@ class Replace:
             numbers = jnp.diag(jnp.broadcast_to(numbers, (3,)))
         elif self.kind == "coefficients":
             numbers = numbers.reshape(np.shape(_stated(robot, name)))
+        elif self.kind == "turn":
+            numbers = quaternion_product(quaternion_of(numbers), _stated(robot, name))
         elif self.kind == "multiple":
             whole = _stated(robot, name)
             numbers = whole * (values[0] / whole.reshape(-1)[0])

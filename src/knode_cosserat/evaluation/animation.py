@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.evaluation.drawing import (
     View,
@@ -80,6 +81,7 @@ def animate(
         ValueError: the path's suffix or a number is not allowed, the trajectory is a batch or has one row,
             or planar and spatial trajectories are mixed.
     """
+    check_arguments(animate, locals())
     path = Path(path)
     motions = by_label(trajectories)
     seconds, delay = _timing(motions, path, fps, speed)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.evaluation import drawing
 from knode_cosserat.evaluation.drawing import equal_scales, new_figure, one_of, tips_of
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
@@ -39,6 +40,7 @@ def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], cou
         ImportError: matplotlib is not installed.
         ValueError: there is nothing to draw, or a batch is given.
     """
+    check_arguments(comparison, locals())
     require_some(predictions)
     with style():
         figure = new_figure(TWO_COLUMNS, 3.8)

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.evaluation.drawing import AXES, Tips, draw_tips, legend_above, line, new_figure, tips_of
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.metrics import dtw_distance, rms_distance
@@ -57,6 +58,7 @@ def prediction_against_measurement(prediction: Tips, recording: Measurements) ->
     Raises:
         ValueError: the numbers of rows differ, or a position is not finite.
     """
+    check_arguments(prediction_against_measurement, locals())
     predicted, measured = tips_of(prediction), tips_of(recording)
     if len(predicted) != len(measured):
         raise ValueError(

@@ -120,9 +120,9 @@ def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Effec
     return [effect] if stated else []
 
 
-def along_axes(label: str, unit: str, width: float, axes: str = "xyz") -> tuple[Number, ...]:
-    """Return one number for each axis, nominally zero."""
-    return tuple(Number(f"{label}.{axis}", unit, 0.0, width) for axis in axes)
+def along_axes(label: str, unit: str, width: float, axes: str = "xyz", **bounds: Any) -> tuple[Number, ...]:
+    """Return one number for each axis, nominally zero; `bounds` are further fields of each."""
+    return tuple(Number(f"{label}.{axis}", unit, 0.0, width, **bounds) for axis in axes)
 
 
 # plain parameters
@@ -133,7 +133,8 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
 
     "all" are all of its own that have a value and can be searched. Parameters of parts have names with dots,
     such as `loads.0.mass`. Positive numbers are searched by their logarithm. A matrix is one number, if it is
-    a multiple of the identity, or the three of its diagonal.
+    a multiple of the identity, or the three of its diagonal. A quaternion is the rotation vector (rad, global
+    frame) that turns its nominal value, such as `base_end.orientation turned.x`.
 
     Raises:
         ParameterError: a name that does not exist or is repeated, a parameter without a value, or a
@@ -185,6 +186,9 @@ def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Effect 
             )
         kind = "diagonal"
         value = diagonal[0] if np.all(diagonal == diagonal[0]) else diagonal
+    elif parameter.shape == "quaternion":
+        turn = along_axes(f"{name} turned", "rad", 1.0, low=-np.pi, high=np.pi, flat=True)
+        return Effect(name, parameter.meaning, turn, Replace((name,), "turn"))
     elif value.ndim == 1:
         kind = "vector"
     labels = [f"{name}[{k}]" for k in range(value.size)] if value.ndim else [name]

@@ -12,10 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.learning.ensemble import Prediction
 from knode_cosserat.metrics import dtw_distance, pose_mse, rotation_rmse
 from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
@@ -77,7 +79,7 @@ class Evaluation:
 
 
 def coverage(
-    members: Iterable[System], measured: Measurements, level: float = 0.9, *,
+    members: Iterable[System], measured: Recording | Measurements, level: float = 0.9, *,
     space: str | SpaceScheme = "lobatto4",
 ) -> float:  # fmt: skip
     """Return the fraction of the measured positions within the spread of several models.
@@ -87,7 +89,7 @@ def coverage(
 
     Args:
         members: at least two models, such as an `Ensemble`.
-        measured: its rows.
+        measured: a recording, or its rows.
         level: probability.
         space: the scheme along the rod.
 
@@ -95,6 +97,8 @@ def coverage(
         SimulationError: a member has no solution.
         ValueError: there are fewer than two members.
     """
+    check_arguments(coverage, locals())
+    measured = Measurements.of(measured)
     predicted = list[Any]()
     for robot in members:
         moved = predict(robot, measured, space=space, recovery=RECOVERY)
@@ -104,7 +108,7 @@ def coverage(
 
 
 def predict(
-    robot: System, measured: Measurements, *, space: str | SpaceScheme = "lobatto4",
+    robot: System, measured: Recording | Measurements, *, space: str | SpaceScheme = "lobatto4",
     recovery: float | None = None,
 ) -> Trajectory:  # fmt: skip
     """Return the motion of a robot under measured tensions, or motor angles, in the rows of the recording.
@@ -114,13 +118,15 @@ def predict(
 
     Args:
         robot: any robot or model.
-        measured: the recording's rows; the tensions are known in all of them.
+        measured: a recording (`Measurements.of`), or its rows; the tensions are known in all of them.
         space: the scheme along the rod.
         recovery: seconds that recovery from failed steps may take; None: the usual budget.
 
     Raises:
         SimulationError: an equilibrium or a step has no solution.
     """
+    check_arguments(predict, locals())
+    measured = Measurements.of(measured)
     initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
     if first is not None:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery)
@@ -133,7 +139,7 @@ def predict(
 
 
 def evaluate(
-    robot: System, measured: Measurements, *, every: int = 1, last: int | None = None,
+    robot: System, measured: Recording | Measurements, *, every: int = 1, last: int | None = None,
     space: str | SpaceScheme = "lobatto4", recovery: float | None = RECOVERY,
 ) -> Evaluation:  # fmt: skip
     """Predict a recording from the equilibrium under its initial tensions, and compare.
@@ -142,7 +148,8 @@ def evaluate(
 
     Args:
         robot: any robot or model.
-        measured: its rows; with continuous tensions the time steps are shorter (`identification.steps`).
+        measured: a recording, or its rows; with continuous tensions the time steps are shorter
+            (`identification.steps`).
         every: interval of compared rows: 1 for all, 2 for every second.
         last: largest number of compared rows.
         space: the scheme along the rod.
@@ -151,6 +158,8 @@ def evaluate(
     Returns:
         The `Evaluation` over the rows in which all bodies were seen; with `failed` if a step has no solution.
     """
+    check_arguments(evaluate, locals())
+    measured = Measurements.of(measured)
     try:
         moved = predict(robot, measured, space=space, recovery=recovery)
     except SimulationError as error:

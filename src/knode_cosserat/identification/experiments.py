@@ -28,8 +28,6 @@ from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
-#: time from row to row of recordings (s)
-DT = 0.0125
 #: a rotation counts as the displacement at this part of the length
 ARM = 0.2
 #: a trajectory starts unstressed if its row 0 is nearer to that shape than so many times to the equilibrium,
@@ -161,7 +159,7 @@ def listed_rows(data: Any) -> list[Any]:
         raise DataError(f"data is a {type(data).__name__}; allowed is a list of recordings or trajectories")
     if not data:
         raise DataError("there are no recordings and no trajectories")
-    rows = [it.sampled(DT, mean=True) if isinstance(it, Recording) else it for it in data]
+    rows = [Measurements.of(it) if isinstance(it, Recording) else it for it in data]
     for it in rows:
         if not isinstance(it, Measurements | Trajectory | Experiment):
             raise DataError(
@@ -224,7 +222,7 @@ def of_measurements(
         raise DataError(f"{name}: nothing was measured after the first row")
     control = measured.tension[:-1]
     held = np.asarray(control[0] if measured.initial_tension is None else measured.initial_tension)
-    swing = np.max(np.abs(control - held), axis=1)
+    swing = np.max(np.abs(control - held), axis=1, initial=0.0)  # a robot may have no controls
     moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
     scheme = time_scheme(measured.dt, measured.continuous)
     settings = dataclasses.replace(Settings.of(None, space, "paper", NewtonOptions()), time=scheme)

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import (
-    DT,
     experiments_of,
     measured_rows,
     names_of,
@@ -30,7 +30,7 @@ from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.passive import Passive, passive
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.learning.states import BEST, fit_states, require_allowed
-from knode_cosserat.recordings.measurements import Measurements
+from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.segments import DataError
@@ -84,39 +84,46 @@ def fit(
         FitError: data without anything to learn, or a config that needs full states.
         IdentificationError: the robot cannot be identified.
     """
-    listed: Any = data
-    several = isinstance(listed, Iterable) and not isinstance(listed, str | Trajectory)
-    listed = list(listed) if several else listed
-    if not several or all(isinstance(it, Trajectory) for it in listed):
-        return fit_states(knowledge, listed, config, held_out=held_out, progress=progress, **options)
-    if options:
-        raise FitError(f"{next(iter(options))} is for trajectories; from recordings there are no checkpoints")
-    if not isinstance(getattr(config, "residual", None), StructuredOptions | PassiveOptions):
-        raise FitError(
-            "this config needs full states, and recordings have none: estimate them first "
-            "(kc.estimate_states), or use FitConfig() or FitConfig.network_recordings()"
-        )
-    tell: Tell = (lambda line: print(line, file=sys.stderr, flush=True)) if progress else log.info
-    measured, use = _measured(listed)
-    for line in use:
-        tell(line)
-    poses = _Poses(measured, use, _measured(held_out)[0] if held_out else [], space)
-    if isinstance(config.residual, PassiveOptions):
-        return _with_network(knowledge, poses, config, tell)
-    if len(measured) == 1 and isinstance(config.seed, tuple):
-        raise FitError("there is one recording; an ensemble needs two at least, for its spread is held out")
-    identified = identify(knowledge, measured, space=space, progress=tell)
-    facts: dict[str, Any] = {"given": use, "identified": identified.to_dict(), "residual": False}
-    if len(measured) == 1:
-        facts["steps"] = [*identified.steps, "no residual: there is one recording, and none to hold out"]
-        return _named(identified.robot, config, {**facts, **poses.unseen_error(identified.robot)})
-    learned = with_residual(knowledge, measured, identified, space=space, progress=tell)
-    errors = {name: {"identified": errors.tip} for name, errors in learned.without.items()}
-    for name, residual_errors in learned.with_residual.items():
-        errors[name]["residual"] = residual_errors.tip
-    steps = [*identified.steps, *learned.steps]
-    facts |= {"steps": steps, "residual": learned.kept, "held_out_error": errors}
-    return _models(learned, poses, config, facts)
+    check_arguments(fit, locals())
+    # motions of trial models that diverge are refused by their results, not by floating-point warnings
+    with np.errstate(all="ignore"):
+        listed: Any = data
+        several = isinstance(listed, Iterable) and not isinstance(listed, str | Trajectory)
+        listed = list(listed) if several else listed
+        if not several or all(isinstance(it, Trajectory) for it in listed):
+            return fit_states(knowledge, listed, config, held_out=held_out, progress=progress, **options)
+        if options:
+            raise FitError(
+                f"{next(iter(options))} is for trajectories; from recordings there are no checkpoints"
+            )
+        if not isinstance(getattr(config, "residual", None), StructuredOptions | PassiveOptions):
+            raise FitError(
+                "this config needs full states, and recordings have none: estimate them first "
+                "(kc.estimate_states), or use FitConfig() or FitConfig.network_recordings()"
+            )
+        tell: Tell = (lambda line: print(line, file=sys.stderr, flush=True)) if progress else log.info
+        measured, use = _measured(listed)
+        for line in use:
+            tell(line)
+        poses = _Poses(measured, use, _measured(held_out)[0] if held_out else [], space)
+        if isinstance(config.residual, PassiveOptions):
+            return _with_network(knowledge, poses, config, tell)
+        if len(measured) == 1 and isinstance(config.seed, tuple):
+            raise FitError(
+                "there is one recording; an ensemble needs two at least, for its spread is held out"
+            )
+        identified = identify(knowledge, measured, space=space, progress=tell)
+        facts: dict[str, Any] = {"given": use, "identified": identified.to_dict(), "residual": False}
+        if len(measured) == 1:
+            facts["steps"] = [*identified.steps, "no residual: there is one recording, and none to hold out"]
+            return _named(identified.robot, config, {**facts, **poses.unseen_error(identified.robot)})
+        learned = with_residual(knowledge, measured, identified, space=space, progress=tell)
+        errors = {name: {"identified": errors.tip} for name, errors in learned.without.items()}
+        for name, residual_errors in learned.with_residual.items():
+            errors[name]["residual"] = residual_errors.tip
+        steps = [*identified.steps, *learned.steps]
+        facts |= {"steps": steps, "residual": learned.kept, "held_out_error": errors}
+        return _models(learned, poses, config, facts)
 
 
 class _Poses(NamedTuple):
@@ -149,6 +156,7 @@ def with_residual(
     Raises:
         DataError: there is one recording only, or they cannot be used.
     """
+    check_arguments(with_residual, locals())
     measured = measured_rows(recordings)
     if len(measured) < 2:
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")

@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import Several, States
@@ -117,6 +118,7 @@ def identify(
         DataError: data that are too short, do not fit the robot, or do not start at rest.
         ParameterError: an effect or a parameter that does not exist, or cannot be searched.
     """
+    check_arguments(identify, locals())
     system: Any = robot
     if not isinstance(system, System) or np.ndim(robot.length):
         raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")

@@ -10,6 +10,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
 from knode_cosserat.solvers.simulate import simulate
@@ -77,6 +78,7 @@ class Ensemble(Sequence[KNODE]):
 
 def load_ensemble(folder: str | Path, **options: Any) -> Ensemble:
     """Read the ensemble in a folder; `options` as for `load_model`. Raises `ModelFileError`."""
+    check_arguments(load_ensemble, locals())
     files = sorted(Path(folder).glob("member-*.model"))
     if not files:
         raise ModelFileError(f"{folder}: there is no ensemble here (files member-000.model, …)")

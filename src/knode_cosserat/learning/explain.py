@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.residual import (
     Expansion,
@@ -48,6 +49,7 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
     Raises:
         TypeError: not a model, or its residual is not structured.
     """
+    check_arguments(explain, locals())
     if not isinstance(model, KNODE):
         raise TypeError(f"model is a {type(model).__name__}; allowed is a KNODE, which `fit` gives")
     residual, knowledge = model.residual, strand_of(model.knowledge)

@@ -21,6 +21,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.limits import MORE, allowed
 from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
 from knode_cosserat.errors import KnodeCosseratError, first_line
@@ -192,6 +193,7 @@ def load_model(path: str | Path, *, knowledge: System | None = None, residuals: 
         ModelFileError: the file cannot be read, is of another kind or version, truncated or damaged, or its
             parts do not fit together.
     """
+    check_arguments(load_model, locals())
     return _model(container.read(path, KIND, _classes(residuals)), str(path), knowledge)
 
 

@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations, Output
 from knode_cosserat.recordings.config import (
     POSITION_UNITS,
+    PRESSURE_UNITS,
     SENSOR_UNITS,
     MotorSource,
     RecordingConfig,
@@ -231,7 +232,7 @@ def _cleaned_rows(
         )
     rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * source.factor)
     rows.drop_unusable(np.zeros(len(time), dtype=bool), ("tension is", "tensions are", "not finite"))
-    if not isinstance(source, TensionSource):
+    if not isinstance(source, TensionSource) or source.unit in PRESSURE_UNITS:
         return rows
     is_sample = kind == "measured" and not source.held
     wrong = implausible_tensions(rows.values)

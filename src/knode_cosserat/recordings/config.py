@@ -44,6 +44,8 @@ PLACE = "{}"
 #: conversion factors to SI units
 POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+#: units of the pressures of chambers, in place of tensions, with factors to Pa
+PRESSURE_UNITS = {"Pa": 1.0, "kPa": 1e3, "bar": 1e5}
 #: units of motors: angles to rad, or wound-up lengths to m
 MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
 #: kinds of sensors beside motion capture: their units with factors to SI units, the default first
@@ -373,8 +375,10 @@ class _NumbersSource(_Settings):
 
     @property
     def factor(self) -> float:
-        """Tension (N), angle (rad) or length (m) over the numbers of the messages."""
-        return {**TENSION_UNITS, **MOTOR_UNITS}[self.unit] * (1.0 if self.gain is None else self.gain)
+        """Tension (N), pressure (Pa), angle (rad) or length (m) over the numbers of the messages."""
+        return {**TENSION_UNITS, **PRESSURE_UNITS, **MOTOR_UNITS}[self.unit] * (
+            1.0 if self.gain is None else self.gain
+        )
 
     def __post_init__(self) -> None:
         names = None
@@ -406,7 +410,7 @@ class TensionSource(_NumbersSource):
         topic: topic of the tensions. With `{}` in it each tendon has its own topic: the place stands for the
             tendons' names, or without names for 1, 2, 3, …
         order: tendon of each number in a message; tendons count from 1. Empty: that of `names`.
-        unit: "N" or "gf" (grams-force).
+        unit: "N" or "gf" (grams-force); "Pa", "kPa" or "bar" for pressures of chambers, which are then in Pa.
         gain: factor from a message's numbers to this unit, such as the tension of a motor current of 1 A; a
             rough one will do where gains of load cells are identified. Negative if numbers pull below zero.
         held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
@@ -417,7 +421,9 @@ class TensionSource(_NumbersSource):
 
     topic: Annotated[str, _text]
     order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[Literal["N", "gf"], _choice(TENSION_UNITS)] = "N"
+    unit: Annotated[Literal["N", "gf", "Pa", "kPa", "bar"], _choice({**TENSION_UNITS, **PRESSURE_UNITS})] = (
+        "N"
+    )
     held: Annotated[bool | None, _flag] = None
     names: tuple[str, ...] | None = None
     gain: Annotated[float | None, _number(-1e6, 1e6)] = None

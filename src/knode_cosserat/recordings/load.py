@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.limits import MORE
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings import checks, frame, streams, table
-from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.config import PRESSURE_UNITS, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError
 from knode_cosserat.recordings.formats import format_of
 from knode_cosserat.recordings.formats.csv_table import read_csv
@@ -27,7 +28,7 @@ from knode_cosserat.recordings.table import Table
 EXAMPLE = "sine_1p0.csv"
 
 
-def load_recording(path: str | Path, config: RecordingConfig | None = None) -> Recording:
+def load_recording(path: str | Path, config: RecordingConfig | str | Path | None = None) -> Recording:
     """Read a recording: a bag, a table, or an export of motion capture.
 
     Bags are of ROS 1 (.bag, also .bag.active) or ROS 2 (.mcap, .db3, a folder). Tables are CSV (delimiters
@@ -40,14 +41,18 @@ def load_recording(path: str | Path, config: RecordingConfig | None = None) -> R
 
     Args:
         path: the file or folder.
-        config: meaning of its topics or columns; None: the paper's robot for bags, the titles and comments
-            of tables, and the names of the bodies in exports of motion capture (see `proposed_config`).
+        config: meaning of its topics or columns, or the YAML file that states it; None: the paper's robot for
+            bags, the titles and comments of tables, and the names of the bodies in exports of motion capture
+            (see `proposed_config`).
 
     Raises:
         RecordingError: the file cannot be read, or a topic or column is missing or unusable; one line.
         ImportError: a library for this kind of file is not installed.
     """
+    check_arguments(load_recording, locals())
     path = Path(path)
+    if isinstance(config, str | Path):
+        config = RecordingConfig.load(config)
     meaning = config or RecordingConfig.paper_robot()
     wanted = {STATIC, *(topic for source in _roles(meaning) for topic in topics_of(source))}
     content = format_of(path).read(path, wanted)
@@ -77,6 +82,7 @@ def proposed_config(path: str | Path) -> tuple[RecordingConfig, tuple[str, ...]]
     Raises:
         RecordingError: the file cannot be read, or nothing in it looks like the poses of a body.
     """
+    check_arguments(proposed_config, locals())
     path = Path(path)
     kind = format_of(path)
     content = kind.read(path, ())
@@ -196,8 +202,11 @@ def _assembled(
     bodies, base, rest, about_frame = frame.bodies_in_robot_frame(bodies, base, config)
     at_rest = frame.rest_positions(bodies, rest)
     findings += about_tensions + about_frame
-    both = (None if config.motors else tension, commanded)
-    findings += checks.implausible_sizes(bodies, both, at_rest, is_static=config.static)
+    both = [
+        pulls if isinstance(source, TensionSource) and source.unit not in PRESSURE_UNITS else None
+        for source, pulls in ((config.measured, tension), (config.command, commanded))
+    ]
+    findings += checks.implausible_sizes(bodies, (both[0], both[1]), at_rest, is_static=config.static)
     if config.simulated:
         findings.append(Finding("note", "", "the robot was itself a simulation, and not a physical one"))
     return Recording(

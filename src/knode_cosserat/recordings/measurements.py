@@ -10,7 +10,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from jaxtyping import Bool, Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
+from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import count_of, wrapped
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
@@ -18,9 +20,13 @@ from knode_cosserat.recordings.streams import Body, Sensor, Tensions
 from knode_cosserat.recordings.table import HELD
 from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from knode_cosserat.trajectory import Trajectory
+    from knode_cosserat.recordings.recording import Recording
+
+#: time from row to row of recordings that models learn from (s)
+DT = 0.0125
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -74,17 +80,28 @@ class Measurements:
         )
 
     @classmethod
-    def of(cls, trajectory: Trajectory, fractions: Sequence[float] = (1.0,)) -> Self:
-        """Return noise-free measurements of a trajectory of one robot.
+    def of(
+        cls, data: Trajectory | Recording | Measurements, fractions: Sequence[float] | None = None
+    ) -> Self:
+        """Return noise-free measurements of a trajectory, or the rows of a recording that models learn from.
 
         Args:
-            trajectory: a whole trajectory, or consecutive rows, of a system with positions.
-            fractions: places of the bodies, as fractions of the rod's length, from base to tip.
+            data: a whole trajectory, or consecutive rows, of one system with positions; or a recording: rows
+                of 0.0125 s with mean tensions. Measurements are returned as they are.
+            fractions: for a trajectory: places of the bodies, as fractions of the rod's length, from base to
+                tip; by default the tip. A recording has its own.
 
         Raises:
-            AttributeError: the system has no positions.
-            ValueError: the trajectory is a batch, or its rows are further apart than the time steps.
+            ValueError: the trajectory is a batch, its rows are further apart than the time steps, or its
+                system has no positions; or fractions of a recording.
         """
+        check_arguments(Measurements.of, locals())
+        if not isinstance(data, Trajectory):
+            if fractions is not None:
+                raise ValueError("fractions are of trajectories; the bodies of a recording have their own")
+            rows: Any = data if isinstance(data, Measurements) else data.sampled(DT, mean=True)
+            return rows
+        trajectory = data
         y, system = np.asarray(trajectory.y), trajectory.system
         if y.ndim == 4:
             raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
@@ -93,9 +110,14 @@ class Measurements:
             held, initial = (system.control_layout.get(control, "tension") for control in (held, initial))
         # the last row has no following tension; without a value it would not count as complete
         held[-1] = held[-2] if len(held) > 1 else initial
-        along = np.array(fractions, dtype=float)
+        along = real_array((1.0,) if fractions is None else fractions)
+        if along.ndim != 1 or not np.all((along >= 0.0) & (along <= 1.0)):
+            raise ValueError(f"fractions is {fractions!r}; allowed is a list of fractions from 0 to 1")
         places = places_at(along, system.nodes)
-        position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
+        try:
+            position = np.asarray(positions_at(system, y, places, np.asarray(trajectory.z)))
+        except AttributeError:
+            raise ValueError(f"a {type(system).__name__} has no positions; nothing is measured") from None
         try:
             quaternion = np.asarray(quaternions_at(system, y, places))
         except AttributeError:

@@ -53,6 +53,8 @@ ALLOWED = (
     "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …; tensions that are held "
     "from a row to the next are held_tension_1 [N], … instead"
 )
+#: largest number of unread columns that are listed
+MOST_LISTED = 8
 #: largest plausible time (s)
 _LATEST = 9e9
 
@@ -196,27 +198,38 @@ def tension_titles(topic: str, unit: str, count: int) -> list[str]:
 def streams_of(
     table: pd.DataFrame, config: RecordingConfig, path: str
 ) -> tuple[dict[str, Stream], list[Finding]]:
-    """Return the measured rows of each topic, and findings on rows that have no time.
+    """Return the measured rows of each topic, and findings on rows without times and on unread columns.
 
     Raises:
         RecordingError: a column is missing, or the times are not plausible seconds.
     """
     columns, titles = list(table.columns), _titles_by_topic(config, list(table.columns), path)
-    time = _times(table, config.table or TableSource(), config.columns or ColumnMap(), path)
     unused = config.command if config.tensions == "measured" else config.measured
     streams = {}
+    templates, mapped = config.table or TableSource(), config.columns or ColumnMap()
+    has_rate = templates.rate is not None and mapped.time is None
+    time = _times(table, templates, mapped, path)
+    read = set[int]() if has_rate else {_place(mapped.time or TIME, columns, path)}
     for topic, named in titles.items():
         # tensions that do not drive the robot may be missing
         if unused is not None and topic == unused.topic and not any(title in columns for title in named):
             continue
-        values = columns_of(table, [_place(title, columns, path) for title in named], path)
+        places = [_place(title, columns, path) for title in named]
+        read |= set(places)
+        values = columns_of(table, places, path)
         there = np.isfinite(time) & np.isfinite(values).any(axis=1)
         stamps = np.round(time[there] * 1e9).astype(np.int64)
         # received times may be negative, because a table may begin before zero
         streams[topic] = Stream(topic, stamps, stamps, values[there])
     rows = (np.flatnonzero(~np.isfinite(time)) + 1).tolist()
     what = f"{numbered(rows, 'row has no time', 'rows have no time')}; left out"
-    return streams, [Finding("warning", "", what)] if rows else []
+    findings = [Finding("warning", "", what)] if rows else []
+    others = [title for k, title in enumerate(columns) if k not in read]
+    if others:
+        listed = ", ".join(others[:MOST_LISTED]) + (", …" if len(others) > MOST_LISTED else "")
+        verb = "column is" if len(others) == 1 else "columns are"
+        findings.append(Finding("note", "", f"{len(others)} {verb} not read: {listed}"))
+    return streams, findings
 
 
 def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> dict[str, list[str]]:

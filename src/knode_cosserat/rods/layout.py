@@ -10,6 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat._numbers import real_array
+
 #: units of displacements and rotations
 MOVING = ("m", "rad")
 
@@ -79,6 +81,42 @@ class Layout:
         if isinstance(packed, jax.core.Tracer):  # brackets take ten times as long to trace
             return jax.lax.slice_in_dim(packed, where.start, where.stop, axis=-1)
         return packed[..., where]
+
+    @property
+    def labels(self) -> list[str]:
+        """Name of every number: its field's, numbered from 1 in a field of several."""
+        return [
+            field.name if field.size == 1 else f"{field.name}_{k + 1}"
+            for field in self.fields
+            for k in range(field.size)
+        ]
+
+    def numbers_of(self, values: Any) -> np.ndarray:
+        """Return packed vectors (…, size) from numbers, or from a table by the names of its columns.
+
+        A table (pandas, polars), or one row of it, has the columns `labels`, perhaps with units such as
+        `tension_1 [N]`, in any order. Columns that are numbered, not named, keep their order.
+
+        Raises:
+            ValueError: no numbers, or other columns; a phrase that follows "they".
+        """
+        columns = getattr(values, "columns", getattr(values, "index", None))
+        if columns is None or callable(columns) or not hasattr(values, "to_numpy"):
+            return real_array(values)
+        units = [field.unit for field in self.fields for _ in range(field.size)]
+        places = {label: k for k, label in enumerate(self.labels)}
+        places |= {
+            f"{label} [{unit}]": k for (label, k), unit in zip(list(places.items()), units, strict=True)
+        }
+        if list(columns) == list(range(len(columns))):
+            return real_array(values.to_numpy())
+        order = [places.get(str(name), -1) for name in columns]
+        if sorted(order) != list(range(self.size)):
+            raise ValueError(
+                f"their columns are {', '.join(map(str, columns))}; allowed are {', '.join(self.labels)}, "
+                "once each"
+            )
+        return real_array(values.to_numpy())[..., np.argsort(order)]
 
     def split(self, packed: Any) -> tuple[Any, ...]:
         """Return all fields of a packed vector, in order."""

@@ -24,6 +24,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
 from knode_cosserat.errors import KnodeCosseratError
@@ -40,6 +41,7 @@ from knode_cosserat.rods.parameters import (
     read_object,
     require_keys,
     schema_if_kind,
+    slots_of,
 )
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES, System, is_traced
@@ -80,10 +82,28 @@ def load_robot(name_or_path: str | Path) -> System:
     Raises:
         RobotFileError: there is no such robot, or its file is invalid.
     """
+    check_arguments(load_robot, locals())
     robot, source = parse_robot(_text_of(name_or_path), str(name_or_path)), str(name_or_path)
     if source not in _catalog_files():
         warn_of_paper_tendons(robot, source)
+        warn_of_places_in_metres(robot, source)
     return robot
+
+
+def warn_of_places_in_metres(robot: System, source: str) -> None:
+    """Warn of parts whose last end, a fraction, equals the robot's length in m: the tip is at 1."""
+    length = float(getattr(robot, "length", 1.0))
+    for name in slots_of(type(robot)):
+        value = getattr(robot, name)
+        parts = value if isinstance(value, tuple) else (value,)
+        ends = [it for part in parts if isinstance(it := getattr(part, "end", None), float)]
+        end = max(ends, default=1.0)
+        if end < 1.0 and np.isclose(end, length, rtol=1e-9, atol=0.0):
+            warnings.warn(
+                f"{source}: the last of {name} ends at {end:g} of the length, {1e3 * end * length:.4g} mm "
+                f"from the base; the robot is {length:g} m long, places are fractions. Did you mean end: 1?",
+                stacklevel=3,
+            )
 
 
 def warn_of_paper_tendons(robot: System, source: str) -> None:
@@ -112,6 +132,7 @@ def save_robot(robot: System, path: str | Path, *, description: str = "") -> Non
     Raises:
         RobotFileError: the robot's class has no kind, it is a batch, or the file cannot be written.
     """
+    check_arguments(save_robot, locals())
     text = format_robot(robot, description)
     try:
         with replacing(Path(path)) as temporary:

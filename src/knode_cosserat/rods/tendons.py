@@ -110,7 +110,8 @@ class Reels(Part):
             if value is not None and np.shape(value)[-1:] != (size,):
                 raise ParameterError(
                     f"Reels: {name} has {np.size(value)} numbers; allowed is {size}, one for each "
-                    f"{'motor' if name in ('radius', 'zero') else 'tendon'}"
+                    f"{'motor' if name in ('radius', 'zero') else 'tendon'}; "
+                    f"motors, {motors.astype(int).tolist()}, has one number for each tendon"
                 )
 
     @property

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat._numbers import real_array
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
@@ -41,7 +41,7 @@ from knode_cosserat.trajectory import Trajectory
 
 def equilibrium(
     robot: System | Sequence[System],
-    control: Any,
+    control: Any = None,
     *,
     space: str | SpaceScheme = "lobatto2",
     initial: Any = None,
@@ -54,7 +54,8 @@ def equilibrium(
 
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only.
-        control: (c,), or (B, c) for a batch; for a tendon robot the tensions in N.
+        control: (c,), or (B, c) for a batch; for a tendon robot the tensions in N; a table's columns are
+            matched by their names. None: for a robot without controls.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         initial: initial guess: a `Trajectory` (its last row), or measured positions (M, 3) in m, evenly
             spaced along the rod from its base to its tip. By default it is the unloaded robot, or a curve
@@ -78,7 +79,8 @@ def equilibrium(
         SimulationError: no equilibrium was found.
         ValueError: arguments of a wrong shape or name.
     """
-    control = _checked_control(control)
+    check_arguments(equilibrium, locals())
+    control = _checked_control(robot, control)
     if position_tolerance is not None:
         solve = functools.partial(
             equilibrium, control=control, space=space, initial=initial, newton=newton,
@@ -120,6 +122,7 @@ def equilibria(
         SimulationError: an equilibrium was not found.
         ValueError: arguments of a wrong shape or name.
     """
+    check_arguments(equilibria, locals())
     settings = Settings.of(None, space, "paper", newton)
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
@@ -159,12 +162,15 @@ def _traced(system, controls, y, task, pattern):  # type: ignore[no-untyped-def]
     return run(system, controls, y)
 
 
-def _checked_control(control: Any) -> Any:
+def _checked_control(robot: Any, control: Any) -> Any:
+    layout = stacked(robot)[0].control_layout
+    if control is None:
+        if layout.size:
+            raise ValueError(f"control is None; allowed is ({layout.size},): {', '.join(layout.labels)}")
+        control = np.zeros(0)
     if not isinstance(control, jax.Array):
         try:
-            if control is None:
-                raise TypeError("None")
-            control = real_array(control)
+            control = layout.numbers_of(control)
         except (TypeError, ValueError) as error:
             raise ValueError(f"control is not numbers ({error}); allowed is (c,), or (B, c)") from None
     if not control.ndim:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat._numbers import real_array
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
@@ -69,8 +69,8 @@ def simulate(
 
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only.
-        controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N. Control i is held
-            from row i to row i + 1; see `between`.
+        controls: (T, c), or (B, T, c) for a batch; for a tendon robot the tensions in N; a table's columns
+            are matched by their names. Control i is held from row i to row i + 1; see `between`.
         dt: time step (s).
         time: "sdirk2", or "bdf1", "bdf2", "bdf-alpha", "trapezoidal", or a scheme. Multistep schemes evaluate
             controls at the end of a step, so that one that is held acts half a step late: they are of order 2
@@ -109,6 +109,7 @@ def simulate(
         SimulationError: a step was not solved, and recovery failed.
         ValueError: arguments of a wrong shape or name.
     """
+    check_arguments(simulate, locals())
     initial, settled = split_initial(initial)
     if time in (None, "static"):
         raise ValueError(f"time is {time!r}; equilibria have no time steps: use solvers.equilibria")
@@ -116,10 +117,14 @@ def simulate(
     if on_failure not in ("raise", "return"):
         raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = checked_dt(dt)
-    warn_if_undamped(robot, dt)
-    warn_of_long_steps(robot, dt)
     if position_tolerance is not None and not errors:
         raise ValueError("position_tolerance needs estimates of errors: leave out errors=False")
+    system, batch = stacked(robot)
+    controls, batch = checked_controls(system, controls, batch)
+    if initial is not None:
+        check_initial(system, initial, batch)
+    warn_if_undamped(robot, dt)
+    warn_of_long_steps(robot, dt)
     if position_tolerance is not None:
         refine = functools.partial(
             simulate, controls=controls, dt=dt, time=time, space=space, start=start, between=between,
@@ -127,10 +132,6 @@ def simulate(
             recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
         )  # fmt: skip
         return refined_trajectory(refine, robot, initial, position_tolerance, settings.space.order)
-    system, batch = stacked(robot)
-    controls, batch = checked_controls(system, controls, batch)
-    if initial is not None:
-        check_initial(system, initial, batch)
     # ranges are not part of the equations: programs are compiled for systems without them
     bare, before = without_range(system), None
     if initial is not None:
@@ -246,7 +247,7 @@ def checked_controls(system: System, controls: Any, batch: int | None) -> tuple[
     allowed = f"allowed is (steps, {size}) or (batch, steps, {size}): {names}"
     if not is_traced(controls):
         try:
-            controls = real_array(controls)
+            controls = system.control_layout.numbers_of(controls)
         except (TypeError, ValueError) as error:
             raise ValueError(f"controls are not numbers ({error}); {allowed}") from None
     shape = np.shape(controls)

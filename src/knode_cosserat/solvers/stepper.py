@@ -8,7 +8,7 @@ from typing import Any, Literal
 import jax
 import numpy as np
 
-from knode_cosserat._numbers import real_array
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
@@ -64,6 +64,7 @@ class Stepper:
             SimulationError: the initial equilibrium was not found.
             ValueError: arguments of a wrong shape or name.
         """
+        check_arguments(Stepper.__init__, locals())
         given: Any = robot
         if not isinstance(given, System) or np.ndim(given.length):
             raise ValueError(f"robot is {type(robot).__name__}; a stepper is of one robot, not of a batch")
@@ -153,7 +154,7 @@ class Stepper:
 
     def _checked(self, control: Any) -> np.ndarray:
         try:
-            control = np.array(real_array(control))
+            control = np.array(self._layout.numbers_of(control))
         except (TypeError, ValueError) as error:
             raise ValueError(f"the control is not numbers ({error}); there are {self._names}") from None
         if control.shape != self._control_shape:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 
+from knode_cosserat._numbers import real_array
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -23,12 +25,13 @@ def checked_system(robot: Any) -> System:
     return robot
 
 
-def checked_vectors(name: str, given: Any, size: int, allowed: str, most: int = 2) -> np.ndarray:
-    """Return finite numbers (size,), or with `most` 2 also (B, size)."""
+def checked_vectors(name: str, given: Any, size: int | Layout, allowed: str, most: int = 2) -> np.ndarray:
+    """Return finite numbers (size,), or with `most` 2 also (B, size); tables by the names of a layout."""
     try:
-        numbers = np.asarray(given, dtype=float)
+        numbers = size.numbers_of(given) if isinstance(size, Layout) else real_array(given)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} is not numbers ({error}); allowed is {allowed}") from None
+    size = size.size if isinstance(size, Layout) else size
     # zero rows are refused; a row of size zero is the control of a robot without controls
     if not 1 <= numbers.ndim <= most or numbers.shape[-1] != size or 0 in numbers.shape[:-1]:
         raise ValueError(f"{name} has shape {numbers.shape}; allowed is {allowed}")
@@ -42,7 +45,10 @@ def checked_control(system: System, control: Any, name: str = "control") -> np.n
     """Return one control (c,)."""
     size = system.control_layout.size
     names = ", ".join(f"{field.name} ({field.unit})" for field in system.control_layout.fields)
-    numbers = checked_vectors(name, control, size, f"({size},): {names or 'there are no controls'}", most=1)
+    if control is None and not size:
+        control = np.zeros(0)
+    allowed = f"({size},): {names or 'there are no controls'}"
+    numbers = checked_vectors(name, control, system.control_layout, allowed, 1)
     return within_limits(system, numbers, name)
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import NewtonOptions
@@ -129,7 +130,7 @@ def _ellipsoid(J: np.ndarray) -> Ellipsoid:
 
 def configuration(
     robot: System,
-    control: Any,
+    control: Any = None,
     *,
     space: str | SpaceScheme = "lobatto2",
     newton: NewtonOptions = NewtonOptions(),
@@ -139,7 +140,7 @@ def configuration(
 
     Args:
         robot: one robot or model.
-        control: (c,); for a tendon robot the tensions in N. For a robot without controls `np.zeros(0)`.
+        control: (c,); for a tendon robot the tensions in N. None: for a robot without controls.
         space: "lobatto2", "lobatto4", "euler", or a scheme.
         newton: tolerances and limits of the solve.
         pose: function from the system and its last node's y to position (m) and quaternion (or None); the
@@ -149,6 +150,7 @@ def configuration(
         SimulationError: no equilibrium was found.
         ValueError: arguments of a wrong shape.
     """
+    check_arguments(configuration, locals())
     system = checked_system(robot)
     control = checked_control(system, control)
     found = first_solved(system, static_settings(space, newton), pose, control)

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.strands import of_rods
 from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalised
 from knode_cosserat.statics.stability import checked_equilibrium
@@ -67,6 +68,7 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
         ValueError: the row is no equilibrium, the motion has no linearisation (friction), it is too large for
             this method, or count is not positive.
     """
+    check_arguments(modes, locals())
     if count < 1:
         raise ValueError(f"count is {count}; allowed is 1 or more")
     system, y, _, control = checked_equilibrium(equilibrium, row)

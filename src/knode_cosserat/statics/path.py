@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.problem import StepProblem
@@ -102,6 +103,7 @@ def equilibrium_path(
         SimulationError: there is no equilibrium at the first control.
         ValueError: arguments of a wrong shape, or the same control twice.
     """
+    check_arguments(equilibrium_path, locals())
     system = checked_system(robot)
     first, last = checked_control(system, first), checked_control(system, last)
     if np.array_equal(first, last):

@@ -12,15 +12,17 @@ remaining pose error is of the size ε². Derivatives are exact, by the implicit
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments, numbers_of
 from knode_cosserat._reprs import packed_text, quantity, wrapped
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import rest_record
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -36,7 +38,6 @@ from knode_cosserat.statics.response import (
     Response,
     first_solved,
     node_values,
-    poses_of,
     respond,
     tip_pose,
 )
@@ -180,10 +181,10 @@ def inverse_kinematics(
     Raises:
         ValueError: arguments of a wrong shape, not finite, or low above high.
     """
+    check_arguments(inverse_kinematics, locals())
     system = checked_system(robot)
     settings = static_settings(space, dataclasses.replace(newton, tolerance=min(newton.tolerance, EXACT)))
     limits = checked_limits(system, low, high)
-    wanted, single = _checked_wanted(system, pose, position, quaternion, (weights, tolerance))
     begin = None
     if initial is not None:
         begin = checked_control(system, initial, "initial")
@@ -191,6 +192,7 @@ def inverse_kinematics(
             raise ValueError(f"initial is {begin.tolist()}; it must be between low and high")
     if not _whole(starts):
         raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
+    wanted, single = _checked_wanted(system, pose, position, quaternion, (weights, tolerance))
     search = _Search(system, settings, pose, *limits)
     free = np.where(search.free, search.span, 1.0)
     last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
@@ -311,7 +313,14 @@ def _checked_wanted(
     system: System, pose: Pose, position: Any, quaternion: Any, measured_by: Any
 ) -> tuple[list[_Wanted], bool]:
     """Return the wanted poses, and True if a single one was given."""
-    here, turned = poses_of(system, pose, rest_record(system)[-1:, : system.y_layout.size])
+    if position is None and quaternion is None:
+        raise ValueError("neither position nor quaternion is given; give one or both")
+    if position is not None:
+        position = numbers_of("position", position, "(3,) or (B, 3) in m")
+    if quaternion is not None:
+        quaternion = numbers_of("quaternion", quaternion, "(4,) or (B, 4), scalar first")
+    state = jax.ShapeDtypeStruct((system.y_layout.size,), float)
+    here, turned = jax.eval_shape(functools.partial(pose, system), state)
     given: dict[str, np.ndarray] = {}
     if position is not None:
         size = here.shape[-1]
@@ -322,8 +331,6 @@ def _checked_wanted(
         given["quaternion"] = checked_vectors("quaternion", quaternion, 4, "(4,) or (B, 4), scalar first")
         if np.any(np.linalg.norm(given["quaternion"], axis=-1) < 1e-9):
             raise ValueError("quaternion is zero; allowed is any other length")
-    if not given:
-        raise ValueError("neither position nor quaternion is given; give one or both")
     tolerance = float(checked_vectors("tolerance", np.atleast_1d(measured_by[1]), 1, "a number", most=1)[0])
     if tolerance <= 0.0:
         raise ValueError(f"tolerance is {tolerance:g}; allowed is above 0")

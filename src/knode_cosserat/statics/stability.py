@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.linalg import block_diag
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
@@ -138,6 +139,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
         ValueError: the row is no equilibrium; the system is not made of rods with positions and orientations;
             or it has further unknowns, and its motions are not resolved.
     """
+    check_arguments(stability, locals())
     system, y, z, control = checked_equilibrium(equilibrium, row)
     space = (equilibrium.settings or Settings()).space
     if not isinstance(space, Lobatto4):

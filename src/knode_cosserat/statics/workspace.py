@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._reprs import quantity, robot_text, wrapped
 from knode_cosserat.controls import titles
@@ -190,6 +191,7 @@ def workspace(
     Raises:
         ValueError: arguments of a wrong shape.
     """
+    check_arguments(workspace, locals())
     system = arguments.checked_system(robot)
     settings = arguments.static_settings(space, newton)
     if low is None and high is not None:
@@ -206,7 +208,7 @@ def workspace(
         samples = sample(*limits, int(number), seed)
     else:
         size = system.control_layout.size
-        samples = arguments.checked_vectors("controls", controls, size, f"(B, {size})")
+        samples = arguments.checked_vectors("controls", controls, system.control_layout, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
         arguments.within_limits(system, samples, "controls")

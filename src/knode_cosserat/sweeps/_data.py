@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import count_of, quantity, wrapped
 from knode_cosserat.errors import first_line
 from knode_cosserat.solvers.result import ResultCodes
@@ -195,6 +196,7 @@ def load_sweep(folder: str | Path) -> SweepData:
     Raises:
         SweepError: there is no sweep, or it has a version that this package does not read.
     """
+    check_arguments(load_sweep, locals())
     folder = Path(folder)
     manifest = read_manifest(folder)
     return SweepData(folder, manifest, shard_numbers(folder, manifest["shards"]))

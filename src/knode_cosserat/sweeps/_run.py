@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._processes import dask_client, end_with_parent
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.sweeps._data import SweepData, load_sweep
@@ -272,6 +273,7 @@ def run_sweep(
         SweepError: the sweep is not possible, the folder has another sweep or a shard of another version,
             nothing can be written, or a worker died.
     """
+    check_arguments(run_sweep, locals())
     if not isinstance(sweep, Sweep):
         raise SweepError(f"sweep is a {type(sweep).__name__}; allowed is a Sweep")
     require_pyarrow()

@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.control import Controller, LoopLog, Plant, constant
 from knode_cosserat.control.commands import Status
 from knode_cosserat.control.loop import Loop, Period, estimated, joined
@@ -430,6 +431,7 @@ def control_live(
         ImportError: `websockets` is not installed.
         ValueError: a controller that does not track the tip, or an impossible target or port.
     """
+    check_arguments(control_live, locals())
     require_websockets()
     checked_port(port)
     followed = FollowedTarget(controller, plant, title, target)

@@ -27,6 +27,7 @@ from typing import Any
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.result import SimulationError
@@ -360,6 +361,7 @@ def view_live(
             port.
         SimulationError: the robot's initial equilibrium was not found.
     """
+    check_arguments(view_live, locals())
     require_websockets()
     checked_port(port)
     if not isinstance(robot, System):

@@ -16,6 +16,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.viewer.scene import Given, Point, scene
 
@@ -48,6 +49,7 @@ def export_scene(
     Raises:
         ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible target.
     """
+    check_arguments(export_scene, locals())
     return write_page(document(scene(trajectories, title, target)), Path(path))
 
 
@@ -120,6 +122,7 @@ def view(
             port.
         OSError: the port is taken.
     """
+    check_arguments(view, locals())
     import http.server
 
     page = document(scene(trajectories, title, target)).encode("utf-8")

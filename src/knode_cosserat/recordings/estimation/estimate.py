@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import CubicSpline
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat.recordings.estimation import balance, curvature, kinematics
 from knode_cosserat.recordings.estimation.balance import KnownRows, packed_fields
 from knode_cosserat.recordings.estimation.curvature import CapturedPoses
@@ -74,6 +75,7 @@ def estimate_states(
         RecordingError: the recording is in parts (then use `estimate_parts`), does not fit the robot, or has
             too few bodies or no orientations; or the method or a time is not allowed.
     """
+    check_arguments(estimate_states, locals(), RecordingError)
     parts = _parts(recording, robot, method, (dt, start, end))
     if len(parts) > 1:
         times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in parts)
@@ -97,6 +99,7 @@ def estimate_parts(
     Raises:
         RecordingError: as in `estimate_states`, except that several parts are allowed.
     """
+    check_arguments(estimate_parts, locals(), RecordingError)
     parts = _parts(recording, robot, method, (dt, start, end))
     return [_estimated(part, robot, method) for part in parts]
 
