@@ -17,6 +17,7 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.history import unloaded_shape
+from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -34,6 +35,7 @@ from knode_cosserat.solvers.simulate import (
     refined_trajectory,
     stacked,
 )
+from knode_cosserat.solvers.small_motion import verdicts
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
@@ -139,15 +141,21 @@ def equilibria(
         if batch and rest.ndim == 2:
             rest = jnp.broadcast_to(rest, (batch, *rest.shape))
         rows = _traced(bare, controls, rest, task, Pattern.of(bare))
+        tested = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
     else:
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
             raise failure(rows, causes, None)
+        tested = verdicts(bare, settings, rows, np.asarray(controls))
+        rows.result[(tested > 0) & (rows.result != Result.OTHER_TURNS)] = Result.UNSTABLE
         warn_of_coarse_grids(system, settings, rows)
         warn_of_results(rows)
         warn_outside_rod_theory(system, rows)
     time = np.arange(float(task.steps))
-    return marked(Trajectory(system, settings, time, control=controls, **rows_of(system, rows)), None)
+    found = Trajectory(
+        system, settings, time, control=controls, **rows_of(system, rows), stability=tested
+    )  # fmt: skip
+    return marked(found, None)
 
 
 @functools.partial(jax.jit, static_argnames=("task", "pattern"))
