@@ -80,6 +80,7 @@ class Verdict(Code):
     UNTESTED_TURNING = -6
     UNTESTED_TRACED = -7
     UNTESTED_UNSOLVED = -8
+    UNTESTED_UNASKED = -9
 
     @property
     def message(self) -> str:
@@ -104,6 +105,7 @@ _VERDICTS = {
     Verdict.UNTESTED_TURNING: "loads turn in the robot's frame, so that it does not stay in equilibrium",
     Verdict.UNTESTED_TRACED: "it was solved inside JAX's transformations",
     Verdict.UNTESTED_UNSOLVED: "no equilibrium was found",
+    Verdict.UNTESTED_UNASKED: "with_stability is False",
 }
 
 

@@ -25,7 +25,7 @@ from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: vectors side by side; most vectors for each factor that is wanted
 BLOCK, MOST = 16, 16
@@ -43,6 +43,8 @@ GROWTH = 1e-6
 NEUTRAL = 1e-4
 #: segments in half a wave from which a grid resolves a bending mode
 SEGMENTS = 4.0
+#: rate above which no motion of the rod grows, as a multiple of that of the last resolved mode
+BEYOND = 10.0
 #: largest distance, in lengths, between the equilibria of the two grids
 SAME = 0.02
 #: time (s) at which an equilibrium must still be one, and largest residual then, in natural units; no common
@@ -50,17 +52,21 @@ SAME = 0.02
 LATER, BALANCED = 0.618, 1e-6
 
 
-def verdicts(system: System, settings: Settings, rows: StepRows, controls: np.ndarray) -> np.ndarray:
+def verdicts(system: System, settings: Settings, rows: StepRows, controls: np.ndarray | None) -> np.ndarray:
     """Return a `Verdict` for each equilibrium (…, T) of a robot or a batch, under controls (…, T, c).
 
-    The energy decides for rods under dead loads. Of other robots a single equilibrium is tested.
+    The energy decides for rods under dead loads. Of other robots a single equilibrium is tested. Without
+    controls no more is tested than `static_run` did.
     """
-    found = np.full(np.shape(rows.result), int(Verdict.UNTESTED_MANY))
+    untested = Verdict.UNTESTED_MANY if controls is not None else Verdict.UNTESTED_UNASKED
+    found = np.full(np.shape(rows.result), int(untested))
     found[rows.result < 0] = int(Verdict.UNTESTED_UNSOLVED)
     found[rows.result == Result.UNSTABLE] = int(Verdict.UNSTABLE)
+    if controls is None:
+        return found
     many, by_energy = np.ndim(system.length) > 0, is_tested(system)
     for at in zip(*np.nonzero(found == int(Verdict.UNTESTED_MANY)), strict=True):
-        if rows.result[at] == Result.COARSE:
+        if rows.result[at] == Result.COARSE and not isinstance(settings.space, Euler):
             found[at] = int(Verdict.UNTESTED_GRID)
         elif by_energy and not many:
             y = rows.records[at][:, : system.y_layout.size]
@@ -75,7 +81,7 @@ def verdicts(system: System, settings: Settings, rows: StepRows, controls: np.nd
 def verdict_by_motion(system: System, settings: Settings, row: StepRows, control: np.ndarray) -> Verdict:
     """Return the stability of one equilibrium by the growth of its small motions."""
     strand, y = strand_of(system), row.records[:, : system.y_layout.size]
-    if not {"p", "q"} <= set(strand.y_layout.names):
+    if not (strand.y_layout.ranges("p") and strand.y_layout.ranges("q")):
         return Verdict.UNTESTED_SYSTEM
     if has_friction(system, y[0], control):
         return Verdict.UNTESTED_FRICTION
@@ -87,7 +93,7 @@ def verdict_by_motion(system: System, settings: Settings, row: StepRows, control
     rate = fastest_growth(system, settings, row, control)
     if rate is None:
         return Verdict.UNTESTED_GRID
-    if rate == 0.0:
+    if rate == 0j:
         return Verdict.STABLE
     # a coarse grid may have motions that the rod has not
     finer = system.replace(nodes=2 * system.nodes - 1)
@@ -101,7 +107,7 @@ def verdict_by_motion(system: System, settings: Settings, row: StepRows, control
     fine = fastest_growth(finer, settings, StepRows(*(leaf[0] for leaf in rows)), control)
     if fine is None or not fine.real > abs(fine.real - rate.real):
         return Verdict.UNTESTED_GRID
-    return Verdict.UNSTABLE if fine.imag == 0.0 else Verdict.FLUTTER
+    return Verdict.UNSTABLE if abs(fine.imag) <= fine.real else Verdict.FLUTTER
 
 
 def fastest_growth(system: System, settings: Settings, row: StepRows, control: np.ndarray) -> complex | None:
@@ -113,14 +119,15 @@ def fastest_growth(system: System, settings: Settings, row: StepRows, control: n
     rates = RATE * (1.0 - 1.0 / factors[np.abs(factors) > STILL])
     sizes = np.maximum(np.abs(rates), 1.0)
     growing = (rates.real > GROWTH * sizes) & (np.abs(rates) > NEUTRAL)
-    resolved = np.abs(rates) <= (np.pi * (system.nodes - 1) / SEGMENTS) ** 2
+    limit = (np.pi * (system.nodes - 1) / SEGMENTS) ** 2
+    resolved, near = (np.abs(rates) <= most for most in (limit, BEYOND * limit))
     if not np.any(resolved):
         return None
     if np.any(growing & resolved):
         fastest = rates[growing & resolved]
-        found = complex(fastest[np.argmax(fastest.real)])
-        return complex(found.real, found.imag if abs(found.imag) > GROWTH * abs(found) else 0.0)
-    return None if np.any(growing) else 0j
+        return complex(fastest[np.argmax(fastest.real)])
+    # fast oscillations that grow are of the grid; buckling in short waves may be of the rod
+    return None if np.any(growing & near & (rates.real > np.abs(rates.imag))) else 0j
 
 
 def _eigenvalues(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray, size: int) -> np.ndarray:
