@@ -30,7 +30,7 @@ from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, 
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
-from knode_cosserat.solvers.result import Result, ResultCodes
+from knode_cosserat.solvers.result import Result, ResultCodes, Verdict, VerdictCodes
 from knode_cosserat.solvers.settings import Settings
 
 
@@ -67,6 +67,8 @@ class Trajectory:
     time_error: Any = dataclasses.field(default_factory=type(None))
     #: True in rows outside the training range of a learned or identified model; None if unknown
     extrapolated: Any = dataclasses.field(default_factory=type(None))
+    #: a `Verdict` for each row of equilibria: stable, unstable or not tested; None for motions
+    stability: Any = dataclasses.field(default_factory=type(None))
     #: True if intermediate rows were left out: the controls held there are not known
     thinned: bool = dataclasses.field(default_factory=bool, metadata=CONSTANT)
 
@@ -82,6 +84,7 @@ class Trajectory:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "result", ResultCodes.of(self.result))
+        object.__setattr__(self, "stability", VerdictCodes.of(self.stability))
 
     @classmethod
     def deferred(cls, fields: Callable[[], dict[str, Any]]) -> Self:
@@ -237,6 +240,17 @@ class Trajectory:
             f"in (controls, strains or strain rates), first at {first:g} s"
         )
 
+    @property
+    def verdict(self) -> str:
+        """Line on the stability of equilibria, with the reason if it was not tested; empty for motions."""
+        if self.stability is None:
+            return ""
+        codes, counts = np.unique(np.asarray(self.stability), return_counts=True)
+        said = [Verdict(int(code)).message for code in codes]
+        if len(said) == 1:
+            return said[0]
+        return "; ".join(f"{n} {words}" for n, words in zip(counts, said, strict=True))
+
     def __str__(self) -> str:
         """Return rows, times, results, tip, estimated error and extrapolation, in a few lines."""
         if is_traced(self) or not isinstance(self.result, np.ndarray | jax.Array):
@@ -250,6 +264,7 @@ class Trajectory:
         elif len(self.time):
             rows += f" from {float(self.time[0]):g} to {float(self.time[-1]):g} s"
         lines = [f"Trajectory of a {type(self.system).__name__}: {batch}{rows}: {results}"]
+        lines += [self.verdict] if self.verdict else []
         lines += self._tip_text()
         errors = [
             f"{where} {1e3 * np.nanmax(error):.2g} mm"
@@ -302,7 +317,7 @@ class Trajectory:
         if self.y.ndim == 4 and not isinstance(index, slice | int | np.integer):
             raise TypeError(f"index a batch by a slice or a robot's number, not by {index!r}")
         fields: tuple[str, ...] = ("y", "z", "control", "result", "residual", "iterations")
-        optional = ("position_error", "time_error", "extrapolated", "stages")
+        optional = ("position_error", "time_error", "extrapolated", "stability", "stages")
         fields += tuple(name for name in optional if getattr(self, name) is not None)
         picked: dict[str, Any] = {name: getattr(self, name)[index] for name in fields}
         time = self.time if self.y.ndim == 4 else self.time[index]
@@ -362,7 +377,9 @@ _ROWS = {
     "position_error": ("m", "estimated discretisation error of positions, the largest over the nodes"),
     "time_error": ("m", "estimated error of positions by the time steps, the largest over the nodes"),
     "extrapolated": ("1", "1 in rows outside the range that the model was trained in"),
+    "stability": ("1", "stability of an equilibrium; below zero: not tested"),
 }
+_CODES = {"result": Result, "stability": Verdict}
 _HINT = "give it, load_trajectory(path, system=…)"
 
 
@@ -395,9 +412,9 @@ def _encoded(trajectory: Trajectory) -> bytes:
         if getattr(trajectory, name) is not None:
             values = np.asarray(getattr(trajectory, name))
             label = _label(unit, meaning)
-            if name == "result":  # by the CF conventions
-                label["flag_values"] = np.array([int(code) for code in Result], values.dtype)
-                label["flag_meanings"] = " ".join(code.name.lower() for code in Result)
+            if name in _CODES:  # by the CF conventions
+                label["flag_values"] = np.array([int(code) for code in _CODES[name]], values.dtype)
+                label["flag_meanings"] = " ".join(code.name.lower() for code in _CODES[name])
             values = values.astype(np.int8) if values.dtype.kind == "b" else values
             variables[name] = Variable(values, rows, label)
     facts: dict[str, Any] = {
@@ -541,6 +558,10 @@ def _require_possible(time: np.ndarray, numbers: Mapping[str, np.ndarray], y: np
         (unknown.size, f"it has the result code {', '.join(map(str, unknown[:1]))}"),
         (not np.all(np.isfinite(y[solved])), "a solved row has a state that is not finite"),
         (not np.all(np.isfinite(residual[solved])), "a solved row has a residual that is not finite"),
+        (
+            not set(numbers.get("stability", np.zeros(0)).ravel().tolist()) <= set(map(int, Verdict)),
+            "it has an unknown code of stability",
+        ),
         (np.any(numbers["iterations"] < 0), "a number of iterations is negative"),
     ):
         if wrong:

@@ -215,6 +215,7 @@ def test_the_catalog_s_robot_reads_back_equal(tmp_path):
         ({"tubes": ()}, "tubes is []; allowed is one or more, the innermost first"),
         ({"tubes": (tube(1, 0.0), tube(0, 0.0))}, "allowed are tubes in one another, the innermost first"),
         ({"tubes": (tube(0, 0.0, end=0.5),)}, "no tube ends at the tip"),
+        ({"loads": (PointWrench(force=(1.0, 0.0, 0.0), at=0.5),)}, "load0 within the rod; allowed on tubes"),
     ],
 )
 def test_tubes_that_do_not_fit_stop_with_one_line(changes, message):
@@ -234,3 +235,74 @@ def test_an_insertion_past_its_end_stops_with_one_line():
     with pytest.raises(ValueError, match=r"insertion_2 is 0.2 m .*; allowed is below 0.1") as error:
         kc.equilibrium(three(), [0.0, 0.0, 0.0, 0.2, 0.0, 0.0])
     assert "\n" not in str(error.value)
+
+
+def straight(ends, moment, drawn=0.0, **more):
+    """Straight tubes under a torque, the innermost drawn back: torsion and angles at the plate."""
+    tubes = tuple(tube(k, 0.0, end=end, transmission=BEHIND) for k, end in enumerate(ends))
+    loads = more.pop("loads", (PointWrench(moment=(0.0, 0.0, moment)),))
+    control = [0.0, -drawn, *[0.0] * (2 * len(ends) - 2)]
+    found = rest(pair(tubes=tubes, loads=loads, nodes=4 * 2 * len(ends) + 1, **more), control)
+    torsion = found.part("torsion")[0] if len(ends) > 1 else None
+    return torsion, found.part("angle")[0]
+
+
+@pytest.mark.parametrize(
+    ("ends", "drawn", "carries"),
+    [
+        ((1.0, 1.0), 0.0, 0),  # by convention the innermost of those that reach the tip
+        ((1.0, 1.0), 0.1, 1),
+        ((0.5, 1.0), 0.0, 1),
+        ((1.0, 0.5), 0.05, 0),
+        ((1.0, 0.4, 1.0), 0.1, 2),
+        ((0.3, 1.0, 0.7), 0.0, 1),
+    ],
+)
+def test_a_torque_at_the_tip_is_carried_by_the_innermost_tube_there(ends, drawn, carries):
+    M = 1e-3
+    torsion, angle = straight(ends, M, drawn)
+    expected = np.zeros(len(ends))
+    behind = BEHIND + (drawn if carries == 0 else 0.0)
+    expected[carries] = behind * M / GJ[carries]
+    np.testing.assert_allclose(angle[0], expected, atol=1e-9)
+    own = np.where(np.arange(1, len(ends)) == carries, M, 0.0)
+    np.testing.assert_allclose(torsion, np.tile(own, (len(torsion), 1)), atol=1e-12)
+    long = ends[carries] * L - (drawn if carries == 0 else 0.0)
+    np.testing.assert_allclose(
+        angle[-1, carries] - angle[0, carries], long * M / GJ[carries], rtol=1e-7, atol=1e-9
+    )
+
+
+def test_a_torque_along_the_rod_is_carried_by_the_innermost_tube_at_each_place():
+    m, end = 5e-3, 0.4
+    load = kc.robots.loads.DistributedWrench(moment=(0.0, 0.0, m))
+    torsion, angle = straight((end, 1.0), 0.0, loads=(load,))
+    beyond = m * (1.0 - end) * L
+    np.testing.assert_allclose(torsion[0], beyond, rtol=1e-6)
+    np.testing.assert_allclose(
+        angle[0], BEHIND * np.array([m * end * L, beyond]) / np.array(GJ[:2]), rtol=1e-6
+    )
+
+
+def test_a_soft_inner_tube_that_ends_early_changes_nothing_under_a_torque():
+    load = (PointWrench(moment=(0.0, 0.0, 2e-3)),)
+    outer, soft = tube(1, 5.0, transmission=BEHIND), tube(0, 0.0, end=0.02, youngs_modulus=1e4)
+    found = [
+        rest(pair(tubes=tubes, loads=load, nodes=33), [0.0] * (2 * len(tubes))).tip_position[0]
+        for tubes in ((outer,), (soft, outer))
+    ]
+    np.testing.assert_allclose(found[1], found[0], atol=1e-6 * L)
+    # out of plane by the torque
+    assert np.min(np.abs(found[0])) > 1e-3 * L
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_the_default_grid_has_four_segments_for_each_interval(count):
+    tubes = tuple(tube(k, 5.0, curved=0.05, end=1.0 - 0.2 * k) for k in range(count))
+    robot = ConcentricTubeRobot(length=L, tubes=tubes, bending_damping=1e-5)
+    assert robot.nodes == 8 * count + 1
+    assert ConcentricTubeRobot(length=L, tubes=tubes, bending_damping=1e-5, nodes=9).nodes == 9
+    control = [0.3 * k for k in range(2 * count)]
+    control[1::2] = [0.0] * count
+    coarse, fine = (rest(each, control) for each in (robot, robot.replace(nodes=16 * count + 1)))
+    np.testing.assert_allclose(coarse.tip_position, fine.tip_position, atol=1e-4 * L)

@@ -24,6 +24,7 @@ from knode_cosserat.cli.output import best_so_far, vector_text, write_output
 from knode_cosserat.cli.program import app, examples
 from knode_cosserat.cli.robots import Held
 from knode_cosserat.cli.summaries import stability_summary
+from knode_cosserat.errors import first_line
 from knode_cosserat.rods.parameters import in_other_unit
 
 if TYPE_CHECKING:
@@ -117,8 +118,8 @@ def reach(
     try:
         decided = kc.statics.stability(found.equilibrium)
         stability, warnings = stability_summary(decided.kind, decided.reason)
-    except ValueError:
-        stability, warnings = stability_summary(None)
+    except ValueError as error:
+        stability, warnings = stability_summary("undecided", first_line(error))
     facts: dict[str, Any] = {
         "robot": model.robot,
         "result": found.result.name.lower(),

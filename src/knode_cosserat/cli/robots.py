@@ -209,7 +209,7 @@ def equilibrium(
     system = model.load()
     with coarse_grid_in_output():
         rest = kc.equilibrium(system, held.of(system), space=space)
-        stability, warnings = _stability(rest, space)
+    stability, verdict = summaries.verdict_summary(rest)
     if out:
         rest.save(out)
     facts = {"robot": model.robot, **summaries.equilibrium_summary(rest), **stability}
@@ -222,7 +222,7 @@ def equilibrium(
     if "base_force" in facts:
         lines.append(f"internal force at the base: {vector_text(facts['base_force'])} N")
         lines.append(f"internal moment at the base: {vector_text(facts['base_moment'])} N m")
-    lines += warnings
+    lines += verdict
     if rest.result[0] == kc.Result.OTHER_TURNS:
         lines.append(f"OTHER TURNS: {facts['result']}")
     if rest.extrapolation:
@@ -292,23 +292,6 @@ def schema(
     import knode_cosserat as kc
 
     typer.echo(json.dumps(kc.robots.robot_schema(), indent=None if as_json else 2, ensure_ascii=False))
-
-
-def _stability(rest: Any, space: str) -> tuple[dict[str, Any], list[str]]:
-    """Return facts and lines on the stability of an equilibrium, by `kc.statics.stability` or compliance."""
-    import knode_cosserat as kc
-
-    if rest.result[0] == kc.Result.UNSTABLE:
-        return summaries.stability_summary("divergence")
-    try:
-        decided = kc.statics.stability(rest)
-        return summaries.stability_summary(decided.kind, decided.reason)
-    except ValueError:
-        # with reels, or without internal force and moment
-        if not {"n", "m"} <= set(kc.robots.Ends.of(rest.system).layout.names):
-            return summaries.stability_summary(None)
-        unstable = bool(kc.statics.configuration(rest.system, rest.control[0], space=space).unstable)
-        return summaries.stability_summary("divergence" if unstable else "stable")
 
 
 def _control_words(control: str, names: list[str]) -> list[str]:

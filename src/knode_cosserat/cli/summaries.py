@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.result import Result, Verdict
 
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
@@ -84,15 +84,24 @@ def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
     return facts
 
 
-def stability_summary(kind: str | None, reason: str = "") -> tuple[dict[str, Any], list[str]]:
-    """Return facts and lines on a kind of `kc.statics.Stability`; None: no decision is possible."""
+def stability_summary(kind: str, reason: str = "") -> tuple[dict[str, Any], list[str]]:
+    """Return facts and a line on a kind of `kc.statics.Stability`, "undecided" with its reason."""
     lines = {
-        "divergence": ["UNSTABLE: a small disturbance moves the robot away from this shape"],
-        "flutter": ["UNSTABLE by flutter: a small disturbance grows to oscillations about this shape"],
-        "undecided": [f"stability is undecided: {reason}"],
+        "stable": Verdict.STABLE.message,
+        "neutral": "stable, with directions in which it moves at no cost",
+        "divergence": Verdict.UNSTABLE.message,
+        "flutter": Verdict.FLUTTER.message,
+        "undecided": f"stability not tested: {reason}",
     }
-    unstable = None if kind in (None, "undecided") else kind != "stable"
-    return {"unstable": unstable, "stability": kind}, lines.get(kind or "", [])
+    unstable = None if kind == "undecided" else kind in ("divergence", "flutter")
+    return {"unstable": unstable, "stability": kind}, [lines[kind]]
+
+
+def verdict_summary(rest: Trajectory) -> tuple[dict[str, Any], list[str]]:
+    """Return facts and a line on the stability of an equilibrium."""
+    verdict = Verdict(int(rest.stability[0]))
+    kinds = {Verdict.STABLE: "stable", Verdict.UNSTABLE: "divergence", Verdict.FLUTTER: "flutter"}
+    return stability_summary(kinds.get(verdict, "undecided"), verdict.reason)
 
 
 def parameters(system: System) -> dict[str, dict[str, Any]]:

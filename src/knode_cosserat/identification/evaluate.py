@@ -129,9 +129,16 @@ def predict(
     measured = Measurements.of(measured)
     initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
     if first is not None:
-        initial = equilibrium(robot, first, space=space, recovery_budget=recovery)
+        initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     if measured.static:
-        return equilibria(robot, measured.tension, space=space, initial=initial, recovery_budget=recovery)
+        return equilibria(
+            robot,
+            measured.tension,
+            space=space,
+            initial=initial,
+            recovery_budget=recovery,
+            with_stability=False,
+        )
     return simulated_rows(
         robot, measured.tension[:-1], measured.dt, initial, measured.initial_tension, measured.continuous,
         space, recovery,

@@ -105,9 +105,11 @@ def moved(
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
-        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY)
+        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY, with_stability=False)
         if like.static:
             tension = np.concatenate([initial[None], undelayed(robot, tension, dt, initial)])
-            rows = equilibria(robot, tension, initial=still, space=space, recovery_budget=RECOVERY)
+            rows = equilibria(
+                robot, tension, initial=still, space=space, recovery_budget=RECOVERY, with_stability=False
+            )
             return still, dataclasses.replace(rows, time=dt * rows.time)
         return still, simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)

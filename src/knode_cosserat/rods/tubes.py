@@ -7,8 +7,10 @@ the angle θᵢ and the curvature κᵢ at rest, in the direction of θᵢ. With
 
     Rᵀm = Σ EIᵢ (u - κᵢ) + τᵢ d₃,      θᵢ_s = τᵢ/GJᵢ,      τᵢ_s = EIᵢ d₃·(u × κᵢ) + torque of friction
 
-over the tubes that are present. τ₁ follows from Rᵀm. Each τᵢ is zero where its tube ends. Behind the plate
-the tubes are straight over the length dᵢ, so that θᵢ = αᵢ + dᵢ τᵢ/GJᵢ at the plate, with the rotation αᵢ.
+over the tubes that are present. τ₁ follows from Rᵀm. A torque on the robot about its axis acts on the
+innermost tube that is present. Each τᵢ is zero where its tube ends, but for such a torque at the tip. Behind
+the plate the tubes are straight over the length dᵢ, so that θᵢ = αᵢ + dᵢ τᵢ/GJᵢ at the plate, with the
+rotation αᵢ.
 Neighbours resist relative rotation by a viscous torque: a snap is then a fast motion.
 
 Insertion. A tube ends, and may begin to be curved, at lengths βᵢ and βᵢ - cᵢ that the controls move. In
@@ -22,6 +24,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, ClassVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -41,7 +44,10 @@ from knode_cosserat.rods.section import (
     round_section,
     shear_modulus,
 )
-from knode_cosserat.rotation import dot, rotation_matrix
+from knode_cosserat.rotation import cross, dot, rotation_matrix
+
+#: default number of segments of each interval: of order 4, their error is below 1e-4 of the length at rest
+SEGMENTS = 4
 
 
 class Tube(Part):
@@ -190,20 +196,32 @@ class _Tubes(CrossSection):
         return (("torsion", n, "N m", "torsion at the ends of the tubes from the second on"),) if n else ()
 
     def tip_rows(self, point: RodPoint) -> Any:
-        """Return the torsion at the tubes' ends: it is constant beyond them."""
-        return -point.get("torsion") if len(self.tubes) > 1 else None
+        """Return the torsion at the tubes' ends, constant beyond them, less the torque at the tip."""
+        if len(self.tubes) == 1:
+            return None
+        innermost = self.innermost(self.present(point.rod, point.s, point.input)[0])
+        return innermost[1:] * self.axial_moment(point) - point.get("torsion")
 
     def scales(self, rod: Any, sizes: Fields) -> Fields:
         """Return the rod's moment for a torsion."""
         return {"torsion": sizes["m"]} if len(self.tubes) > 1 else {}
 
+    def axial_moment(self, point: RodPoint) -> Float[Any, ""]:
+        """Return the third component of Rᵀm (N·m): the sum of all τᵢ."""
+        return dot(rotation_matrix(point.get("h")).T, point.get("m"))[2]
+
+    def innermost(self, presence: Float[Any, " n"]) -> Float[Any, " n"]:
+        """Return 1 for the innermost tube that is present, and 0 for the others."""
+        absent = jnp.cumprod(1.0 - presence)
+        return presence * jnp.concatenate([jnp.ones(1), absent[:-1]])
+
     def torsions(self, point: RodPoint) -> Float[Any, " n"]:
         """Return τᵢ (N·m): the first tube has what the others leave of Rᵀm."""
-        total = dot(rotation_matrix(point.get("h")).T, point.get("m"))[2:]
+        total = self.axial_moment(point)
         if len(self.tubes) == 1:
-            return total
+            return total[None]
         others = point.get("torsion")
-        return jnp.concatenate([total - jnp.sum(others), others])
+        return jnp.concatenate([total[None] - jnp.sum(others), others])
 
     def base_y(self, point: RodPoint) -> Fields:
         """Return the angles at the plate."""
@@ -261,6 +279,8 @@ class ConcentricTubeRobot(SlenderRod):
     bending_stiffness: ClassVar[Any] = None  # type: ignore[misc]
     sections: ClassVar[Any] = ()  # type: ignore[misc]
 
+    #: by default four segments for each interval between the places where tubes begin to be curved, or end
+    nodes: int = eqx.field(static=True, default=None, kw_only=True)
     tubes: tuple[Tube, ...] = slot("tubes, the innermost first", Tube, many=True, default=())
     tube_friction: Any = parameter(
         "N s", "viscous torque between neighbouring tubes, by length and relative rate of rotation", low=0.0,
@@ -270,8 +290,20 @@ class ConcentricTubeRobot(SlenderRod):
     def __check_init__(self) -> None:
         if not self.tubes:
             raise ParameterError("tubes is []; allowed is one or more, the innermost first")
+        if self.nodes is None:
+            intervals = len(self.cross_section.cuts) + 1
+            object.__setattr__(self, "nodes", SEGMENTS * intervals + 1)
         if max(tube.end for tube in self.tubes) < 1.0:
             raise ParameterError("no tube ends at the tip; allowed is an end of 1 for the longest")
+        moved = [
+            name for name, part in self.parts.items()
+            if not isinstance(part, _Tubes) and any(cut < 1.0 for cut in part.cuts)
+        ]  # fmt: skip
+        if moved:
+            raise ParameterError(
+                f"{', '.join(moved)} within the rod; allowed on tubes, which move with their insertion, "
+                "are parts at the tip or all along"
+            )
         for k, (inner, outer) in enumerate(zip(self.tubes, self.tubes[1:], strict=False), 1):
             radius, hole = as_number(inner.radius), as_number(outer.inner_radius)
             if radius is not None and hole is not None and radius > hole:
@@ -285,9 +317,28 @@ class ConcentricTubeRobot(SlenderRod):
         lambda robot: _Tubes(robot.tubes, robot.tube_friction, robot.length)
     )
 
+    def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
+        """Return y_s; torque about the axis acts on the innermost tube that is present."""
+        y_s, layout = super().balance(s, t, y, y_t, z, z_t, control), self.y_layout
+        if len(self.tubes) == 1:
+            return y_s
+        tubes, input = self._tubes_of(control)
+        R, u = rotation_matrix(layout.get(y, "h")), self.z_layout.get(z, "u")
+        rate = tubes.arclength(self, s, input)[1]
+        carried = dot(R.T, layout.get(y_s, "m")) - rate * cross(u, dot(R.T, layout.get(y, "m")))
+        torsion = layout.get(y_s, "torsion")
+        # the first tube's torque follows from Rᵀm; where it is absent, that of the states is balanced
+        innermost = tubes.innermost(tubes.present(self, s, input)[0])
+        changed = torsion + innermost[1:] * (carried[2] - jnp.sum(torsion))
+        where = layout.slice("torsion")
+        return jnp.concatenate([y_s[: where.start], changed, y_s[where.stop :]])
+
+    def _tubes_of(self, control: Any) -> tuple[_Tubes, Any]:
+        return next((part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes))
+
     def material(self, s: Any, control: Any) -> Material:
         """Return the sum of the tubes that are present."""
-        tubes, input = next((part, input) for part, input in self.inputs(control) if isinstance(part, _Tubes))
+        tubes, input = self._tubes_of(control)
         section = tubes.section(self, s, tubes.present(self, s, input)[0])
         return Material(
             section.Kse, self.shear_damping, section.Kbt, self.bending_damping, self.u_star,

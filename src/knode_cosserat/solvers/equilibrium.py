@@ -17,6 +17,7 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.history import unloaded_shape
+from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -34,6 +35,7 @@ from knode_cosserat.solvers.simulate import (
     refined_trajectory,
     stacked,
 )
+from knode_cosserat.solvers.small_motion import verdicts
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
@@ -48,8 +50,8 @@ def equilibrium(
     newton: NewtonOptions = NewtonOptions(),
     position_tolerance: float | None = None,
     recovery_budget: float | None = None,
-    on_failure: Literal["raise", "return"] = "raise",
-) -> Trajectory:
+    on_failure: Literal["raise", "return"] = "raise", with_stability: bool = True,
+) -> Trajectory:  # fmt: skip
     """Return the static equilibrium under a constant control.
 
     Args:
@@ -65,15 +67,17 @@ def equilibrium(
             it; by default it is the robot's.
         recovery_budget: seconds that recovery may take; see `simulate`.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with its row marked invalid.
+        with_stability: test the stability. It takes 10 to 100 ms, and once a second for new code.
 
     Returns:
         A `Trajectory` of one row, at time 0 and without a solver state; it can be the `initial` of a
         simulation. Driven ends are turned in parts of at most 1 rad from zero, or from the control of
         `initial`, and keep their turns; if not, the result is OTHER_TURNS. If direct iteration fails, the
         load is applied in parts, or a damped motion is simulated until the robot rests. There may be several
-        equilibria. Without a guess, a rod under dead loads is tested for stability. An unstable shape of a
-        compressed rod is replaced by a stable one; if there is none near it, and for all other rods, the
-        result is UNSTABLE. For robots that are not tested, see `kc.statics.stability`.
+        equilibria. `stability` of the trajectory is the verdict, or the reason why it was not tested: rods
+        under dead loads by their energy, one equilibrium of another robot by the growth of its small
+        motions, of batches only the former. An unstable shape of a compressed rod is replaced by a stable one
+        if no guess was given; if there is none near it, and for all other robots, the result is UNSTABLE.
 
     Raises:
         SimulationError: no equilibrium was found.
@@ -84,13 +88,13 @@ def equilibrium(
     if position_tolerance is not None:
         solve = functools.partial(
             equilibrium, control=control, space=space, initial=initial, newton=newton,
-            recovery_budget=recovery_budget, on_failure=on_failure,
+            recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
         )  # fmt: skip
         order = Settings.of(None, space, "paper", newton).space.order
         return refined_trajectory(solve, robot, initial, position_tolerance, order)
     return equilibria(
         robot, control[..., None, :], space=space, initial=initial, newton=newton,
-        recovery_budget=recovery_budget, on_failure=on_failure,
+        recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
     )  # fmt: skip
 
 
@@ -102,8 +106,8 @@ def equilibria(
     initial: Any = None,
     newton: NewtonOptions = NewtonOptions(),
     recovery_budget: float | None = None,
-    on_failure: Literal["raise", "return"] = "raise",
-) -> Trajectory:
+    on_failure: Literal["raise", "return"] = "raise", with_stability: bool = True,
+) -> Trajectory:  # fmt: skip
     """Return the static equilibria under a list of controls, each found from the one before.
 
     Args:
@@ -114,6 +118,7 @@ def equilibria(
         newton: see `equilibrium`.
         recovery_budget: see `equilibrium`.
         on_failure: see `equilibrium`.
+        with_stability: see `equilibrium`.
 
     Returns:
         A `Trajectory` of T rows. All are at time 0 of the robot's equations; `time` counts them from 0.
@@ -142,15 +147,21 @@ def equilibria(
         if batch and rest.ndim == 2:
             rest = jnp.broadcast_to(rest, (batch, *rest.shape))
         rows = _traced(bare, controls, rest, task, Pattern.of(bare))
+        tested = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
     else:
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
             raise failure(rows, causes, None)
+        tested = verdicts(bare, settings, rows, np.asarray(controls) if with_stability else None)
+        rows.result[(tested > 0) & (rows.result != Result.OTHER_TURNS)] = Result.UNSTABLE
         warn_of_coarse_grids(system, settings, rows)
         warn_of_results(rows)
         warn_outside_rod_theory(system, rows)
     time = np.arange(float(task.steps))
-    return marked(Trajectory(system, settings, time, control=controls, **rows_of(system, rows)), None)
+    found = Trajectory(
+        system, settings, time, control=controls, **rows_of(system, rows), stability=tested
+    )  # fmt: skip
+    return marked(found, None)
 
 
 @functools.partial(jax.jit, static_argnames=("task", "pattern"))

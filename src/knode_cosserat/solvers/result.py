@@ -66,6 +66,49 @@ _MESSAGES = {
 }
 
 
+class Verdict(Code):
+    """Stability of an equilibrium under small disturbances. Below zero: not tested, with the reason."""
+
+    STABLE = 0
+    UNSTABLE = 1
+    FLUTTER = 2
+    UNTESTED_MANY = -1
+    UNTESTED_FRICTION = -2
+    UNTESTED_GRID = -3
+    UNTESTED_SIZE = -4
+    UNTESTED_SYSTEM = -5
+    UNTESTED_TURNING = -6
+    UNTESTED_TRACED = -7
+    UNTESTED_UNSOLVED = -8
+    UNTESTED_UNASKED = -9
+
+    @property
+    def message(self) -> str:
+        """The verdict in words."""
+        return f"stability not tested: {self.reason}" if self < 0 else self.reason
+
+    @property
+    def reason(self) -> str:
+        """The reason why it was not tested, or the verdict."""
+        return _VERDICTS[self]
+
+
+_VERDICTS = {
+    Verdict.STABLE: "stable",
+    Verdict.UNSTABLE: "UNSTABLE: a small disturbance moves the robot away from this shape",
+    Verdict.FLUTTER: "UNSTABLE by flutter: a small disturbance grows to oscillations about this shape",
+    Verdict.UNTESTED_MANY: "one of several equilibria; kc.statics.stability(equilibria, row) tests one",
+    Verdict.UNTESTED_FRICTION: "friction has no linearisation at rest",
+    Verdict.UNTESTED_GRID: "the grid is too coarse to decide; use more nodes",
+    Verdict.UNTESTED_SIZE: "the robot has too many states; kc.statics.stability may test it",
+    Verdict.UNTESTED_SYSTEM: "the system has no positions p and velocities q",
+    Verdict.UNTESTED_TURNING: "loads turn in the robot's frame, so that it does not stay in equilibrium",
+    Verdict.UNTESTED_TRACED: "it was solved inside JAX's transformations",
+    Verdict.UNTESTED_UNSOLVED: "no equilibrium was found",
+    Verdict.UNTESTED_UNASKED: "with_stability is False",
+}
+
+
 class Codes(np.ndarray):
     """Array of integer codes that prints their names; an element is a member of `members`."""
 
@@ -99,6 +142,12 @@ class ResultCodes(Codes):
     """Array of `Result` codes."""
 
     members = Result
+
+
+class VerdictCodes(Codes):
+    """Array of `Verdict` codes."""
+
+    members = Verdict
 
 
 class SimulationError(KnodeCosseratError, RuntimeError):

@@ -1,54 +1,46 @@
-"""Linearised motion about an equilibrium: frequencies, damping and shapes of its modes.
-
-In a small motion δy e^{λt} all rates are λ times the changes. A step of implicit Euler of any length,
-y_t = c0 (y - y_before), multiplies such a motion by ζ = c0 / (c0 - λ). The eigenvalues ζ of one linearised
-step therefore give λ without an error in time. Inertia, damping, relaxation, ends and attached bodies are
-those of `simulate`; no potential is needed.
-"""
+"""Linearised motion about an equilibrium: frequencies, damping and shapes of its modes, on two grids."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.aspects import Ends
-from knode_cosserat.rods.law import InternalState, JointLaw, MaterialLaw
-from knode_cosserat.rods.strands import in_strands, of_rods, strand_count, strand_of
+from knode_cosserat.rods.strands import of_rods, strand_count, strand_of
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import StepCoefficients, repeated_record_history, used_places
+from knode_cosserat.solvers.history import repeated_record_history, used_places
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
+from knode_cosserat.solvers.small_motion import (
+    NEUTRAL,
+    RATE,
+    SAME,
+    has_friction,
+    history_size,
+    largest_eigenvalues,
+    linearised_step,
+    natural_time,
+)
 from knode_cosserat.solvers.space import Lobatto4
 
 #: nodes of the two grids that are compared: for robots of at most as many nodes as the finer one, or the last
 GRIDS = ((11, 21), (21, 41))
 #: largest number of history terms of a step on the finer grid; beyond, eigenvalues take minutes
 MOST_TERMS = 4000
-#: vectors side by side; largest factors that are wanted of each strand, and most vectors for each of them
-BLOCK, WANTED, MOST = 16, 40, 16
-#: residual of an eigenvector, as a fraction of its factor
-CONVERGED = 1e-9
-#: c0 of the step in natural units: near the lowest frequencies, which are thereby the most accurate
-RATE = 10.0
-#: factors below this are of history that does not move anything
-STILL = 1e-9
+#: largest factors that are wanted of each strand
+WANTED = 40
 #: largest difference of λ between the two grids, as a fraction of λ or of the natural rate, up to the first
 #: mode with a larger one: modes beyond it are of the grid. A scheme of order 4 has a fifteenth of the
 #: difference as its error on the finer grid; a quarter is taken
 RESOLVED, ERROR = 0.1, 0.25
-#: rounding of a factor ζ; rounding of λ as a fraction of it; natural rate below which a mode is neutral
-FACTOR_ROUNDING, ROUNDING, NEUTRAL = 1e-13, 1e-8, 1e-4
+#: rounding of a factor ζ; rounding of λ as a fraction of it
+FACTOR_ROUNDING, ROUNDING = 1e-13, 1e-8
 #: frequency below which an eigenvalue is real, as a fraction of λ or of the natural rate
 TOGETHER = 1e-6
-#: largest distance, in lengths, between the equilibria of the two grids
-SAME = 0.02
 
 
 class _Modes(NamedTuple):
@@ -81,19 +73,13 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     Raises `ValueError`, with a reason, if they cannot be computed.
     """
     grids = next((pair for pair in GRIDS if system.nodes <= pair[1]), GRIDS[-1])
-    if used_places(system.replace(nodes=grids[1]), Lobatto4()) * _history_size(system) > MOST_TERMS:
+    if used_places(system.replace(nodes=grids[1]), Lobatto4()) * history_size(system) > MOST_TERMS:
         raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
-    layout, scale = strand_of(system).y_layout, np.asarray(strand_of(system).scales().y)
-    if not layout.ranges("q"):
+    if not strand_of(system).y_layout.ranges("q"):
         raise ValueError(f"a {type(system).__name__} has no velocity q in y")
-    s = jnp.zeros(())
-    base = in_strands(system, jnp.asarray(y[0]))[0]
-    strand, still = strand_of(nominal_model(system)), jnp.zeros_like(base)
-    law = strand.constitutive(s, s, base, still, jnp.asarray(control))
-    for own in [own for own, *_ in law.laws] if isinstance(law, JointLaw) else [law]:
-        if isinstance(own, InternalState) or (isinstance(own, MaterialLaw) and own.internal is not None):
-            raise ValueError("its friction has no linearisation at rest")
-    time = float(scale[layout.ranges("p")[0][0]] / scale[layout.ranges("q")[0][0]])
+    if has_friction(system, y[0], control):
+        raise ValueError("its friction has no linearisation at rest")
+    time = natural_time(system)
     found, c0 = [], RATE / time
     for nodes in grids:
         own = system.replace(nodes=nodes)
@@ -103,7 +89,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
         off = np.max(np.abs(of_rods(system, solved - guess, "p")))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
-        factors, vectors = _largest_eigenvalues(step, unit, WANTED * strand_count(system))
+        factors, vectors = largest_eigenvalues(step, unit, WANTED * strand_count(system))
         found.append(RATE * (1.0 - 1.0 / factors))
     coarse, fine = found
     nearest = np.abs(fine[:, None] - coarse).argmin(axis=1)
@@ -125,76 +111,26 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     growth = np.where(np.abs(fine.real) <= uncertainty, 0.0, fine.real)
     order = np.lexsort((np.abs(fine), -growth))
     found = [each[order] / time for each in (fine, uncertainty, rounding, other)]
-    records = vectors.T[order].reshape(len(order), -1, _history_size(own))
+    records = vectors.T[order].reshape(len(order), -1, history_size(own))
     motions = records[:, grid_of(own, Lobatto4()).nodes, : own.y_layout.size]
     return _Modes(found[0], found[1], found[2], found[3], motions)
-
-
-def _history_size(system: System) -> int:
-    return system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
 
 
 def _step(
     system: System, guess: np.ndarray, control: np.ndarray, c0: float
 ) -> tuple[np.ndarray, float, Callable[[np.ndarray], np.ndarray], np.ndarray]:
     """Return the equilibrium at the nodes, its error, a linearised step of its history, and its units."""
-    space, used, ny = Lobatto4(), used_places(system, Lobatto4()), system.y_layout.size
+    space, ny = Lobatto4(), system.y_layout.size
     still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
     begun = still_state(system, space, control, guess)
     if Ends.of(system).held:
-        _, y, found = TimeIntegration(still).solve(system, control[None], begun.y)
+        found = TimeIntegration(still).solve(system, control[None], begun.y)[2]
     else:
         # a robot that can move as a whole has no single equilibrium, but a step from rest
         past = repeated_record_history(system, settings, begun.records, begun.y, 0.0)
-        _, after, found = TimeIntegration(settings, 1.0 / c0).solve(system, control[None], past)
-        y = after.y[0]
-    records = still_state(system, space, control, y).records[:used]
-    steps = StepCoefficients.of(settings, 1.0 / c0, settings.memory)
-    before = np.stack([records] * settings.memory)
-    unit = np.tile(np.concatenate([system.scales().y, np.ones(records.shape[1] - ny)]), used)
-
-    def stepped(vectors: np.ndarray) -> np.ndarray:
-        m = vectors.shape[1]
-        d_past = np.zeros((settings.memory, *records.shape, m))
-        d_past[0] = vectors.reshape(*records.shape, m)
-        state = TangentState(before, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
-        changes = Changes(np.zeros((1, system.control_layout.size, m)))
-        solved = found.records, found.unknowns
-        moved, _ = tangent_time_loop(steps, solved, (system, control[None]), changes, state)
-        return np.asarray(moved.d_records[0].reshape(len(vectors), m))
-
-    return found.records[0, :, :ny], float(found.error[0]), stepped, unit
-
-
-def _largest_eigenvalues(
-    step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray, wanted: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest eigenvalues of a linear map of vectors, and their vectors (count, m).
-
-    By a block Krylov method, which finds multiple eigenvalues as well (Saad 2011, section 6.5).
-
-    Args:
-        step: map of vectors side by side (count, BLOCK).
-        unit: unit of each number (count,).
-        wanted: number of eigenvalues, or more than there are.
-    """
-    fresh = np.linalg.qr(np.random.default_rng(0).normal(size=(len(unit), BLOCK)))[0]
-    basis = images = np.zeros((len(unit), 0))
-    while True:
-        basis = np.concatenate([basis, fresh], axis=1)
-        images = np.concatenate([images, step(unit[:, None] * fresh) / unit[:, None]], axis=1)
-        values, small = np.linalg.eig(basis.T @ images)
-        largest = np.argsort(-np.abs(values))[:wanted]
-        values, vectors = values[largest], basis @ small[:, largest]
-        off = np.linalg.norm(images @ small[:, largest] - vectors * values, axis=0)
-        known = (np.abs(values) > STILL) & (off <= CONVERGED * np.abs(values))
-        if known.all() or basis.shape[1] + BLOCK > min(MOST * wanted, len(unit)):
-            # none beyond one that did not converge
-            count = int(np.argmin(np.append(known, False)))
-            return values[:count], unit[:, None] * vectors[:, :count]
-        fresh = images[:, -BLOCK:]
-        for _ in range(2):
-            fresh = np.linalg.qr(fresh - basis @ (basis.T @ fresh))[0]
+        found = TimeIntegration(settings, 1.0 / c0).solve(system, control[None], past)[2]
+    step, unit = linearised_step(system, space, found, control, c0)
+    return found.records[0, :, :ny], float(found.error[0]), step, unit
 
 
 def displacements(system: System, motion: np.ndarray) -> np.ndarray:

@@ -109,7 +109,9 @@ def equilibrium_path(
     if np.array_equal(first, last):
         raise ValueError("first and last are the same control; there is no path between them")
     settings = static_settings(space, newton)
-    found = equilibrium(system, first, space=settings.space, initial=initial, newton=newton)
+    found = equilibrium(
+        system, first, space=settings.space, initial=initial, newton=newton, with_stability=False
+    )
     walk = _Walk(system, settings, (first, last), np.asarray(found.y[0]))
     directions: list[int] = []
 

@@ -127,7 +127,9 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any) -
     if not Ends.of(system).rest_is_guess:
         found = respond(system, settings, pose, control, unloaded_shape(system, settings.space))
     if found is None or not found.error <= settings.newton.acceptable:
-        recovered = equilibrium(system, control, space=settings.space, newton=settings.newton)
+        recovered = equilibrium(
+            system, control, space=settings.space, newton=settings.newton, with_stability=False
+        )
         found = respond(
             system, settings, pose, control, still_state(system, settings.space, control, recovered.y[0]).y
         )

@@ -147,7 +147,9 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
             system=system, settings=equilibrium.settings, time=np.zeros(1), y=y[None], z=z[None],
             control=control[None], result=np.zeros(1, int), residual=np.zeros(1), iterations=np.zeros(1, int),
         )  # fmt: skip
-        found = rests(system, control, space="lobatto4", initial=one, on_failure="return")
+        found = rests(
+            system, control, space="lobatto4", initial=one, on_failure="return", with_stability=False
+        )
         if found.result[0] not in NEARBY:
             raise ValueError(
                 f"row {row} cannot be decided: by Lobatto4 along the rod no equilibrium is found near it; "
