@@ -195,8 +195,11 @@ def _names(kind: Any) -> list[str]:
 def _words(kind: Any) -> str:
     """Return an annotation in words."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
-    if len(_parts(kind)) > 1:
-        return " or ".join(dict.fromkeys(_words(one) for one in inner))
+    if len(parts := _parts(kind)) > 1:
+        if any("numpy._typing" in repr(one) for one in parts):  # anything that NumPy makes an array of
+            own = [_words(one) for one in parts if f"{__name__.partition('.')[0]}." in repr(one)]
+            return " or ".join([*own, "an array"])
+        return " or ".join(dict.fromkeys(map(_words, parts)))
     if origin is typing.Literal:
         return " or ".join(f'"{one}"' if isinstance(one, str) else repr(one) for one in inner)
     if isinstance(origin, type) and issubclass(origin, collections.abc.Mapping):

@@ -84,6 +84,15 @@ def some(family):
     return st.lists(parts(family), max_size=3).map(tuple)
 
 
+def everywhere(found):
+    """Parts at the tip or all along: tubes move others with their insertion, and refuse them."""
+    whole, moved = {"at": 1.0, "begin": 0.0, "end": 1.0}, []
+    for part in found:
+        names = {field.name for field in dataclasses.fields(part)}
+        moved.append(dataclasses.replace(part, **{name: whole[name] for name in whole if name in names}))
+    return tuple(moved)
+
+
 ROD = {
     "sections": some(SectionChange), "loads": some(Load), "surroundings": some(Obstacle),
     "effects": st.tuples(parts(SpinningFrame)),
@@ -112,8 +121,8 @@ FIELDS = {
     "tendon-robot": ROD,
     "virtual-robot": {**ROD, **TENDONS},
     "concentric-tube-robot": {
-        **{name: ROD[name] for name in ("loads", "surroundings", "tip_end")},
-        "tubes": TUBES,
+        **{name: ROD[name].map(everywhere) for name in ("loads", "surroundings")},
+        "tip_end": ROD["tip_end"], "tubes": TUBES,
     },
     "assembly": {
         "rods": st.tuples(

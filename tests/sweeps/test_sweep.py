@@ -273,7 +273,7 @@ def test_executors_that_cannot_work(tmp_path, monkeypatch):
     ):
         with pytest.raises(SweepError, match=message):
             run_sweep(described(), tmp_path / "a", executor=executor)
-    with pytest.raises(SweepError, match="executor is a str"):
+    with pytest.raises(ValueError, match="executor is 'slurm'; allowed is a Local"):
         run_sweep(described(), tmp_path / "b", executor="slurm")
     work = Work(Plan.of(described()), None, {"jax": "0.1"})
     with pytest.raises(SweepError, match="the workers have another"):

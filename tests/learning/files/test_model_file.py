@@ -181,7 +181,7 @@ def test_a_users_residual_has_to_be_told(tmp_path):
         load_model(path)
     with fails("residual.bag", "'Bag'"):
         load_model(path, residuals=[Pull])
-    with fails("'nothing' cannot be in a model file"):
+    with pytest.raises(ValueError, match="residuals holds 'nothing'; allowed is a list, each a class"):
         load_model(path, residuals=["nothing"])
     with fails("int'> cannot be in a model file"):
         load_model(path, residuals=[int])
