@@ -27,7 +27,7 @@ def moved():
 WRONG = {
     "a robot by its name": (lambda t: kc.simulate("delrin", TENSIONS, 0.05), "str", "a robot or"),
     "no robot": (lambda t: kc.simulate(None, TENSIONS, 0.05), "None", "a robot or"),
-    "robots mixed with text": (lambda t: kc.simulate([ROBOT, "x"], TENSIONS, 0.05), "str 'x'", "a robot or a list"),
+    "robots mixed with text": (lambda t: kc.simulate([ROBOT, "x"], TENSIONS, 0.05), "str 'x'", "or a list"),
     "controls as text": (lambda t: kc.simulate(ROBOT, "sine", 0.05), "'sine'", r"\(steps, 4\)"),
     "three tendons": (
         lambda t: kc.simulate(ROBOT, TENSIONS[:, :3], 0.05), r"\(5, 3\)", r"\(steps, 4\).*\(N\)",
