@@ -135,7 +135,7 @@ def test_simulations_start_in_equilibrium_on_request():
     falls = kc.simulate(SAGGING, none, DT)
     np.testing.assert_allclose(falls.tip_position[0], [0.0, 0.0, 0.3], atol=1e-12)
     with pytest.raises(
-        ValueError, match=r"initial is a str 'rest'; allowed is a Trajectory, \"equilibrium\", or None"
+        ValueError, match=r"initial is a str 'rest'; allowed is a Trajectory or \"equilibrium\" or None"
     ):
         kc.simulate(SAGGING, none, DT, initial="rest")
 

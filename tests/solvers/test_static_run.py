@@ -180,11 +180,11 @@ def test_turns_of_bent_rods_are_kept():
 def test_the_result_says_if_turns_are_lost(monkeypatch):
     """Frames of two shapes differ by whole turns: counted, and reported where smaller parts do not help."""
     from knode_cosserat.solvers import static_run
+    from knode_cosserat.solvers.guess import turns_between
 
     one, other = (kc.equilibrium(ROD, [0.0, 0.0, angle], space="lobatto4") for angle in (0.5, 7.0))
-    walk = static_run._Walk(None, ROD)
-    assert [walk._turns(a.y[0], b.y[0]) for a in (one, other) for b in (one, other)] == [0, 1, -1, 0]
-    monkeypatch.setattr(static_run._Walk, "_turns", lambda walk, before, after: 1)
+    assert [turns_between(ROD, a.y[0], b.y[0]) for a in (one, other) for b in (one, other)] == [0, 1, -1, 0]
+    monkeypatch.setattr(static_run, "turns_between", lambda system, before, after: 1)
     with pytest.warns(UserWarning, match="another number of turns"):
         found = kc.equilibrium(ROD, [0.0, 0.0, 1.0], space="lobatto4", initial=one)
     assert found.result[0] == kc.Result.OTHER_TURNS
