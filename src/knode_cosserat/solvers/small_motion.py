@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -149,14 +150,20 @@ def natural_time(system: System) -> float:
 
 def has_friction(system: System, base: np.ndarray, control: np.ndarray) -> bool:
     """True if internal variables of the law have bounds, such as friction: no linearisation at rest."""
-    s, y = jnp.zeros(()), in_strands(system, jnp.asarray(base))[0]
-    strand = strand_of(nominal_model(system))
-    law = strand.constitutive(s, s, y, jnp.zeros_like(y), jnp.asarray(control))
-    laws: Iterable[Any] = [own for own, *_ in law.laws] if isinstance(law, JointLaw) else [law]
-    return any(
-        isinstance(own, InternalState) or (isinstance(own, MaterialLaw) and own.internal is not None)
-        for own in laws
-    )
+    strand, found = strand_of(nominal_model(system)), list[bool]()
+
+    def look(y: Any, control: Any) -> None:
+        s = jnp.zeros(())
+        law = strand.constitutive(s, s, y, jnp.zeros_like(y), control)
+        laws: Iterable[Any] = [own for own, *_ in law.laws] if isinstance(law, JointLaw) else [law]
+        found.extend(
+            isinstance(own, InternalState) or (isinstance(own, MaterialLaw) and own.internal is not None)
+            for own in laws
+        )
+
+    # traced only: the kind of law does not depend on numbers
+    jax.eval_shape(look, in_strands(system, np.asarray(base))[0], np.asarray(control))
+    return any(found)
 
 
 def history_size(system: System) -> int:
