@@ -1,4 +1,4 @@
-"""Stability of every equilibrium: closed forms for rods with parts that have no energy here; reasons if untested."""
+"""Stability of every equilibrium: closed forms for rods with all kinds of parts; reasons if it is untested."""
 
 import warnings
 
@@ -84,7 +84,7 @@ def test_a_follower_load_makes_a_column_flutter():
 
 
 def test_tendons_that_compress_a_straight_rod_do_not_buckle_it():
-    """The force of a tendon along the line turns with it, and bends nothing: stable at ten times Euler's load."""
+    """The force of a tendon along the line turns with it and bends nothing, at ten times Euler's load too."""
     robot = kc.load_robot("delrin-tendon-robot").replace(gravity=(0.0, 0.0, 0.0))
     euler = np.pi**2 / 4 * float(robot.Kbt[0, 0]) / float(robot.length) ** 2
     found, said = rest(robot, np.full(4, 10.0 * euler / 4.0))

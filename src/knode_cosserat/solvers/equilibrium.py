@@ -144,7 +144,7 @@ def equilibria(
         if batch and rest.ndim == 2:
             rest = jnp.broadcast_to(rest, (batch, *rest.shape))
         rows = _traced(bare, controls, rest, task, Pattern.of(bare))
-        tested = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
+        tested: Any = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
     else:
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
