@@ -1,4 +1,4 @@
-"""Stability of every equilibrium: closed forms for rods with all kinds of parts; reasons if it is untested."""
+"""Stability of every equilibrium: closed forms for rods with all kinds of parts; reasons if untested."""
 
 import warnings
 

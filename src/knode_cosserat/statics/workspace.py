@@ -244,7 +244,11 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
 def _recovered(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:
     """Replace sample i by the result of `kc.equilibrium` with its recoveries, solved or not."""
     rest = equilibrium(
-        found.system, found.controls[i], space=settings.space, newton=settings.newton, on_failure="return",
+        found.system,
+        found.controls[i],
+        space=settings.space,
+        newton=settings.newton,
+        on_failure="return",
         with_stability=False,
     )
     found.result[i], found.residual[i] = rest.result[0], rest.residual[0]
