@@ -101,7 +101,7 @@ WRONG = {
     "a step of two": (lambda t: kc.solvers.Stepper(ROBOT, 0.05).step([1, 2]), r"\(2,\)", r"\(4,\).*N\)"),
     "a scene of text": (lambda t: kc.viewer.export_scene("x", "x.html"), "str", "a Trajectory"),
     "a view of a number": (lambda t: kc.view(3), "3", "a Trajectory"),
-    "a live view of text": (lambda t: kc.viewer.view_live("x"), "str", "one robot"),
+    "a live view of text": (lambda t: kc.viewer.view_live("x"), "str", "a robot"),
     "no ensemble": (lambda t: kc.learning.load_ensemble("nope"), "nope", "member-000"),
     "to estimate parts of text": (lambda t: kc.recordings.estimate_parts("x", ROBOT), "str", "a Recording"),
     "nodes of a number": (lambda t: kc.metrics.node_error(t, 3), "int", "a Trajectory"),

@@ -286,8 +286,6 @@ def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
         ValueError: the trajectory is not a batch.
     """
     check_arguments(spread, locals())
-    if not isinstance(batch, Trajectory):
-        raise TypeError(f"batch is a {type(batch).__name__}; allowed is a Trajectory of several robots")
     if np.ndim(batch.y) != 4:
         raise ValueError("the trajectory is of one robot; allowed is a batch")
     tip = np.asarray(batch.tip_position)
@@ -392,8 +390,6 @@ def workspace(samples: Workspace) -> Figure:
     """
     check_arguments(workspace, locals())
     require_matplotlib()
-    if not (hasattr(samples, "position") and hasattr(samples, "valid")):
-        raise TypeError(f"samples is a {type(samples).__name__}; allowed is a Workspace")
     if samples.position.shape[1] != 3 or not samples.valid.any():
         raise ValueError("there is no solved sample with three coordinates to draw")
     shown = np.flatnonzero(samples.valid)[:MOST_POINTS]

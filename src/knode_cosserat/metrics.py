@@ -277,8 +277,6 @@ def state_errors(
     """
     check_arguments(state_errors, locals())
     for name, it in (("estimate", estimate), ("truth", truth)):
-        if not isinstance(it, Trajectory):
-            raise ValueError(f"the {name} is a {type(it).__name__}; allowed is a Trajectory")
         if np.ndim(it.y) != 3:
             raise ValueError(f"the {name} is a batch of {len(it.y)}; allowed is one robot")
     time = np.asarray(estimate.time)

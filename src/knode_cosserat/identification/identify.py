@@ -119,9 +119,8 @@ def identify(
         ParameterError: an effect or a parameter that does not exist, or cannot be searched.
     """
     check_arguments(identify, locals())
-    system: Any = robot
-    if not isinstance(system, System) or np.ndim(robot.length):
-        raise IdentificationError(f"robot is a {type(robot).__name__}; allowed is one robot")
+    if np.ndim(robot.length):
+        raise IdentificationError("robot is a batch; allowed is one robot")
     named = effects is None and parameters is not None
     if not named and not isinstance(robot, TendonRod):
         raise IdentificationError(

@@ -50,8 +50,6 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
         TypeError: not a model, or its residual is not structured.
     """
     check_arguments(explain, locals())
-    if not isinstance(model, KNODE):
-        raise TypeError(f"model is a {type(model).__name__}; allowed is a KNODE, which `fit` gives")
     residual, knowledge = model.residual, strand_of(model.knowledge)
     if not isinstance(residual, Structured):
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")

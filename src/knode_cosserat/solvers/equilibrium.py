@@ -129,8 +129,6 @@ def equilibria(
     """
     check_arguments(equilibria, locals())
     settings = Settings.of(None, space, "paper", newton)
-    if on_failure not in ("raise", "return"):
-        raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
     if initial is not None and not isinstance(initial, Trajectory):

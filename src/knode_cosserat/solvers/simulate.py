@@ -114,8 +114,6 @@ def simulate(
     if time in (None, "static"):
         raise ValueError(f"time is {time!r}; equilibria have no time steps: use solvers.equilibria")
     settings = Settings.of(time, space, start, newton, between, errors)
-    if on_failure not in ("raise", "return"):
-        raise ValueError(f'on_failure is {on_failure!r}; allowed is "raise" or "return"')
     dt = checked_dt(dt)
     if position_tolerance is not None and not errors:
         raise ValueError("position_tolerance needs estimates of errors: leave out errors=False")

@@ -65,9 +65,8 @@ class Stepper:
             ValueError: arguments of a wrong shape or name.
         """
         check_arguments(Stepper.__init__, locals())
-        given: Any = robot
-        if not isinstance(given, System) or np.ndim(given.length):
-            raise ValueError(f"robot is {type(robot).__name__}; a stepper is of one robot, not of a batch")
+        if np.ndim(robot.length):
+            raise ValueError("robot is a batch; a stepper is of one robot")
         if time in (None, "static"):
             raise ValueError(f"time is {time!r}; a stepper moves: see `equilibrium` for shapes at rest")
         settings = Settings.of(time, space, start, newton, errors=errors)

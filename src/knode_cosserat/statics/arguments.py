@@ -18,13 +18,6 @@ def static_settings(space: str | SpaceScheme, newton: NewtonOptions) -> Settings
     return Settings.of(None, space, "paper", newton)
 
 
-def checked_system(robot: Any) -> System:
-    """Return the robot, if it is one system; `ValueError` otherwise."""
-    if not isinstance(robot, System):
-        raise ValueError(f"robot is {type(robot).__name__}; allowed is one robot or model")
-    return robot
-
-
 def checked_vectors(name: str, given: Any, size: int | Layout, allowed: str, most: int = 2) -> np.ndarray:
     """Return finite numbers (size,), or with `most` 2 also (B, size); tables by the names of a layout."""
     try:

@@ -12,7 +12,7 @@ from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.settings import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
+from knode_cosserat.statics.arguments import checked_control, static_settings
 from knode_cosserat.statics.response import Pose, first_solved, tip_pose
 
 #: error of the schemes along the rod in a compliance, as a fraction of its largest eigenvalue
@@ -151,11 +151,10 @@ def configuration(
         ValueError: arguments of a wrong shape.
     """
     check_arguments(configuration, locals())
-    system = checked_system(robot)
-    control = checked_control(system, control)
-    found = first_solved(system, static_settings(space, newton), pose, control)
+    control = checked_control(robot, control)
+    found = first_solved(robot, static_settings(space, newton), pose, control)
     turned = None if found.quaternion is None else np.asarray(found.quaternion)
     return Configuration(
         control, np.asarray(found.position), turned, np.asarray(found.jacobian),
-        np.asarray(found.compliance), float(system.length),
+        np.asarray(found.compliance), float(robot.length),
     )  # fmt: skip

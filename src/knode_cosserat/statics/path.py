@@ -28,7 +28,7 @@ from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.statics.arguments import checked_control, checked_system, static_settings
+from knode_cosserat.statics.arguments import checked_control, static_settings
 from knode_cosserat.statics.response import node_values
 from knode_cosserat.statics.stability import stability
 from knode_cosserat.trajectory import Trajectory
@@ -104,19 +104,18 @@ def equilibrium_path(
         ValueError: arguments of a wrong shape, or the same control twice.
     """
     check_arguments(equilibrium_path, locals())
-    system = checked_system(robot)
-    first, last = checked_control(system, first), checked_control(system, last)
+    first, last = checked_control(robot, first), checked_control(robot, last)
     if np.array_equal(first, last):
         raise ValueError("first and last are the same control; there is no path between them")
     settings = static_settings(space, newton)
     found = equilibrium(
-        system, first, space=settings.space, initial=initial, newton=newton, with_stability=False
+        robot, first, space=settings.space, initial=initial, newton=newton, with_stability=False
     )
-    walk = _Walk(system, settings, (first, last), np.asarray(found.y[0]))
+    walk = _Walk(robot, settings, (first, last), np.asarray(found.y[0]))
     directions: list[int] = []
 
     def path() -> EquilibriumPath:
-        trajectory, unknown = _trajectory(system, settings, walk), [-1] * (len(walk.parts) - len(directions))
+        trajectory, unknown = _trajectory(robot, settings, walk), [-1] * (len(walk.parts) - len(directions))
         return EquilibriumPath(
             np.array(walk.parts), trajectory, np.array([*directions, *unknown]), walk.complete
         )

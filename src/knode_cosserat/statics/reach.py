@@ -29,7 +29,6 @@ from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import (
     checked_control,
     checked_limits,
-    checked_system,
     checked_vectors,
     static_settings,
 )
@@ -182,18 +181,17 @@ def inverse_kinematics(
         ValueError: arguments of a wrong shape, not finite, or low above high.
     """
     check_arguments(inverse_kinematics, locals())
-    system = checked_system(robot)
     settings = static_settings(space, dataclasses.replace(newton, tolerance=min(newton.tolerance, EXACT)))
-    limits = checked_limits(system, low, high)
+    limits = checked_limits(robot, low, high)
     begin = None
     if initial is not None:
-        begin = checked_control(system, initial, "initial")
+        begin = checked_control(robot, initial, "initial")
         if np.any((begin < limits[0]) | (begin > limits[1])):
             raise ValueError(f"initial is {begin.tolist()}; it must be between low and high")
     if not _whole(starts):
         raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
-    wanted, single = _checked_wanted(system, pose, position, quaternion, (weights, tolerance))
-    search = _Search(system, settings, pose, *limits)
+    wanted, single = _checked_wanted(robot, pose, position, quaternion, (weights, tolerance))
+    search = _Search(robot, settings, pose, *limits)
     free = np.where(search.free, search.span, 1.0)
     last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
     rows, shape = [], None

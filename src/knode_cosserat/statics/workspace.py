@@ -192,7 +192,6 @@ def workspace(
         ValueError: arguments of a wrong shape.
     """
     check_arguments(workspace, locals())
-    system = arguments.checked_system(robot)
     settings = arguments.static_settings(space, newton)
     if low is None and high is not None:
         # positional limits
@@ -201,18 +200,18 @@ def workspace(
     if given not in ([True, False, False, False], [False, True, True, True]):
         raise ValueError("allowed is workspace(robot, controls) or workspace(robot, low, high, count)")
     if controls is None:
-        limits = arguments.checked_limits(system, low, high)
+        limits = arguments.checked_limits(robot, low, high)
         number: Any = count
         if not isinstance(number, int | np.integer) or not 1 <= number <= 2**30:
             raise ValueError(f"count is {count!r}; allowed is a whole number from 1 to 2^30")
         samples = sample(*limits, int(number), seed)
     else:
-        size = system.control_layout.size
-        samples = arguments.checked_vectors("controls", controls, system.control_layout, f"(B, {size})")
+        size = robot.control_layout.size
+        samples = arguments.checked_vectors("controls", controls, robot.control_layout, f"(B, {size})")
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
-        arguments.within_limits(system, samples, "controls")
-    return _found(system, settings, pose, samples, progress)
+        arguments.within_limits(robot, samples, "controls")
+    return _found(robot, settings, pose, samples, progress)
 
 
 def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray, progress: bool) -> Workspace:

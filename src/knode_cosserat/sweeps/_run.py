@@ -274,12 +274,8 @@ def run_sweep(
             nothing can be written, or a worker died.
     """
     check_arguments(run_sweep, locals())
-    if not isinstance(sweep, Sweep):
-        raise SweepError(f"sweep is a {type(sweep).__name__}; allowed is a Sweep")
     require_pyarrow()
     folder, executor = Path(folder).absolute(), executor or Local()
-    if not isinstance(executor, Local | Dask | Slurm):
-        raise SweepError(f"executor is a {type(executor).__name__}; allowed is Local, Dask or Slurm")
     plan, began, date = Plan.of(sweep), time.perf_counter(), time.time()
     open_folder(plan, folder)
     missing = [number for number in range(plan.shard_count) if not is_complete(plan, folder, number)]

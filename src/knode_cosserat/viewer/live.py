@@ -333,7 +333,7 @@ SWITCH = 5e-4
 
 
 def view_live(
-    robot: Any,
+    robot: System,
     *,
     dt: float | None = None,
     space: str = "lobatto2",
@@ -364,8 +364,6 @@ def view_live(
     check_arguments(view_live, locals())
     require_websockets()
     checked_port(port)
-    if not isinstance(robot, System):
-        raise ValueError(f"robot is a {type(robot).__name__}; allowed is one robot")
     # in equilibrium under the sliders' initial controls: nothing moves by itself
     still = equilibrium(robot, [slider["start"] for slider in sliders(robot)], space=space)
     stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space, initial=still)

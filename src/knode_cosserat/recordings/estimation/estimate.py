@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, get_args
+from typing import Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -114,10 +114,6 @@ def _parts(recording: Recording | Measurements, robot: System, method: str, time
     Raises:
         RecordingError: an argument is not allowed, the recording does not fit the robot, or has too few data.
     """
-    if method not in get_args(Method):
-        raise RecordingError(f'method is {method!r}; allowed is "best" or "paper"')
-    if not isinstance(robot, System):
-        raise RecordingError(f"robot is a {type(robot).__name__}; allowed is a robot or a model")
     balance.require_rod(robot)
     parts = _pieces(recording, robot, times)
     for part in parts:
