@@ -20,11 +20,11 @@ ROUNDS = 3
 WARM = ("steps", "cantilever", "batch", "gradient", "tangents", "schemes", "memory", "workspace")
 
 
-def case(name: str | None, cache: str, of: str = "cases") -> dict[str, Any]:
-    """One case in a process of its own, with the given directory of compiled programs."""
+def case(name: str | None, cache: str, of: str = "cases", code: str = "final") -> dict[str, Any]:
+    """One case in a process of its own, with the given folder of compiled programs and level of code."""
     ran = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{of}", *([name] if name else [])],
-        env={**os.environ, "KNODE_COSSERAT_CACHE": cache},
+        env={**os.environ, "KNODE_COSSERAT_CACHE": cache, "KNODE_COSSERAT_CODE": code},
         stdout=subprocess.PIPE,
         check=True,
         text=True,
@@ -64,14 +64,14 @@ def measure() -> dict[str, Any]:
         cold = []
         for _ in range(ROUNDS):
             with tempfile.TemporaryDirectory() as empty:
-                cold.append(case("first_call", empty))
+                cold.append(case("first_call", empty, code=""))
         command_seconds(cache)
         second = [command_seconds(cache) for _ in range(ROUNDS)]
         found = {name: case(name, cache) for name in WARM}
         found["family"] = case(None, cache, "family")
         found |= {name: case(name, cache, "learning") for name in ("fits", "learned_steps")}
     with tempfile.TemporaryDirectory() as empty:
-        found["study"] = case("study", empty, "learning")
+        found["study"] = case("study", empty, "learning", code="")
     found["first_call"] = {key: statistics.median(one[key] for one in cold) for key in cold[0]}
     found["second_process"] = {"seconds": statistics.median(second)}
     return {"machine": machine(), **found}

@@ -71,6 +71,15 @@ def test_the_final_code_takes_over_with_the_same_bits(cache):
     assert file.read_bytes().startswith(generation.generate(module_of(2.0).text, generation.FINAL))
 
 
+@pytest.mark.parametrize(("wanted", "level"), [("quick", generation.QUICK), ("final", generation.FINAL)])
+def test_one_level_of_code_may_be_asked_for(cache, monkeypatch, wanted, level):
+    monkeypatch.setenv("KNODE_COSSERAT_CODE", wanted)
+    code = module_of(2.5).compile()
+    assert code._later is None and answer(code) == answer(module_of(2.5).compile())
+    [file] = cache.rglob("*engine-*")
+    assert file.read_bytes().startswith(generation.generate(module_of(2.5).text, level))
+
+
 def test_quick_code_stays_if_the_other_process_is_killed(cache):
     code = module_of(3.0).compile()
     code._later.send_signal(getattr(signal, "SIGKILL", signal.SIGTERM))

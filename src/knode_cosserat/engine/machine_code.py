@@ -67,12 +67,13 @@ class MachineCode:
 
     @classmethod
     def of(cls, text: str, kinds: Mapping[str, str]) -> MachineCode:
-        """Return the code of a module."""
-        level = generation.QUICK if os.environ.get("KNODE_COSSERAT_CODE") == "quick" else generation.FINAL
+        """Return the code of a module: quick, final, or first one and then the other."""
+        wanted = os.environ.get("KNODE_COSSERAT_CODE")
+        level = generation.QUICK if wanted == "quick" else generation.FINAL
         name = f"engine-{hashlib.sha256(f'{text}{computer()}{level}'.encode()).hexdigest()}"
         code, later = stored(name), None
         if code is None:
-            if level == generation.FINAL and len(text) > LARGE:
+            if wanted not in ("quick", "final") and len(text) > LARGE:
                 later = _generated_beside(text, name)
             code = generation.generate(text, generation.QUICK if later else level)
             store(f"{QUICK}{name}" if later else name, code)
