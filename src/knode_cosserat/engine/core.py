@@ -45,7 +45,7 @@ ACCEPTABLE = [field.name for field in dataclasses.fields(NewtonOptions)].index("
 
 
 class Core(EliminationCode):
-    """Machine code of a system's time loop, or of its equilibria in turn.
+    """Machine code of a system's time loop, and of its equilibria in turn, whose rates are zero (c0 = 0).
 
     It does not depend on Newton's options. A run may have fewer stages in a step than the scheme.
     """
@@ -65,14 +65,13 @@ class Core(EliminationCode):
         self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3), a(1)
         self.errors, self.error_rate = [a(numbers, self.used) for _ in memory], a(numbers, self.used)
         self.time_errors = [a(numbers, self.used) for _ in memory]
-        #: the part of the memory that is the state of a motion, and its arrays as in a `StateHistory`
-        self._motion = slice(first, self._size)
-        self._parts = {
-            "records": self.records, "rate": [self.rate], "y": self.past, "weights": [self.weights],
-            "t0": [self.t0], "error": [*self.errors, self.error_rate], "time_error": self.time_errors,
-        }  # fmt: skip
-        if settings.time is None:
-            self._motion, self._parts = slice(self.y.offset, self.unknowns.offset), {"y": [self.y]}
+        #: the state of a motion and that of an equilibrium: a part of the memory, and the arrays in it in the
+        #: order of a `StateHistory` and of a `Shape`
+        self.motion = slice(first, self._size), [
+            self.records, [self.rate], self.past, [self.weights], [self.t0],
+            [*self.errors, self.error_rate], self.time_errors,
+        ]  # fmt: skip
+        self.shape = slice(self.y.offset, self.unknowns.offset), [[self.y]]
         #: of the stage solved last (`USABLE` and the next)
         self.numbers = a(8)
         #: for sizes relative to the state: one over the natural unit plus |y|
@@ -90,9 +89,7 @@ class Core(EliminationCode):
         self.dfe = a(ny, self.pieces) if self.near else self.tangents.f
         self._write()
         self._functions = self.module.compile()
-        guesses = EXTRAPOLATIONS[None]
-        if settings.stages > 1:
-            guesses = stage_extrapolations(settings)
+        guesses = stage_extrapolations(settings) if settings.stages > 1 else EXTRAPOLATIONS[None]
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
 
@@ -348,7 +345,7 @@ class Core(EliminationCode):
 
     def _write_static_errors(self) -> None:
         """Errors of an equilibrium: the correction that its defects ask for."""
-        self.corrected = f = self._function("corrected", "numbers")
+        self.corrected_at_rest = f = self._function("corrected_at_rest", "numbers")
         memory, numbers = f.arguments
         ny = self.equations.ny
         self._copy_wide(self.defect, self.r, self.pieces)
@@ -492,11 +489,12 @@ class Core(EliminationCode):
         c0 = f.load(coefficients, 0)
         newest = self._evaluated_at(self.y)
         if isinstance(self.scheme, SDIRK2):
-            of_rate = 1.0 / c0
-            for i, j, value in self._numbers_of(newest, self.used):
-                rate = value + self._wide(self.H, i, j) * of_rate
-                step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
-                self._write_wide(rate - step, self.difference, i, j)
+            with f.if_(f.arguments[1] > 1):
+                of_rate = 1.0 / c0
+                for i, j, value in self._numbers_of(newest, self.used):
+                    rate = value + self._wide(self.H, i, j) * of_rate
+                    step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
+                    self._write_wide(rate - step, self.difference, i, j)
         self._write_shift(self.records, self.count)
         for i, j, value in self._numbers_of(newest, self.count):
             self._write_wide(value, self.records[0], i, j)
@@ -540,7 +538,7 @@ class Core(EliminationCode):
                 table = f.pointer(coefficients, number * (self.settings.memory + 3))
                 control = f.pointer(controls, number * (e.nc * P))
                 f.call(self.stage, memory, estimates, numbers, table, control)
-                if self.scheme:
+                with f.if_(self._is_moving(table)):
                     f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
                 with f.loop(nodes) as node:
                     point = self._node(node)
@@ -558,8 +556,15 @@ class Core(EliminationCode):
             f.store(f.load(reached, 0, P) + f.select(alive, 1.0, 0.0), reached, 0, P)
             step.set(step.get() + 1)
 
+    def _is_moving(self, coefficients: Value) -> Value:
+        """Return true for a stage of a motion, false for an equilibrium."""
+        return self._now.compare("ne", self._now.load(coefficients, 0), 0.0)
+
     def _write_stage(self) -> None:
-        """One stage of a step: history, first guess, solution, records and estimates."""
+        """One stage of a step: history, first guess, solution, records and estimates.
+
+        An equilibrium is solved from y as it is, and has no history.
+        """
         e, P = self.equations, self.P
         self.stage = f = self._function("stage", "n_estimates", "numbers", "coefficients", "controls")
         memory, estimates, numbers, coefficients, controls = f.arguments
@@ -573,7 +578,7 @@ class Core(EliminationCode):
                     value = value + d1 * self._wide(rate, i, j)
                 self._write_wide(value, target, i, j)
 
-        if self.scheme:
+        with f.if_(self._is_moving(coefficients)):
             history(self.records, self.rate, self.H, self.count)
             weights = [self._wide(self.weights, k) for k in range(3)]
             for i, j in self._components(e.ny, self.points):
@@ -589,9 +594,10 @@ class Core(EliminationCode):
         if isinstance(self.scheme, SDIRK2):
             with f.if_(estimates > 1):
                 f.call(self.time_history, memory, coefficients)
-        with f.if_(estimates > 0):
-            if self.scheme:
-                history(self.errors, self.error_rate, self.dH, self.used)
+        with f.if_(estimates > 0), f.if_(~self._is_moving(coefficients)):
+            f.call(self.corrected_at_rest, memory, numbers)
+        with f.if_(estimates > 0), f.if_(self._is_moving(coefficients)):
+            history(self.errors, self.error_rate, self.dH, self.used)
             f.call(self.corrected, memory, numbers)
             if self.settings.uses_rate:
                 for i, j in self._components(e.numbers, self.used):
@@ -647,14 +653,14 @@ class Core(EliminationCode):
         """
         e, P, L = self.equations, self.P, self.L
         names = ["memory", "motions", "parameters", "controls", "coefficients", "extrapolations", "results"]
-        names += ["n_vectors", "n_steps", "n_stages", "n_estimates"]
+        names += ["n_first", "n_size", "n_vectors", "n_steps", "n_stages", "n_estimates"]
         f = self._now = self.module.function("run", names, exported=True)
         memory, motions, parameters, controls, coefficients, extrapolations, results = f.arguments[:7]
-        vectors, steps, stages, estimates = f.arguments[7:]
-        solves, size = steps * stages, self._motion.stop - self._motion.start
+        first, size, vectors, steps, stages, estimates = f.arguments[7:]
+        solves = steps * stages
         rows = solves * (len(self.grid.nodes) * self.strands * e.numbers * P)
         infos = solves * ((8 + e.k) * P)
-        state = f.pointer(memory, self._motion.start)
+        state = f.pointer(memory, first)
         with f.loop(vectors) as vector:
             k = vector.value
             own = f.pointer(motions, k * size)
@@ -708,10 +714,8 @@ class Core(EliminationCode):
         self._write_newton()
         self._write_recorded()
         self._write_check()
-        if self.scheme:
-            self.corrected = self._write_corrected("corrected", self.errors, self.dH, True, POSITION)
-        else:
-            self._write_static_errors()
+        self.corrected = self._write_corrected("corrected", self.errors, self.dH, True, POSITION)
+        self._write_static_errors()
         if isinstance(self.scheme, SDIRK2):
             self._write_products()
             self.corrected_in_time = self._write_corrected(

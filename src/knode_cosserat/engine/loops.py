@@ -18,6 +18,7 @@ from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import StepCoefficients, StepRows
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.time import TWO_STAGES
 
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 
@@ -25,12 +26,12 @@ AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
     """Return the core of a pattern, of one robot or with robots in lanes.
 
-    Newton's options are not part of the code.
+    The core of the default scheme in time solves equilibria, too. Newton's options are not part of the code.
 
     Raises:
         EngineError: the engine does not cover the system or the settings.
     """
-    schemes = Settings(settings.time, settings.space)
+    schemes = Settings(settings.time or TWO_STAGES, settings.space)
     build = functools.partial(Core, pattern.system, schemes, robots)
     return compiled((pattern, schemes, robots), Core, build, _given(pattern, schemes))
 

@@ -40,6 +40,8 @@ class Motions:
     def __init__(self, core: Core, parameters: np.ndarray, states: Any, steps: StepCoefficients):
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
         self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
+        #: part of the memory that is a state, and its arrays
+        self._own, self._arrays = core.shape if self._kind is Shape else core.motion
         self._shapes = [np.shape(values)[1:] for values in states]
         self._memory = core._empty_memory()
         options = dataclasses.astuple(steps.settings.newton)
@@ -47,8 +49,19 @@ class Motions:
             self._view(self._memory[None], [array])[:] = numbers
         self.set_parameters(parameters)
         #: states of the vectors of robots
-        self.motions = np.empty((len(self._parameters), core._motion.stop - core._motion.start))
+        self.motions = np.empty((len(self._parameters), self._own.stop - self._own.start))
         self.put(states, np.arange(len(self.motions) * core.P))
+
+    @property
+    def _span(self) -> tuple[int, int]:
+        """First number of a state in the memory, and its size."""
+        return self._own.start, self._own.stop - self._own.start
+
+    @property
+    def _estimates(self) -> int:
+        """Number of estimated errors; an equilibrium has none in time."""
+        estimates = self.steps.settings.estimates
+        return min(estimates, 1) if self._kind is Shape else estimates
 
     def set_parameters(self, values: np.ndarray) -> None:
         """Set the parameters (n,) of all robots, or (robots, n)."""
@@ -59,18 +72,18 @@ class Motions:
         """Write the states (n, ...) of robots at places (n,); the last one is that of all places beyond."""
         core = self.core
         vectors, lanes = np.divmod(places, core.P)
-        for arrays, values in zip(core._parts.values(), states, strict=True):
+        for arrays, values in zip(self._arrays, states, strict=True):
             values = np.asarray(values, float)
             values = values.reshape(len(values), len(arrays), -1, core._width(arrays[0]))
             values = core._by_strand(arrays[0], values)[np.minimum(np.arange(len(places)), len(values) - 1)]
-            target, count = self._view(self.motions, arrays, core._motion.start), values.shape[-2]
+            target, count = self._view(self.motions, arrays, self._own.start), values.shape[-2]
             # the last place is repeated in the lanes beyond it
             for where, own in ((slice(count), values), (slice(count, None), values[..., -1:, :])):
                 target[vectors, lanes, :, where] = own
 
     def set_times(self, t0: Float[np.ndarray, " robots"]) -> None:
         """Set the times (s) of row 0."""
-        self._view(self.motions, [self.core.t0], self.core._motion.start)[:, :, 0, 0, 0] = self._in_lanes(t0)
+        self._view(self.motions, [self.core.t0], self._own.start)[:, :, 0, 0, 0] = self._in_lanes(t0)
 
     def _in_lanes(self, values: np.ndarray) -> np.ndarray:
         """Return values (vectors, lanes, ...) of robots; the last robot is repeated in the last vector."""
@@ -100,8 +113,8 @@ class Motions:
     def _places(self) -> list[tuple[tuple[int, ...], int, tuple[int, ...]]]:
         """Shape, first place and strides of each part of the state of one robot of one strand."""
         found = []
-        for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
-            _, at, strides = self._place_of(arrays, self.core._motion.start)
+        for arrays, shape in zip(self._arrays, self._shapes, strict=True):
+            _, at, strides = self._place_of(arrays, self._own.start)
             found.append((shape, at, strides[len(strides) - len(shape) :]))
         return found
 
@@ -123,9 +136,9 @@ class Motions:
 
     def _states(self, motions: np.ndarray) -> Any:
         found = []
-        for arrays, shape in zip(self.core._parts.values(), self._shapes, strict=True):
+        for arrays, shape in zip(self._arrays, self._shapes, strict=True):
             count = math.prod(shape) // (len(arrays) * self.core._width(arrays[0]))
-            view = self._view(motions, arrays, self.core._motion.start)
+            view = self._view(motions, arrays, self._own.start)
             values = self.core._joined(arrays[0], view, count)
             found.append(values.reshape(-1, *shape)[: self.size])
         return self._kind(*found)
@@ -178,7 +191,7 @@ class Motions:
         own = (each[first:] for each in (self.motions, self._parameters, acting))
         arrays = self._memory, *own, table, core._guesses, results
         core._functions["run"](
-            *(each.ctypes.data for each in arrays), len(results), count, stages, self.steps.settings.estimates
+            *(each.ctypes.data for each in arrays), *self._span, len(results), count, stages, self._estimates
         )
         if not core.batch and 0 < (done := int(results[0, -2])) < count:
             # again, for the state before the step that failed
@@ -214,8 +227,8 @@ class Motions:
         table[:, -1] = (i + ends) * self.steps.dt
         after, results = before.copy(), np.zeros(size)
         self.core._functions["run"](
-            self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, 1, 1, len(acting),
-            self.steps.settings.estimates,
+            self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, *self._span, 1, 1,
+            len(acting), self._estimates,
         )  # fmt: skip
         if not results[-2]:
             return before, None, NOT_SOLVED
