@@ -63,10 +63,12 @@ def test_code_is_restored_without_tracing(cache, monkeypatch):
         assert again.equations.__class__.__name__ == "Sizes"
         again = loops.tangents_for(TangentCore, pattern.Pattern.of(other), SETTINGS, moving)
         assert again.tangents == tangents.tangents and again is not tangents
+        # and another grid of the same robot
+        assert simulated(robot.replace(nodes=6)).shape != found.shape
     # of another structure
     refuse_traces(monkeypatch)
     with pytest.raises(AssertionError, match="traced again"):
-        simulated(robot.replace(nodes=6))
+        simulated(robot.replace(loads=(kc.robots.loads.AttachedMass(mass=0.01),)))
 
 
 def damage_half(content):

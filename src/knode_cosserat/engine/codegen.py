@@ -112,8 +112,17 @@ class Index:
     def __init__(self, value: Value, slot: list[str], delta: int = 0):
         self._root, self._slot, self.delta = value, slot, delta
 
-    def __add__(self, number: int) -> Index:
-        return Index(self._root, self._slot, self.delta + number)
+    def __add__(self, number: int | Value) -> Index:
+        """Return the sum with a number, known now or in the whole function (`Function.constant`)."""
+        if isinstance(number, int):
+            return Index(self._root, self._slot, self.delta + number)
+        function, root = self._root.function, self._root
+        key = (root.name, number.name)
+        if key not in function.addresses:
+            name = function.fresh()
+            self._slot.append(f"  {name} = add nsw i64 {root.name}, {number.name}")
+            function.addresses[key] = Value(function, name, "i64")
+        return Index(function.addresses[key], self._slot, self.delta)
 
     @property
     def value(self) -> Value:
@@ -255,6 +264,20 @@ class Function:
         if self.returned is not None:
             kind, end = self.returned.type, f"ret {self.returned.type} {self.returned.name}"
         return f"define {linkage}{kind} @{self.name}({given}) {inline} {{\nentry:\n{body}\n  {end}\n}}"
+
+    def constant(self, base: Value, offset: int) -> Value:
+        """Return a whole number in memory that does not change in this function."""
+        key = (base.name, offset)
+        if key not in self.addresses:
+            at, name = self.fresh(), self.fresh()
+            self._stack.append(f"  {at} = getelementptr inbounds double, ptr {base.name}, i64 {offset}")
+            self._stack.append(f"  {name} = load i64, ptr {at}")
+            self.addresses[key] = Value(self, name, "i64")
+        return self.addresses[key]
+
+    def constant_index(self, number: Value) -> Index:
+        """Return a number from `constant` as an index."""
+        return Index(number, self._stack)
 
     # lines
 

@@ -12,7 +12,7 @@ import functools
 import itertools
 import math
 import operator
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,36 +57,33 @@ class Core(EliminationCode):
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: its options, a trial point, and the correction from the last accepted one
         self.options = a(len(dataclasses.fields(NewtonOptions)))
-        self.trial, self.direction = a(ny, self.ends), a(ny, self.ends)
+        self.trial, self.direction = a(ny, "ends"), a(ny, "ends")
         self.trial_unknowns, self.direction_unknowns = a(k), a(k)
         # the motion: records of earlier states and their rate, states for the first guess, errors of records
-        first, memory = self._size, range(settings.memory)
-        self.records, self.rate = [a(numbers, self.count) for _ in memory], a(numbers, self.count)
-        self.past, self.weights, self.t0 = [a(ny, self.ends) for _ in range(3)], a(3), a(1)
-        self.errors, self.error_rate = [a(numbers, self.used) for _ in memory], a(numbers, self.used)
-        self.time_errors = [a(numbers, self.used) for _ in memory]
-        #: the state of a motion and that of an equilibrium: a part of the memory, and the arrays in it in the
-        #: order of a `StateHistory` and of a `Shape`
-        self.motion = slice(first, self._size), [
+        memory = range(settings.memory)
+        self.records, self.rate = [a(numbers, "count") for _ in memory], a(numbers, "count")
+        self.past, self.weights, self.t0 = [a(ny, "ends") for _ in range(3)], a(3), a(1)
+        self.errors, self.error_rate = [a(numbers, "used") for _ in memory], a(numbers, "used")
+        self.time_errors = [a(numbers, "used") for _ in memory]
+        #: arrays of the state of a motion (`StateHistory`) and of an equilibrium (`Shape`)
+        self.motion = [
             self.records, [self.rate], self.past, [self.weights], [self.t0],
             [*self.errors, self.error_rate], self.time_errors,
         ]  # fmt: skip
-        self.shape = slice(self.y.offset, self.unknowns.offset), [[self.y]]
+        self.shape = [[self.y]]
         #: of the stage solved last (`USABLE` and the next)
         self.numbers = a(8)
         #: for sizes relative to the state: one over the natural unit plus |y|
-        self.weights_of_y = a(ny, self.points)
+        self.weights_of_y = a(ny, "points")
         # corrected motions: history terms, defects
-        self.dH, self.own_dH = (a(numbers, self.used) for _ in range(2))
-        self.better, self.better_unknowns = a(ny, self.ends), a(k)
-        self.defect, self.own_defect, self.rest = (a(ny, self.pieces) for _ in range(3))
+        self.dH, self.own_dH = (a(numbers, "used") for _ in range(2))
+        self.better, self.better_unknowns = a(ny, "ends"), a(k)
+        self.defect, self.own_defect, self.rest = (a(ny, "pieces") for _ in range(3))
         self.tip_rest = a(k)
         # products of derivatives, for the error of the time scheme
-        self.difference, self.move, self.time_dH = (a(numbers, self.used) for _ in range(3))
-        self.tangents = StateArrays(
-            a(ny, self.ends), a(ny, self.used - self.ends), a(nz, self.used), a(ny, self.used)
-        )
-        self.dfe = a(ny, self.pieces) if self.near else self.tangents.f
+        self.difference, self.move, self.time_dH = (a(numbers, "used") for _ in range(3))
+        self.tangents = StateArrays(a(ny, "ends"), a(ny, "used between"), a(nz, "used"), a(ny, "used"))
+        self.dfe = a(ny, "pieces") if self.near else self.tangents.f
         self._write()
         self._functions = self.module.compile()
         guesses = stage_extrapolations(settings) if settings.stages > 1 else EXTRAPOLATIONS[None]
@@ -96,7 +93,7 @@ class Core(EliminationCode):
     def _write_weights(self) -> None:
         """Weights of sizes relative to the state."""
         self.weigh = f = self._function("weigh")
-        for i, j in self._components(self.equations.ny, self.points):
+        for i, j in self._components(self.equations.ny, self._count("points")):
             unit = self._unit(i, j)
             size = f.apply("abs", self._wide(self.y, i, j))
             self._write_wide(unit / (1.0 + unit * size), self.weights_of_y, i, j)
@@ -125,7 +122,7 @@ class Core(EliminationCode):
         renew, first, fresh, old, done = (truth(False) for _ in range(5))
         renew.set(~usable)
         old.set(usable)
-        for i, j in self._components(e.ny, self.points):
+        for i, j in self._components(e.ny, self._count("points")):
             self._write_wide(0.0, self.direction, i, j)
         for i in range(e.k):
             self._put(0.0, self.direction_unknowns, i)
@@ -148,11 +145,11 @@ class Core(EliminationCode):
                 fresh.set(fresh.get() & ~now)
                 renew.set(renew.get() & ~now)
                 linearisations.set(linearisations.get() + f.select(now, 1.0, 0.0))
-                self._copy_wide(self.y, self.trial, self.points)
+                self._copy_wide(self.y, self.trial, self._count("points"))
                 f.call(self.defects, memory)
             with f.if_(~anew.get()):
                 step = self._spread(damping.get())
-                for i, j in self._components(e.ny, self.points):
+                for i, j in self._components(e.ny, self._count("points")):
                     moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
                     self._write_wide(moved, self.trial, i, j)
                 for i in range(e.k):
@@ -165,7 +162,7 @@ class Core(EliminationCode):
             with f.if_(anew.get()):
                 for i in range(e.k):
                     self._put(self._get(self.unknowns, i), self.trial_unknowns, i)
-            now_error = f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
+            now_error = f.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
             # by the same factors, the correction shrinks as the residual does: a tiny one is not computed
             expected = left.get() * now_error
             enough = expected <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
@@ -173,7 +170,7 @@ class Core(EliminationCode):
             lengths = plain(0.0), plain(0.0)
             with f.if_(f.any(going & ~sure)):
                 f.call(self.correct, memory)
-                norms = self._norms(self.dy, self.points, self.weights_of_y)
+                norms = self._norms(self.dy, self._count("points"), self.weights_of_y)
                 for length, norm in zip(lengths, norms, strict=True):
                     length.set(norm)
             now_size, now_left = (each.get() for each in lengths)
@@ -203,7 +200,7 @@ class Core(EliminationCode):
             more = going & ~(good | dead | again)
             corrections.set(corrections.get() + f.select(more, 1.0, 0.0))
             wide_accept = self._spread(accept)
-            for i, j in self._components(e.ny, self.points):
+            for i, j in self._components(e.ny, self._count("points")):
                 for source, target in ((self.trial, self.y), (self.dy, self.direction)):
                     value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
                     self._write_wide(value, target, i, j)
@@ -238,7 +235,7 @@ class Core(EliminationCode):
                 self._write_rates_between(self.rates, k, check.stages[k], self.y, self.H)
             pairs = itertools.zip_longest(check.weights, formula.weights, fillvalue=0.0)
             changes = [weight - own for weight, own in pairs]
-            for i, j in self._components(e.ny, self.pieces):
+            for i, j in self._components(e.ny, self._count("pieces")):
                 self._write_wide(self._increment(changes, (self.f, self.fe), i, j), self.defect, i, j)
         self._write_records()
 
@@ -249,18 +246,18 @@ class Core(EliminationCode):
         memory, estimates, numbers, coefficients = f.arguments
         f.call(self.recorded, memory, estimates, coefficients)
         f.call(self.weigh, memory)
-        largest = f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
+        largest = f.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
         f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
         # the residual of the solution is no part of its errors
-        self._copy_wide(self.r, self.rest, self.pieces)
+        self._copy_wide(self.r, self.rest, self._count("pieces"))
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)
         # no residual has the strains of the tip; y_s is part of a record if B is not zero
         total = Variable(f, f.splat(f.value(0.0), self.L))
-        with self._places(self.count) as j:
+        with self._places(self._count("count")) as j:
             for i in range(e.ny, e.numbers):
                 size = f.apply("abs", self._wide(self.records[0], i, j))
-                total.set(total.get() + self._before(self.count, j, size))
+                total.set(total.get() + self._before(self._count("count"), j, size))
         finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
         f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
 
@@ -279,13 +276,13 @@ class Core(EliminationCode):
         e = self.equations
         f = self._function(name, "numbers")
         memory, numbers = f.arguments
-        for i, j in self._components(e.ny, self.pieces):
+        for i, j in self._components(e.ny, self._count("pieces")):
             defect = self._wide(self.defect, i, j) if has_defect else 0.0
             self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
-        for i, j in self._components(e.ny, self.ends):
+        for i, j in self._components(e.ny, self._count("ends")):
             start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
             self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
-        with self._places(self.used) as j:
+        with self._places(self._count("used")) as j:
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(history, i, j)
                 self._write_wide(value, self.own_dH, i, j)
@@ -296,12 +293,12 @@ class Core(EliminationCode):
         def evaluated() -> Value:
             self._write_base(self.better_unknowns, self.better, self.own_dH)
             f.call(self.residual_of_better, memory)
-            for i, j in self._components(e.ny, self.pieces):
+            for i, j in self._components(e.ny, self._count("pieces")):
                 value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
                 self._write_wide(value, self.r, i, j)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
-            return f.apply("max", *self._norms(self.r, self.pieces), self._tip_norm())
+            return f.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
 
         alive = f.load(numbers, ALIVE * self.P, self.P) > 0.0
         largest = Variable(f, f.splat(f.value(0.0), self.P))
@@ -311,32 +308,32 @@ class Core(EliminationCode):
 
         def going() -> Value:
             found = Variable(f, f.splat(f.value(0.0), self.L))
-            for i, j in self._components(e.ny, self.points):
+            for i, j in self._components(e.ny, self._count("points")):
                 y = self._wide(self.y, i, j)
                 change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
                 size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
-                size = self._before(self.points, j, size)
+                size = self._before(self._count("points"), j, size)
                 found.set(f.apply("max", found.get(), size))
             far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
             return f.any(far & alive) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
 
         with f.while_(going):
             f.call(self.correct, memory)
-            for i, j in self._components(e.ny, self.points):
+            for i, j in self._components(e.ny, self._count("points")):
                 value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
                 self._write_wide(value, self.better, i, j)
             for i in range(e.k):
                 value = self._get(self.better_unknowns, i) + self._get(self.step_unknowns, i)
                 self._put(value, self.better_unknowns, i)
-            _, size = self._norms(self.dy, self.points, self.weights_of_y)
+            _, size = self._norms(self.dy, self._count("points"), self.weights_of_y)
             before = largest.get()
             largest.set(evaluated())
             left.set(size * largest.get() / before)
             turns.set(turns.get() + 1.0)
         off, angle = self._errors_of_poses()
         known = self._spread(f.select(off <= self._get(self.length, 0), 1.0, float("nan")))
-        self._write_shift(errors, self.used)
-        for i, j, value in self._numbers_of(self._evaluated_at(self.better), self.used):
+        self._write_shift(errors, self._count("used"))
+        for i, j, value in self._numbers_of(self._evaluated_at(self.better), "used between"):
             self._write_wide((value - self._wide(self.records[0], i, j)) * known, errors[0], i, j)
         f.store(f.select(off <= self._get(self.length, 0), off, float("nan")), numbers, number * self.P)
         if has_defect:
@@ -348,11 +345,11 @@ class Core(EliminationCode):
         self.corrected_at_rest = f = self._function("corrected_at_rest", "numbers")
         memory, numbers = f.arguments
         ny = self.equations.ny
-        self._copy_wide(self.defect, self.r, self.pieces)
+        self._copy_wide(self.defect, self.r, self._count("pieces"))
         for i in range(self.equations.k):
             self._put(0.0, self.tip, i)
         f.call(self.correct, memory)
-        for i, j in self._components(ny, self.points):
+        for i, j in self._components(ny, self._count("points")):
             self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
         for number, value in zip((POSITION, ANGLE), self._errors_of_poses(), strict=True):
             f.store(value, numbers, number * self.P)
@@ -362,13 +359,13 @@ class Core(EliminationCode):
         f, layout = self._now, self.equations.strand.y_layout
         offs, angles = (Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(2))
         total = Variable(f, f.splat(f.value(0.0), self.L))
-        with self._places(self.points) as j:
+        with self._places(self._count("points")) as j:
 
             def change(i: int) -> Value:
                 return self._wide(self.better, i, j) - self._wide(self.y, i, j)
 
             def largest(found: Variable, value: Value) -> None:
-                value = self._before(self.points, j, value)
+                value = self._before(self._count("points"), j, value)
                 found.set(f.apply("max", found.get(), value))
                 total.set(total.get() + value)
 
@@ -409,13 +406,13 @@ class Core(EliminationCode):
                 c * self._wide(error, i, j) for c, error in zip(earlier, self.time_errors, strict=True)
             )
 
-        for i, j in self._components(e.numbers, self.used):
+        for i, j in self._components(e.numbers, self._count("used")):
             self._write_wide(carried(i, j), self.time_dH, i, j)
         with f.if_(f.compare("ne", earlier[1], 0.0)):
             # the difference of the rates at both stages, and its product with the equations' derivatives
-            for i, j in self._components(e.numbers, self.used):
+            for i, j in self._components(e.numbers, self._count("used")):
                 self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
-            for i, j in self._components(e.ny, self.points):
+            for i, j in self._components(e.ny, self._count("points")):
                 self._write_wide(0.0, self.dy, i, j)
             f.call(self.products, memory)
             state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
@@ -426,7 +423,7 @@ class Core(EliminationCode):
             for k in range(len(moved)):
                 self._put(0.0, self.w, k % e.ny, self.bases[k // e.ny])
             f.call(self.products, memory)
-            for i, j, product in self._numbers_of(self.tangents, self.used):
+            for i, j, product in self._numbers_of(self.tangents, "used between"):
                 once = product - self._wide(self.difference, i, j)
                 self._write_wide(carried(i, j) - c0 * scheme.defect * once, self.time_dH, i, j)
 
@@ -435,26 +432,28 @@ class Core(EliminationCode):
         e = self.equations
         self.products = self._function("products")
         (far, between, *_), tangents = self._evaluated_at(self.y), self.tangents
-        self._copy_wide(self.dy, tangents.far, self.points)
+        self._copy_wide(self.dy, tangents.far, self._count("points"))
         if self.far is not None:
-            with self._places(self.pieces) as j:
+            with self._places(self._count("pieces")) as j:
                 state = self._state_with_tangents((self.y, self.dy), j, j) | self._acting_at(j)
                 self._write_results([(tangents.far, e.products["far"])], j, state)
-        for k, point in enumerate(self.near):
+        for k in self.near:
             for i in range(e.ny):
-                self._put(self._get(self.dy, i, point), tangents.far, i, self.points + k)
+                value = self._get(self.dy, i, self._place(f"near {k}"))
+                self._put(value, tangents.far, i, self._place("points") + k)
         results = (tangents.f, e.products["rates"][: e.ny]), (tangents.z, e.products["rates"][e.ny :])
         ends = tangents.far, self.dy
         rates = tangents.f, self.dfe
-        with self._places(self.ends) as j:
+        with self._places(self._count("ends")) as j:
             self._write_results(results, j, self._state_with_tangents((far, tangents.far), j, j))
         self._write_ends(*rates)
         for k, stage in enumerate(self.space.formula.stages):
             self._write_between(k, stage, ends, rates, tangents.between)
-            with self._places(self.pieces) as j:
+            with self._places(self._count("pieces")) as j:
                 y = between, tangents.between
-                state = self._state_with_tangents(y, j + k * self.pieces, j + self.stages[k])
-                self._write_results(results, j + self.stages[k], state)
+                here = self._at_stage(k, j)
+                state = self._state_with_tangents(y, self._before_stage(k, j), here)
+                self._write_results(results, here, state)
         self._write_missing(ends, rates)
         state = self._tip_state(self.y, self.H) | self._tangents_of_history(self.tips)
         for tip, nodes in zip(self.tips, e.dy, strict=True):
@@ -462,7 +461,7 @@ class Core(EliminationCode):
         for i, value in enumerate(self._evaluated(e.products["tip"], 0, False, state)):
             self._put(value, self.tip, i)
 
-    def _tangents_of_history(self, points: list[int]) -> dict[int, Value]:
+    def _tangents_of_history(self, points: Sequence[Any]) -> dict[int, Value]:
         """Return the tangents of the history of each strand at its point."""
         return {
             int(node): self._get(self.move, i, point)
@@ -491,15 +490,15 @@ class Core(EliminationCode):
         if isinstance(self.scheme, SDIRK2):
             with f.if_(f.arguments[1] > 1):
                 of_rate = 1.0 / c0
-                for i, j, value in self._numbers_of(newest, self.used):
+                for i, j, value in self._numbers_of(newest, "used between"):
                     rate = value + self._wide(self.H, i, j) * of_rate
                     step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
                     self._write_wide(rate - step, self.difference, i, j)
-        self._write_shift(self.records, self.count)
-        for i, j, value in self._numbers_of(newest, self.count):
+        self._write_shift(self.records, self._count("count"))
+        for i, j, value in self._numbers_of(newest, "between"):
             self._write_wide(value, self.records[0], i, j)
         if self.settings.uses_rate:
-            for i, j in self._components(e.numbers, self.count):
+            for i, j in self._components(e.numbers, self._count("count")):
                 value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
                 self._write_wide(value, self.rate, i, j)
 
@@ -525,9 +524,9 @@ class Core(EliminationCode):
                 for k in places:
                     f.store(math.nan, numbers, k * P, P)
                 for array in arrays:
-                    for i, j in self._components(array.size, self.used):
+                    for i, j in self._components(array.size, self._count("used")):
                         self._write_wide(math.nan, array, i, j)
-        step, nodes = Variable(f, f.value(0, "i64")), len(self.grid.nodes)
+        step, nodes = Variable(f, f.value(0, "i64")), self._count("nodes")
 
         def going() -> Value:
             return (step.get() < steps) & f.any(f.load(numbers, ALIVE * P, P) > 0.0)
@@ -545,7 +544,7 @@ class Core(EliminationCode):
                     target = f.pointer(rows, (number * nodes + node.value) * (self.strands * e.numbers * P))
                     for q, i in np.ndindex(self.strands, e.numbers):
                         array = self.y if i < e.ny else self.records[0]
-                        value = self._get(array, i, point + self.bases[q])
+                        value = self._get(array, i, self._of_strand(q, point))
                         f.store(value, target, (q * e.numbers + i) * P, P)
                 info = f.pointer(infos, number * ((8 + e.k) * P))
                 for k in range(8):
@@ -571,7 +570,7 @@ class Core(EliminationCode):
         c0, *earlier, d1, t = (f.load(coefficients, i) for i in range(self.settings.memory + 3))
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
-        def history(states: list[Array], rate: Array, target: Array, count: int) -> None:
+        def history(states: list[Array], rate: Array, target: Array, count: Value) -> None:
             for i, j in self._components(e.numbers, count):
                 value = _sum(c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True))
                 if self.settings.uses_rate:
@@ -579,9 +578,9 @@ class Core(EliminationCode):
                 self._write_wide(value, target, i, j)
 
         with f.if_(self._is_moving(coefficients)):
-            history(self.records, self.rate, self.H, self.count)
+            history(self.records, self.rate, self.H, self._count("count"))
             weights = [self._wide(self.weights, k) for k in range(3)]
-            for i, j in self._components(e.ny, self.points):
+            for i, j in self._components(e.ny, self._count("points")):
                 guess = weights[0] * self._wide(self.past[0], i, j)
                 for k in (1, 2):
                     guess = guess + weights[k] * self._wide(self.past[k], i, j)
@@ -597,10 +596,10 @@ class Core(EliminationCode):
         with f.if_(estimates > 0), f.if_(~self._is_moving(coefficients)):
             f.call(self.corrected_at_rest, memory, numbers)
         with f.if_(estimates > 0), f.if_(self._is_moving(coefficients)):
-            history(self.errors, self.error_rate, self.dH, self.used)
+            history(self.errors, self.error_rate, self.dH, self._count("used"))
             f.call(self.corrected, memory, numbers)
             if self.settings.uses_rate:
-                for i, j in self._components(e.numbers, self.used):
+                for i, j in self._components(e.numbers, self._count("used")):
                     value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
                     self._write_wide(value, self.error_rate, i, j)
         if isinstance(self.scheme, SDIRK2):
@@ -623,7 +622,7 @@ class Core(EliminationCode):
             for half in range(2)
         )
         misfits = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(3)]
-        for i, j in self._components(e.ny, self.points):
+        for i, j in self._components(e.ny, self._count("points")):
             past = [self._wide(each, i, j) for each in self.past]
             unit, y = self._unit(i, j), self._wide(self.y, i, j)
             for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
@@ -631,7 +630,7 @@ class Core(EliminationCode):
                 for k in range(1, order + 1):
                     guess = guess + past[k] * weights[k]
                 size = f.apply("abs", guess - y) * unit
-                size = self._before(self.points, j, size)
+                size = self._before(self._count("points"), j, size)
                 misfit.set(f.apply("max", misfit.get(), size))
         sizes = [self._largest(each.get()) for each in misfits]
         least = f.apply("max", f.apply("min", sizes[0], f.apply("min", sizes[1], sizes[2])), ROUNDING)
@@ -643,7 +642,7 @@ class Core(EliminationCode):
             for order in range(k, 3):
                 weight = weight + trusts[order] / total * following[order][k]
             self._put(weight, self.weights, k)
-        self._write_shift([self.y, *self.past], self.points)
+        self._write_shift([self.y, *self.past], self._count("points"))
 
     def _write_vectors(self) -> None:
         """Runs of vectors of robots in turn, each from its state, which is replaced by the state after it.
@@ -653,19 +652,21 @@ class Core(EliminationCode):
         """
         e, P, L = self.equations, self.P, self.L
         names = ["memory", "motions", "parameters", "controls", "coefficients", "extrapolations", "results"]
-        names += ["n_first", "n_size", "n_vectors", "n_steps", "n_stages", "n_estimates"]
+        names += ["n_size", "n_vectors", "n_steps", "n_stages", "n_estimates"]
         f = self._now = self.module.function("run", names, exported=True)
         memory, motions, parameters, controls, coefficients, extrapolations, results = f.arguments[:7]
-        first, size, vectors, steps, stages, estimates = f.arguments[7:]
-        solves = steps * stages
-        rows = solves * (len(self.grid.nodes) * self.strands * e.numbers * P)
+        size, vectors, steps, stages, estimates = f.arguments[7:]
+        solves, is_moving = steps * stages, self._is_moving(coefficients)
+        rows = solves * (self._count("nodes") * (self.strands * e.numbers * P))
         infos = solves * ((8 + e.k) * P)
-        state = f.pointer(memory, first)
+        states = [(is_moving, [*itertools.chain(*self.motion)]), (~is_moving, [self.y])]
         with f.loop(vectors) as vector:
             k = vector.value
             own = f.pointer(motions, k * size)
-            with f.loop(size, 0, L) as j:
-                f.store(f.load(own, j.value, L), state, j.value, L)
+            for condition, state in states:
+                with f.if_(condition):
+                    for inside, outside in self._packed_vectors(state, own):
+                        f.store(f.load(outside, 0, L), inside, 0)
             with f.loop(self.params.size * P, 0, P) as i:
                 value = f.load(parameters, k * (self.params.size * P) + i.value, P)
                 f.store(value, self._pointer(self.params, 0), i.value, P)
@@ -679,8 +680,10 @@ class Core(EliminationCode):
             f.store(self._get(self.length, 0), reached, P, P)
             least = f.splat(f.value(1.0), P) if self.batch else f.result(f"sitofp i64 {steps.name} to double")
             moved = self._spread(f.load(reached, 0, P) >= least)
-            with f.loop(size, 0, L) as j:
-                f.store(f.select(moved, f.load(state, j.value, L), f.load(own, j.value, L)), own, j.value, L)
+            for condition, state in states:
+                with f.if_(condition):
+                    for inside, outside in self._packed_vectors(state, own):
+                        f.store(f.select(moved, f.load(inside, 0, L), f.load(outside, 0, L)), outside, 0)
 
     def _write_evaluate(self) -> None:
         """The state at y and history terms; y is corrected at points between nodes, `n_most` a segment."""
@@ -689,7 +692,7 @@ class Core(EliminationCode):
         memory, coefficients, control, most = f.arguments
         f.call(self.setup, memory)
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
-        if len(self.grid.between):
+        if self.near:
             self._write_filling(most, self.rates_and_slopes, self.rates)
         f.call(self.recorded, memory, 1, coefficients)
 
@@ -737,13 +740,13 @@ class Core(EliminationCode):
         Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at
         the nodes.
         """
-        memory = self._empty_memory()
+        memory, layout = self._empty_memory(), self.layout
         self._put_in(memory[None], self.params, parameters[None, None, None])
 
         def evaluate(c0: float, t: float, control: Any, history: Any, y: Any) -> Evaluated:
             most = 0
-            if len(y) < self.strand_points:
-                y, most = self.grid.spread(y), self.grid.parts.shape[1] - 1
+            if len(y) < layout["points of strand"]:
+                y, most = layout.grid.spread(y), layout["most"]
             for array, values in ((self.H, history), (self.y, y)):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
@@ -751,9 +754,10 @@ class Core(EliminationCode):
             self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), most)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
-            error = np.max(np.abs(defects[: self.pieces]) * inverse[: self.pieces])
-            y = self._joined(self.y, y, self.strand_points)
-            records = self._joined(self.records[0], records, self.grid.count)
+            pieces = slice(layout["pieces"])
+            error = np.max(np.abs(defects[pieces]) * inverse[pieces])
+            y = self._joined(self.y, y, layout["points of strand"])
+            records = self._joined(self.records[0], records, layout.grid.count)
             return Evaluated(y.copy(), records.copy(), error, tip[0].copy())
 
         return evaluate

@@ -26,8 +26,6 @@ from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
 from knode_cosserat.solvers.problem import FILLING
 
-#: pieces between two changes of the unknowns
-GROUPS = (3, 4, 5)
 #: columns that are solved side by side: each operation of a column waits for the one before
 COLUMNS = 2
 #: corrections between nodes with new factors, and the largest, in natural units, after which none is needed
@@ -68,41 +66,41 @@ class EliminationCode(RodCode):
         self.nonzero_M = np.zeros((k, ny), dtype=bool)
         for i, c, _ in self.tip_slopes:
             self.nonzero_M[i, c % ny] = True
-        self.factor = a(len(self.elimination.factors), self.pieces)
+        self.factor = a(len(self.elimination.factors), "pieces")
         #: true if B⁻¹ A is formed; the recursion along the rod solves by B in every piece if it is not
         self.has_matrix = not (robots or self.keeps_both)
         if self.keeps_both:
-            self.entries = a(len(self.elimination.entries), self.pieces)
+            self.entries = a(len(self.elimination.entries), "pieces")
         if not self.has_matrix:
             self.added = self.r
         else:
             #: columns of B⁻¹ A, and B⁻¹ r: places in lanes, and rows in lanes for the recursion along the rod
-            self.wide_matrix = a(ny * (ny + 1), self.pieces)
-            self.matrix, self.added = by_rows(ny, ny, self.pieces), by_rows(ny, 1, self.pieces)
+            self.wide_matrix = a(ny * (ny + 1), "pieces")
+            self.matrix, self.added = by_rows(ny, ny, "pieces"), by_rows(ny, 1, "pieces")
         if not robots:
-            self.wide_added = a(ny, self.pieces)
+            self.wide_added = a(ny, "pieces")
         #: columns of the unknowns along the rod
-        self.X = by_rows(ny, self.own, self.points)
-        tip = self.grid.tip
-        # a change of the unknowns costs about two pieces
-        size = min(GROUPS, key=lambda each: -(-tip // each) * (each + 2))
-        #: number of pieces of a group, and of groups of a strand
-        self.groups = size, (tip - 1) // size
-        self.T = by_rows(self.own, self.own, self.groups[1] * self.strands)
+        self.X = by_rows(ny, self.own, "points")
+        self.T = by_rows(self.own, self.own, "groups")
         self.M, self.inverse = by_rows(k, ny, self.strands), by_rows(k, k, 1)
         #: M X with orthogonal columns, and the factor that makes them so
         self.at_tip, self.triangle = by_rows(k, k, 1), by_rows(k, k, 1)
         self.zeros = by_rows(ny, 1, 1)
         #: the solution, its unknowns, and the correction of both
-        self.y, self.unknowns = a(ny, self.ends), a(k)
-        self.dy, self.step_unknowns = a(ny, self.ends), a(k)
+        self.y, self.unknowns = a(ny, "ends"), a(k)
+        self.dy, self.step_unknowns = a(ny, "ends"), a(k)
         #: corrections along the rod at fixed unknowns, changes of unknowns at the ends of groups of pieces,
         #: all corrections, and those of each strand's unknowns
-        self.w, self.beta = by_rows(ny, 1, self.points), by_rows(self.own, 1, self.groups[1] * self.strands)
-        self.column_dy = self.dy if robots else by_rows(ny, 1, self.points)
+        self.w, self.beta = by_rows(ny, 1, "points"), by_rows(self.own, 1, "groups")
+        self.column_dy = self.dy if robots else by_rows(ny, 1, "points")
         self.alpha = by_rows(self.own, 1, self.strands)
         #: history terms of the step
-        self.H = a(self.equations.numbers, self.count)
+        self.H = a(self.equations.numbers, "count")
+
+    @property
+    def groups(self) -> tuple[Value, Value]:
+        """Number of pieces of a group, and of groups of a strand."""
+        return self._count("pieces of group"), self._count("groups of strand")
 
     def _filled(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the structural nonzeros of X and of T anywhere along the rod."""
@@ -161,7 +159,7 @@ class EliminationCode(RodCode):
             f.call(function, memory)
         if not self.has_matrix:
             return
-        with self._places(self.pieces) as j:
+        with self._places(self._count("pieces")) as j:
             first = self._pointer(self.wide_matrix, j)
             for rows, function in zip(blocks, solved_columns, strict=True):
                 # the last column may be another block's, zero in these rows
@@ -172,7 +170,8 @@ class EliminationCode(RodCode):
             source = c.value * (n * self.wide_matrix.component) + self.wide_matrix.offset
             target = c.value * self._padded(n) + self.matrix.offset
             wide = f.pointer(memory, source), self.wide_matrix.component
-            self._transpose(n, self.pieces, wide, (f.pointer(memory, target), self.matrix.place))
+            columns = f.pointer(memory, target), self.matrix.place
+            self._transpose(n, self._count("pieces"), wide, columns)
 
     def _write_factor_of(self, name: str, block: range) -> Function:
         """Factors and A of all pieces, in a block of rows and columns."""
@@ -181,7 +180,7 @@ class EliminationCode(RodCode):
         entries = [k for k, (i, _) in enumerate(el.entries) if i in block]
         outputs = [] if self.batch else [int(node) for node in el.matrix[block][:, block].flat]
         outputs += [el.factors[k] for k in factors]
-        with self._places(self.pieces) as j:
+        with self._places(self._count("pieces")) as j:
             known = self._slopes_at(j)
             results = [(self.factor, [(k, el.factors[k]) for k in factors])]
             if self.keeps_both:
@@ -286,7 +285,7 @@ class EliminationCode(RodCode):
                 f.call(advance, memory, source, *zero, target, j.value)
 
         with f.loop(self.strands) as strand:
-            base = strand.value * self.strand_points
+            base = strand.value * self._count("points of strand")
             with f.loop(count) as g:
                 last = f.index(base + (g.value + 1) * size)
                 with f.loop(last.value, base + g.value * size) as j:
@@ -297,7 +296,7 @@ class EliminationCode(RodCode):
                 for c in range(own):
                     self._set_column(columns[c], self.X, ny, c, last)
                     self._set_column(T[c], self.T, own, c, group)
-            tip = f.index(base + self.grid.tip)
+            tip = f.index(base + self._count("tip 0"))
             with f.loop(tip.value, base + count * size) as j:
                 piece(j)
             M = [self._column(self.M, k, i, strand) for i in range(ny)]
@@ -408,16 +407,17 @@ class EliminationCode(RodCode):
         self.correct = f = self._function("correct")
         memory = f.arguments[0]
         if not self.batch:
-            with self._places(self.pieces) as j:
+            with self._places(self._count("pieces")) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
                 f.call(self.solved, memory, *points, j.value)
             wide = self._pointer(self.wide_added, 0), self.wide_added.component
-            self._transpose(ny, self.pieces, wide, (self._pointer(self.added, 0), self.added.place))
+            columns = self._pointer(self.added, 0), self.added.place
+            self._transpose(ny, self._count("pieces"), wide, columns)
         self._write_correction()
         if not self.batch:
             wide = self._pointer(self.dy, 0), self.dy.component
             columns = self._pointer(self.column_dy, 0), self.column_dy.place
-            self._transpose(ny, self.points, wide, columns, back=True)
+            self._transpose(ny, self._count("points"), wide, columns, back=True)
         for k in range(self.equations.k):
             strand, i = divmod(k, self.own)
             self._put(self._get(self.alpha, i, strand), self.step_unknowns, k)
@@ -439,17 +439,17 @@ class EliminationCode(RodCode):
             with f.if_(~(turn < RENEWALS)):
                 self._write_places(rates, self.y, self.H)
             self._write_defects(self.y, self.H)
-            with self._places(self.pieces) as j:
+            with self._places(self._count("pieces")) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
                 f.call(self.solved, f.arguments[0], *points, j.value)
-            largest = f.value(0.0)
-            for point in (base + int(cut) for base in self.bases for cut in self.grid.between):
+            left.set(0.0)
+            with f.loop(self._count("filled")) as cut:
+                point = self._from_table(self.filled.offset, cut.value * 3)
                 for i in range(ny):
-                    change = self._get(self.wide_added, i, point - 1)
+                    change = self._get(self.wide_added, i, point + -1)
                     self._put(self._get(self.y, i, point) + change, self.y, i, point)
                     unit = self._get(self.scale_y, i, point if self.strands > 1 else 0)
-                    largest = f.apply("max", largest, f.apply("abs", change) * unit)
-            left.set(largest)
+                    left.set(f.apply("max", left.get(), f.apply("abs", change) * unit))
             turns.set(turns.get() + 1)
 
     def _write_correction(self) -> None:
@@ -463,7 +463,7 @@ class EliminationCode(RodCode):
 
         tips = [Variable(f, each) for each in self._column(self.tip, k)]
         with f.loop(self.strands) as strand:
-            base = strand.value * self.strand_points
+            base = strand.value * self._count("points of strand")
             with f.loop(count) as g:
                 last = f.index(base + (g.value + 1) * size)
                 with f.loop(last.value, base + g.value * size) as j:
@@ -476,7 +476,7 @@ class EliminationCode(RodCode):
                 self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
                 group = f.index(strand.value * count + g.value)
                 self._set_column(self._gathered(w, self.pivots), self.beta, own, 0, group)
-            tip = f.index(base + self.grid.tip)
+            tip = f.index(base + self._count("tip 0"))
             with f.loop(tip.value, base + count * size) as j:
                 piece(j)
             w = self._column(self.w, ny, 0, tip)
@@ -501,9 +501,9 @@ class EliminationCode(RodCode):
                 self._set_column([a + b for a, b in zip(w, moved, strict=True)], self.column_dy, ny, 0, j)
 
         with f.loop(self.strands) as strand:
-            base = strand.value * self.strand_points
+            base = strand.value * self._count("points of strand")
             alpha = [Variable(f, each) for each in self._column(self.alpha, own, 0, strand)]
-            correct(base + (count * size + 1), base + self.strand_points)
+            correct(base + (count * size + 1), base + self._count("points of strand"))
             with f.loop(0, count - 1, -1) as g:
                 end = base + (g.value + 1) * size
                 correct(end, end + 1)

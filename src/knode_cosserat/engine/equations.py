@@ -19,7 +19,6 @@ from knode_cosserat.engine.program import LARGEST_PRODUCT, PRODUCTS, Program
 from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 
@@ -137,20 +136,20 @@ class Equations(Sizes):
 
         def geometry(leaves: Any) -> Any:
             own = jax.tree.unflatten(tree, leaves)
-            still, scales = StepProblem.still(own, space, np.zeros(self.nc)), own.scales()
-            length = jnp.asarray(own.length)[None]
-            return 1.0 / scales.y, 1.0 / scales.tip, still.places, still.lengths()[:, 0], length
+            scales = own.scales()
+            return 1.0 / scales.y, 1.0 / scales.tip, jnp.asarray(own.length)[None]
 
         one, step = np.zeros(()), (leaves, 1.0, 0.0, np.zeros(self.nc))
-        # of the parameters alone: inverse scales, places and lengths of pieces
+        # of the parameters alone: inverse scales, and the length, of which places and pieces are parts
         self.geometry = [
             np.broadcast_to(nodes, size)
             for nodes, size in zip(
                 program.evaluate(jax.make_jaxpr(geometry)(leaves), folded),
-                (len(whole_y), self.k, grid_of(system, space).count, grid_of(system, space).tip, 1),
+                (len(whole_y), self.k, 1),
                 strict=True,
             )
         ]
+        self.length = int(self.geometry[2][0])
         known = [*folded, self.c0, self.t, self.control]
         traced = jax.make_jaxpr(rates)(step, one, np.ones(self.ny), np.zeros(self.numbers))
         self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
@@ -279,8 +278,6 @@ class TangentEquations(Equations):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
         moved = np.concatenate([nodes[moves] for nodes, moves in zip(self.parameters, moving, strict=True)])
-        grid = grid_of(system, space)
-        places = self.geometry[2][: grid.ends + len(space.formula.stages) * grid.tip]
         #: arrays of moving parameters that are read in memory, with the place of each in their vector
         self.moving_arrays = {
             array: int(np.searchsorted(moved, nodes.flat[0]))
@@ -288,24 +285,22 @@ class TangentEquations(Equations):
             if (array := self.program.known_inputs(nodes)) is not None and np.isin(nodes, moved).all()
         }
         moves = [*moved, *self.moving_arrays]
-        self.moves_lengths = bool(self.program.dependent(self.geometry[3], moves))
-        moves += [self.s.item()] if self.program.dependent(places, moves) else []
+        self.moves_lengths = bool(self.program.dependent([self.length], moves))
+        moves += [self.s.item()] if self.moves_lengths else []
         moved_nodes = self.program.dependent([*itertools.chain(*results.values())], moves)
         #: numbers of the results that move with the system at fixed y
         self.moving_rows = {
             name: [i for i, node in enumerate(nodes) if node in moved_nodes]
             for name, nodes in results.items()
         }
-        (self._pull if transposed else self._push)(results, moved, places)
+        (self._pull if transposed else self._push)(results, moved)
 
-    def _push(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
+    def _push(self, results: dict[str, list[int]], moved: np.ndarray) -> None:
         program = self.program
         self.dparameters = program.inputs("dparameter", moved.shape, RUN, True)
         tangents = dict(zip(moved.tolist(), self.dparameters.tolist(), strict=True))
-        #: tangents of places and of lengths of pieces
-        self.dplaces, self.dlengths = (
-            program.derivative(nodes, tangents) for nodes in (places, self.geometry[3])
-        )
+        #: tangent of the length
+        [self.dlength] = program.derivative([self.length], tangents)
         self.ds = program.inputs("ds", (), PLACE)
         tangents[self.s.item()] = self.ds.item()
         #: tangents of the results by the system, at fixed y, history and control
@@ -334,7 +329,7 @@ class TangentEquations(Equations):
                 found.add(node)
         return sorted(found)
 
-    def _pull(self, results: dict[str, list[int]], moved: np.ndarray, places: np.ndarray) -> None:
+    def _pull(self, results: dict[str, list[int]], moved: np.ndarray) -> None:
         program = self.program
         moving = [*moved, *self.moving_arrays]
         #: cotangents of the results
@@ -354,14 +349,11 @@ class TangentEquations(Equations):
         }
         outputs = [node for nodes in self.pulled.values() for node in nodes]
         self.pulled_terms = self._hoisted(outputs, {STEP, RUN})
-        #: cotangents of the parameters from those of the terms, and of places and lengths of pieces
+        #: cotangents of the parameters from those of the terms, and of the length
         self.of_terms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
-        self.of_places = program.inputs("cotangent of place", places.shape, RUN)
-        self.of_lengths = program.inputs("cotangent of length", self.geometry[3].shape, RUN)
+        self.of_length = program.inputs("cotangent of length", (), RUN)
         self.by_terms = program.gradient(self.moving_terms, self.of_terms, moving)
-        self.by_geometry = program.gradient(
-            [*places, *self.geometry[3]], [*self.of_places, *self.of_lengths], moving
-        )
+        self.by_geometry = program.gradient([self.length], [self.of_length.item()], moving)
 
     def _scalars_of(self, terms: Sequence[int]) -> set[int]:
         """Return terms with the scalars from which arrays among them are computed in their place."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -10,17 +11,18 @@ import jax
 import numpy as np
 
 from knode_cosserat.engine.core import Core
+from knode_cosserat.engine.layout import layout_of
 from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import StepCoefficients, StepRows
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.time import TWO_STAGES
 
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
+AnyCode = TypeVar("AnyCode", Core, TangentCore, CotangentCore)
 
 
 def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
@@ -32,26 +34,30 @@ def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
         EngineError: the engine does not cover the system or the settings.
     """
     schemes = Settings(settings.time or TWO_STAGES, settings.space)
-    build = functools.partial(Core, pattern.system, schemes, robots)
-    return compiled((pattern, schemes, robots), Core, build, _given(pattern, schemes))
+    build = functools.partial(Core, pattern.in_room.system, schemes, robots)
+    core = compiled((pattern.in_room, schemes, robots), Core, build, _given(schemes))
+    return _on_grid(core, pattern)
 
 
-def _given(pattern: Pattern, settings: Settings) -> dict[str, Any]:
+def _given(settings: Settings) -> dict[str, Any]:
     """Return the attributes of a core that are no data of its own."""
-    space = settings.space
-    return {
-        "settings": settings, "scheme": settings.time, "space": space,
-        "grid": grid_of(pattern.system, space),
-    }  # fmt: skip
+    return {"settings": settings, "scheme": settings.time, "space": settings.space}
+
+
+def _on_grid(core: AnyCode, pattern: Pattern) -> AnyCode:
+    """Return code with the layout of a grid."""
+    found = copy.copy(core)
+    found.layout = layout_of(pattern.system, core.space)
+    return found
 
 
 def tangents_for(
     kind: type[AnyTangents], pattern: Pattern, settings: Settings, moving: Sequence[np.ndarray]
 ) -> AnyTangents:
     """Return the core of tangents or cotangents of a pattern, with masks of `moving` parameters."""
-    key = pattern, masks_of(moving), settings.space, settings.memory, settings.uses_rate, kind
-    build = functools.partial(kind, pattern.system, settings, moving)
-    return compiled(key, kind, build, _given(pattern, settings))
+    key = pattern.in_room, masks_of(moving), settings.space, settings.memory, settings.uses_rate, kind
+    build = functools.partial(kind, pattern.in_room.system, settings, moving)
+    return _on_grid(compiled(key, kind, build, _given(settings)), pattern)
 
 
 def solve_steps(

@@ -11,12 +11,13 @@ import contextlib
 import dataclasses
 import functools
 import itertools
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from knode_cosserat.engine.codegen import Function, Index, Module, Stores, Value, vector_lanes
+from knode_cosserat.engine.layout import GridLayout, Layout
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +34,8 @@ class Array:
     memory: int = 0
     #: true if tangents are in lanes
     is_tangent: bool = False
+    #: name of the number of places that are used (`Layout`); empty if it is `count`
+    where: str = ""
 
     def at(self, i: int, j: int) -> int:
         """Return the offset of component i at place j."""
@@ -42,30 +45,43 @@ class Array:
 class Memory:
     """Arrays of a run, and the function that is being written."""
 
-    def __init__(self, robots: bool, places: int):
-        self.batch, self.L = robots, vector_lanes()
+    #: counts of the grid that runs
+    layout: GridLayout
+
+    def __init__(self, robots: bool, room: Layout):
+        self.batch, self.L, self.room = robots, vector_lanes(), room
         #: lanes of a plain value
         self.P = self.L if robots else 1
         #: distance between components of a single robot's arrays
         # an odd number of vectors: components spread over all sets of the cache
-        self.stride = (-(-(places + 1) // self.L) + 1 | 1) * self.L
+        self.stride = (-(-(room["count"] + 1) // self.L) + 1 | 1) * self.L
         self.module = Module()
-        self._size = 0
+        #: counts in memory, as whole numbers
+        self._size, self._counts = (
+            -(-len(room.counts) // self.L) * self.L,
+            {name: k for k, name in enumerate(room.counts)},
+        )
 
-    def _array(self, size: int, count: int = 0, memory: int = 0) -> Array:
+    def _room(self, count: int | str) -> tuple[int, str]:
+        """Return the largest number of places, and the name of that of a grid, if it has one."""
+        return (self.room[count], count) if isinstance(count, str) else (count, "")
+
+    def _array(self, size: int, where: int | str = 0, memory: int = 0) -> Array:
         """Reserve an array: robots in lanes, or places in lanes."""
+        count, name = self._room(where)
         place, component = (size * self.L, self.L) if self.batch else (1, self.stride if count else 1)
-        found = Array(self._size, size, count, component, place, memory)
+        found = Array(self._size, size, count, component, place, memory, where=name)
         length = size * max(count, 1) * self.L if self.batch else size * component
         self._size += -(-length // self.L) * self.L
         return found
 
-    def _by_rows(self, rows: int, columns: int, count: int) -> Array:
+    def _by_rows(self, rows: int, columns: int, where: int | str) -> Array:
         """Reserve matrices by columns: a vector has a row of all robots, or as many rows as lanes."""
         size = columns * self._padded(rows)
         if self.batch:
-            return self._array(size, count)
-        found = Array(self._size, size, count, 1, size)
+            return self._array(size, where)
+        count, name = self._room(where)
+        found = Array(self._size, size, count, 1, size, where=name)
         # a transpose writes as many columns as there are lanes
         self._size += size * -(-count // self.L) * self.L
         return found
@@ -89,6 +105,38 @@ class Memory:
         """Rows of a matrix in one vector."""
         return 1 if self.batch else self.L
 
+    # counts of the grid that runs
+
+    def _count(self, name: str) -> Value:
+        """Return a count in the function that is being written."""
+        return self._now.constant(self._now.arguments[0], self._counts[name])
+
+    def _place(self, name: str) -> Index:
+        """Return a place that has a name."""
+        return self._now.constant_index(self._count(name))
+
+    def _used_places(self, array: Array) -> Any:
+        """Return the number of an array's places that are used."""
+        return self._count(array.where) if array.where else array.count
+
+    def _packed_vectors(self, arrays: Sequence[Array], outside: Value) -> Iterator[tuple[Value, Value]]:
+        """Write loops over vectors of arrays, and yield their addresses in memory and outside (`_packed`)."""
+        f = self._now
+        for array in arrays:
+            inside, rows, width = f.pointer(f.arguments[0], array.offset), 1, f.value(array.size, "i64")
+            if self.batch:
+                width = width * self.L * (self._used_places(array) or 1)
+            elif array.where:
+                rows, width = array.size, self._count(array.where)
+            # whole vectors
+            width = f.result(f"and i64 {(width + (self.L - 1)).name}, {-self.L}", "i64")
+            with f.loop(rows) as i:
+                source = f.pointer(inside, i.value * array.component)
+                target = f.pointer(outside, i.value * width)
+                with f.loop(width, 0, self.L) as k:
+                    yield f.pointer(source, k.value), f.pointer(target, k.value)
+            outside = f.pointer(outside, width * rows)
+
     # numbers from outside
 
     def _numbers(self, memory: np.ndarray, array: Array, first: int = 0) -> np.ndarray:
@@ -106,7 +154,25 @@ class Memory:
         target = self._numbers(memory, array, first)
         count = values.shape[-2]
         target[:, :, :count] = values
-        target[:, :, count:] = values[:, :, -1:]
+        if not self.batch:
+            target[:, :, count:] = values[:, :, -1:]
+
+    def _packed(self, arrays: Sequence[Array]) -> list[Array]:
+        """Return arrays one after the other outside of the memory, of the places that are used."""
+        found, at = list[Array](), 0
+        for array in arrays:
+            count = self.layout[array.where] if array.where else array.count
+            component = -(-count // self.L) * self.L if count and not self.batch else array.component
+            own = dataclasses.replace(array, offset=at, count=count, component=component)
+            found.append(own)
+            at += self._size_of(own)
+        return found
+
+    def _size_of(self, packed: Array) -> int:
+        """Return the numbers of an array outside of the memory, in whole vectors."""
+        if self.batch:
+            return packed.size * max(packed.count, 1) * self.L
+        return -(-packed.size * packed.component // self.L) * self.L
 
     # code that reads and writes
 
@@ -175,7 +241,7 @@ class Memory:
         return f.splat(f.lane(column[row // self.L], row % self.L), self.L)
 
     @contextlib.contextmanager
-    def _places(self, count: int, first: int = 0) -> Iterator[Index]:
+    def _places(self, count: Any, first: int = 0) -> Iterator[Index]:
         """Write a loop over places, all independent: one by one, or as many as there are lanes.
 
         The last lanes of a single robot may lie beyond the last place. They hold numbers that nobody reads.
@@ -191,14 +257,14 @@ class Memory:
             with self._now.loop(size) as i:
                 yield i
 
-    def _components(self, size: int, count: int) -> Iterator[tuple[Any, Index]]:
+    def _components(self, size: int, count: Any) -> Iterator[tuple[Any, Index]]:
         """Write a loop over places, and yield each component with the place."""
         with self._places(count) as j:
             for i in self._each(size):
                 yield i, j
 
     def _transpose(
-        self, rows: int, places: int, wide: tuple[Value, int], by_rows: tuple[Value, int], back: bool = False
+        self, rows: int, places: Any, wide: tuple[Value, int], by_rows: tuple[Value, int], back: bool = False
     ) -> None:
         """Copy numbers with places in lanes to columns with rows in lanes, or back.
 
@@ -217,28 +283,30 @@ class Memory:
                 for value, at in zip(f.transposed(values), then, strict=False):
                     f.store(value, *at)
 
-    def _copy_wide(self, source: Array, target: Array, count: int, shift: int = 0) -> None:
+    def _copy_wide(self, source: Array, target: Array, count: Any, shift: int = 0) -> None:
         """Copy values at places, to places that are earlier by a shift."""
         for i, j in self._components(source.size, count):
             self._write_wide(self._wide(source, i, j + shift), target, i, j)
 
-    def _write_shift(self, states: list[Array], count: int) -> None:
+    def _write_shift(self, states: list[Array], count: Any) -> None:
         """Shift earlier states by one step."""
         for newer, older in reversed(list(itertools.pairwise(states))):
             self._copy_wide(newer, older, count)
 
-    def _before(self, end: int, j: Index, value: Value) -> Value:
+    def _before(self, end: Any, j: Index, value: Value) -> Value:
         """Return a value, but zero in the lanes from a place on."""
         return value if self.batch else self._now.select(self._inside(j, end), value, 0.0)
 
-    def _inside(self, j: Index, end: int) -> Any:
+    def _inside(self, j: Index, end: Any) -> Any:
         """Return true for the lanes before a place."""
         if self.batch:
             return True
         f = self._now
         numbers = f.joined([f.value(float(k)) for k in range(self.L)])
-        here = f.result(f"sitofp i64 {j.value.name} to double")
-        return numbers + here < float(end)
+        here, stop = (
+            f.result(f"sitofp i64 {each.name} to double") for each in (j.value, f.value(end, "i64"))
+        )
+        return numbers + here < stop
 
     def _largest(self, value: Value) -> Value:
         """Return the largest of a wide value for each robot."""

@@ -40,8 +40,11 @@ class Motions:
     def __init__(self, core: Core, parameters: np.ndarray, states: Any, steps: StepCoefficients):
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
         self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
-        #: part of the memory that is a state, and its arrays
-        self._own, self._arrays = core.shape if self._kind is Shape else core.motion
+        parts = core.shape if self._kind is Shape else core.motion
+        arrays = core._packed([array for part in parts for array in part])
+        #: size of a state, and the arrays of its parts in it
+        self._packed_size, rest = sum(map(core._size_of, arrays)), iter(arrays)
+        self._arrays = [[next(rest) for _ in part] for part in parts]
         self._shapes = [np.shape(values)[1:] for values in states]
         self._memory = core._empty_memory()
         options = dataclasses.astuple(steps.settings.newton)
@@ -49,13 +52,8 @@ class Motions:
             self._view(self._memory[None], [array])[:] = numbers
         self.set_parameters(parameters)
         #: states of the vectors of robots
-        self.motions = np.empty((len(self._parameters), self._own.stop - self._own.start))
+        self.motions = np.empty((len(self._parameters), self._packed_size))
         self.put(states, np.arange(len(self.motions) * core.P))
-
-    @property
-    def _span(self) -> tuple[int, int]:
-        """First number of a state in the memory, and its size."""
-        return self._own.start, self._own.stop - self._own.start
 
     @property
     def _estimates(self) -> int:
@@ -76,14 +74,15 @@ class Motions:
             values = np.asarray(values, float)
             values = values.reshape(len(values), len(arrays), -1, core._width(arrays[0]))
             values = core._by_strand(arrays[0], values)[np.minimum(np.arange(len(places)), len(values) - 1)]
-            target, count = self._view(self.motions, arrays, self._own.start), values.shape[-2]
+            target, count = self._view(self.motions, arrays), values.shape[-2]
             # the last place is repeated in the lanes beyond it
             for where, own in ((slice(count), values), (slice(count, None), values[..., -1:, :])):
                 target[vectors, lanes, :, where] = own
 
     def set_times(self, t0: Float[np.ndarray, " robots"]) -> None:
         """Set the times (s) of row 0."""
-        self._view(self.motions, [self.core.t0], self._own.start)[:, :, 0, 0, 0] = self._in_lanes(t0)
+        # the parts are those of a `StateHistory`
+        self._view(self.motions, self._arrays[4])[:, :, 0, 0, 0] = self._in_lanes(t0)
 
     def _in_lanes(self, values: np.ndarray) -> np.ndarray:
         """Return values (vectors, lanes, ...) of robots; the last robot is repeated in the last vector."""
@@ -93,28 +92,25 @@ class Motions:
             values = values[np.minimum(np.arange(vectors * P), self.size - 1)]
         return values.reshape(vectors, P, *values.shape[1:])
 
-    def _view(self, memory: np.ndarray, arrays: list[Array], first: int = 0) -> np.ndarray:
-        """Return numbers (vectors, lanes, arrays, places, size) of arrays at even distances in memories.
-
-        The memories (vectors, n) begin with the number `first`.
-        """
-        shape, at, strides = self._place_of(arrays, first)
+    def _view(self, memory: np.ndarray, arrays: list[Array]) -> np.ndarray:
+        """Return numbers (vectors, lanes, arrays, places, size) of arrays at even distances in memories."""
+        shape, at, strides = self._place_of(arrays)
         return np.ndarray((len(memory), *shape), float, memory, at, (memory.strides[0], *strides))
 
-    def _place_of(self, arrays: list[Array], first: int) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
+    def _place_of(self, arrays: list[Array]) -> tuple[tuple[int, ...], int, tuple[int, ...]]:
         """Return the shape (lanes, arrays, places, size) of arrays, their first byte, and their strides."""
         core, one = self.core, arrays[0]
-        places = one.count if core.batch else core.stride * (one.count > 0)
+        places = one.count if core.batch else one.component * (one.count > 0)
         apart = arrays[1].offset - one.offset if len(arrays) > 1 else 0
         shape = core.P, len(arrays), max(places, 1), one.size
-        return shape, 8 * (one.offset - first), (8, 8 * apart, 8 * one.place, 8 * one.component)
+        return shape, 8 * one.offset, (8, 8 * apart, 8 * one.place, 8 * one.component)
 
     @functools.cached_property
     def _places(self) -> list[tuple[tuple[int, ...], int, tuple[int, ...]]]:
         """Shape, first place and strides of each part of the state of one robot of one strand."""
         found = []
         for arrays, shape in zip(self._arrays, self._shapes, strict=True):
-            _, at, strides = self._place_of(arrays, self._own.start)
+            _, at, strides = self._place_of(arrays)
             found.append((shape, at, strides[len(strides) - len(shape) :]))
         return found
 
@@ -138,7 +134,7 @@ class Motions:
         found = []
         for arrays, shape in zip(self._arrays, self._shapes, strict=True):
             count = math.prod(shape) // (len(arrays) * self.core._width(arrays[0]))
-            view = self._view(motions, arrays, self._own.start)
+            view = self._view(motions, arrays)
             values = self.core._joined(arrays[0], view, count)
             found.append(values.reshape(-1, *shape)[: self.size])
         return self._kind(*found)
@@ -182,7 +178,7 @@ class Motions:
         """Return the shapes of a vector's results: rows, numbers of stages, steps done and length."""
         core, e = self.core, self.core.equations
         numbers = core.strands * e.numbers
-        shapes = (count, stages, len(core.grid.nodes), numbers), (count, stages, 8 + e.k), (2,)
+        shapes = (count, stages, core.layout["nodes"], numbers), (count, stages, 8 + e.k), (2,)
         return tuple((*shape, core.P) for shape in shapes)
 
     def _run(self, first: int, acting: np.ndarray, table: np.ndarray, results: np.ndarray) -> None:
@@ -191,7 +187,12 @@ class Motions:
         own = (each[first:] for each in (self.motions, self._parameters, acting))
         arrays = self._memory, *own, table, core._guesses, results
         core._functions["run"](
-            *(each.ctypes.data for each in arrays), *self._span, len(results), count, stages, self._estimates
+            *(each.ctypes.data for each in arrays),
+            self._packed_size,
+            len(results),
+            count,
+            stages,
+            self._estimates,
         )
         if not core.batch and 0 < (done := int(results[0, -2])) < count:
             # again, for the state before the step that failed
@@ -227,8 +228,8 @@ class Motions:
         table[:, -1] = (i + ends) * self.steps.dt
         after, results = before.copy(), np.zeros(size)
         self.core._functions["run"](
-            self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, *self._span, 1, 1,
-            len(acting), self._estimates,
+            self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, self._packed_size,
+            1, 1, len(acting), self._estimates,
         )  # fmt: skip
         if not results[-2]:
             return before, None, NOT_SOLVED

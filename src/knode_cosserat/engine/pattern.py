@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Module, vector_lanes
 from knode_cosserat.engine.equations import MOST_OPERATIONS, PLACE, RUN, STEP, constant_zeros, is_moving
+from knode_cosserat.engine.layout import in_room
 from knode_cosserat.engine.program import EngineError, Program
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced
@@ -60,6 +61,11 @@ class Pattern:
             mask = np.unpackbits(np.frombuffer(bits, np.uint8), count=size).reshape(shape)
             leaves.append(1.0 - mask)
         return jax.tree.unflatten(self.structure, leaves)
+
+    @functools.cached_property
+    def in_room(self) -> Pattern:
+        """The pattern of this structure for which code is written, which serves other grids too."""
+        return Pattern(jax.tree.structure(in_room(self.system)), self.zeros)
 
 
 def _say() -> None:
@@ -184,7 +190,7 @@ def values_along(function: Callable[[Any, Any, Any], Any], system: System, s: An
     Raises:
         EngineError: the engine does not cover the function.
     """
-    pattern, control = Pattern.of(system), np.asarray(control, dtype=float)
+    pattern, control = Pattern.of(system).in_room, np.asarray(control, dtype=float)
     code = compiled(
         (pattern, function, len(control)), _PlaceCode,
         lambda: _PlaceCode(function, pattern.system, len(control)),

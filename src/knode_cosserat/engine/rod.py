@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import functools
-import itertools
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -14,8 +13,8 @@ import numpy as np
 from knode_cosserat.engine.arrays import Stored
 from knode_cosserat.engine.codegen import Function, Index, Stores, Sums, Value, Variable
 from knode_cosserat.engine.equations import Equations
+from knode_cosserat.engine.layout import Layout
 from knode_cosserat.engine.memory import Array, Memory
-from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.space import Stage
 
 
@@ -39,75 +38,67 @@ class RodCode(Memory):
     rates_and_slopes: Function
 
     def __init__(self, equations: Equations, robots: bool):
-        system = equations.system
-        self.equations, self.grid, self.space = equations, grid_of(system, equations.space), equations.space
-        e, grid = self.equations, self.grid
-        self.strands, self.strand_points = e.strands, grid.tip + 1
-        self.points = self.strands * self.strand_points
-        self.pieces = self.points - 1
-        #: first and last point of each strand
-        self.bases = [q * self.strand_points for q in range(self.strands)]
-        self.tips = [base + grid.tip for base in self.bases]
-        #: points that have a near side
-        self.near = [base + int(point) for base in self.bases for point in grid.near]
-        self.ends = self.points + len(self.near)
-        #: first places of the stages of scheme and check, and the numbers of places of both and of the scheme
-        self.check_stages = [self.ends + k * self.pieces for k in range(len(self.space.check.stages))]
+        system, room = equations.system, Layout.room_of(equations.system, equations.space)
+        super().__init__(robots, room)
+        self.equations, self.space, self.strands = equations, equations.space, equations.strands
+        e = self.equations
+        #: numbers of points with a near side, and of stages of the check and of the scheme
+        self.near = list(range(self.strands * room.near))
+        self.check_stages = list(range(len(self.space.check.stages)))
         self.stages = self.check_stages[: len(self.space.formula.stages)]
-        self.count, self.used = (
-            self.ends + len(stages) * self.pieces for stages in (self.check_stages, self.stages)
-        )
-        strands, pieces = range(self.strands), list(np.ndindex(self.strands, self.strand_points))[:-1]
-        #: strand and place in the grid of each place; an idle piece has the stages of the one before
-        self.origins = [(q, j) for q in strands for j in range(self.strand_points)]
-        self.origins += [(q, j) for q in strands for j in range(self.strand_points, grid.ends)]
-        for k in range(len(self.check_stages)):
-            self.origins += [(q, grid.stage(k).start + min(j, grid.tip - 1)) for q, j in pieces]
-        super().__init__(robots, self.count)
         ny, nz, k, a = e.ny, e.nz, e.k, self._array
         self.params, self.scale_tip = a(len(e.parameter_values)), a(k)
-        self.scale_y = a(ny, 0 if self.strands == 1 else self.points)
+        self.scale_y = a(ny, 0 if self.strands == 1 else "points")
         self.inputs, self.step_terms = a(2 + e.nc), a(e.size(e.step_terms))
-        self.s, self.h, self.length = a(1, self.count), a(1, self.pieces), a(1)
-        scale_y, scale_tip, places, lengths, length = e.geometry
-        idle = e.program.constant(0.0)
-        units = np.repeat(scale_y.reshape(-1, ny).T, self.scale_y.count // self.strands or 1, axis=1)
-        #: arrays of numbers that depend on the parameters alone, and their nodes (size, count)
-        self.geometry = [
-            (self.scale_y, units),
-            (self.scale_tip, scale_tip[:, None]),
-            (self.s, places[None, [place for _, place in self.origins]]),
-            (self.h, np.tile(np.append(lengths, idle), self.strands)[None, :-1]),
-            (self.length, length[None]),
-        ]
-        self.place_terms = a(e.size(e.place_terms), self.count)
-        self.f, self.z = a(ny, self.count), a(nz, self.count)
-        self.slope = a(len(e.pattern), self.used)
+        self.s, self.h, self.length = a(1, "count"), a(1, "pieces"), a(1)
+        #: places and pieces as parts of the length
+        self.s_parts, self.h_parts = a(1, "count"), a(1, "pieces")
+        self.place_terms = a(e.size(e.place_terms), "count")
+        self.f, self.z = a(ny, "count"), a(nz, "count")
+        self.slope = a(len(e.pattern), "used")
         # at the ends of pieces; without near sides these are the starts of the next ones
         self.fe, self.slope_end = (
-            a(each.size, self.pieces) if self.near else each for each in (self.f, self.slope)
+            a(each.size, "pieces") if self.near else each for each in (self.f, self.slope)
         )
-        self.acting, self.jump = a(e.acting.size, self.pieces), a(len(e.jumping), self.pieces)
+        self.acting, self.jump = a(e.acting.size, "pieces"), a(len(e.jumping), "pieces")
         #: y at the places of the ends; with jumps it differs from y at the points
-        self.far = a(ny, self.ends) if system.discontinuities.jump is not None else None
+        self.far = a(ny, "ends") if system.discontinuities.jump is not None else None
         #: y at the stages between ends
-        self.between = a(ny, self.count - self.ends)
-        #: points of the nodes, as whole numbers
-        self.node_table = a(len(grid.nodes))
+        self.between = a(ny, "between")
+        #: points of the nodes, and points between nodes with the nodes around them, as whole numbers
+        self.node_table, self.filled = a(room["nodes"]), a(3 * room["filled"])
+        #: parts of segments before points between nodes
+        self.filled_parts = a(room["filled"])
         #: slopes of jumps
         self.jumps = [(self.jump, [node for *_, node in e.jumping])]
         #: defects of the pieces and of the tip
-        self.r, self.tip = a(ny, self.pieces), a(k)
+        self.r, self.tip = a(ny, "pieces"), a(k)
         #: subtracted from the tip's residual
         self.tip_offset = a(k)
 
+    @property
+    def bases(self) -> list[Any]:
+        """First points of the strands."""
+        return [0, *(self._place(f"base {q}") for q in range(1, self.strands))]
+
+    @property
+    def tips(self) -> list[Index]:
+        """Last points of the strands."""
+        return [self._place(f"tip {q}") for q in range(self.strands)]
+
     def _empty_memory(self) -> np.ndarray:
-        """Return the memory before a run: zeros, but for discontinuities and nodes; aligned to 64 bytes."""
-        raw = np.zeros(self._size + 8)
+        """Return the memory before a run: zeros, but for the layout of the grid; aligned to 64 bytes."""
+        raw, layout = np.zeros(self._size + 8), self.layout
         found = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-        if self.acting.size:
-            self._put_in(found[None], self.acting, self.grid.acting[None, None])
-        found[self.node_table.offset :].view(np.int64)[: len(self.grid.nodes)] = self.grid.nodes
+        numbers = (self.s_parts, layout.along[:, None]), (self.h_parts, layout.lengths[:, None])
+        for array, values in (*numbers, (self.acting, layout.acting)):
+            if array.size:
+                self._put_in(found[None], array, values[None, None])
+        whole = found.view(np.int64)
+        whole[: len(layout.counts)] = list(layout.counts.values())
+        whole[self.node_table.offset :][: len(layout.nodes)] = layout.nodes
+        whole[self.filled.offset :][: layout.filled.size] = layout.filled.T.ravel()
+        found[self.filled_parts.offset :][: len(layout.filled_parts)] = layout.filled_parts
         return found
 
     def _width(self, array: Array) -> int:
@@ -118,23 +109,26 @@ class RodCode(Memory):
         """Return an array's numbers from those of all strands at places of the grid (…, places, width)."""
         if self._width(array) == array.size:
             return packed
-        strand, place = np.transpose([each for each in self.origins if each[1] < packed.shape[-2]])
+        origins = self.layout.origins
+        strand, place = np.transpose([each for each in origins if each[1] < packed.shape[-2]])
         return self.equations.by_strand(packed)[..., place, strand, :]
 
     def _joined(self, array: Array, values: np.ndarray, count: int) -> np.ndarray:
         """Return the numbers of all strands at the first places of the grid (…, count, width)."""
         if self._width(array) == array.size:
             return values[..., :count, :]
-        first = {origin: k for k, origin in reversed(list(enumerate(self.origins)))}
+        first = {origin: k for k, origin in reversed(list(enumerate(self.layout.origins)))}
         places = [[first[q, j] for q in range(self.strands)] for j in range(count)]
         return self.equations.joined(values[..., places, :])
 
     def _node(self, node: Index) -> Index:
         """Return the point of a node."""
+        return self._from_table(self.node_table.offset, node.value) if self.near else node
+
+    def _from_table(self, offset: int, k: Value) -> Index:
+        """Return a whole number of a table."""
         f = self._now
-        if not len(self.grid.between):
-            return node
-        at = f.pointer(f.pointer(f.arguments[0], self.node_table.offset), node.value)
+        at = f.pointer(f.pointer(f.arguments[0], offset), k)
         return f.index(f.result(f"load i64, ptr {at.name}", "i64"))
 
     def _known(self, j: Any, wide: bool, state: dict[int, Any]) -> dict[int, Any]:
@@ -194,19 +188,28 @@ class RodCode(Memory):
         """Scales, places and lengths of pieces: once a run."""
         e = self.equations
         self.setup = f = self._function("setup")
-        outputs = [int(node) for _, nodes in self.geometry for node in nodes.flat]
+        outputs = [int(node) for nodes in e.geometry for node in nodes.flat]
         values = f.evaluate(e.program, outputs, self._parameters(outputs), self.P)
-        for array, nodes in self.geometry:
-            # the lanes beyond the last place have its numbers
-            beyond = 0 if self.batch or not array.count else self.stride - array.count
-            for i, row in enumerate(np.pad(nodes, ((0, 0), (0, beyond)), mode="edge")):
-                first = 0
-                for node, places in itertools.groupby(row):
-                    stop = first + len(list(places))
-                    # a loop, even for one place: LLVM is slow where a block has thousands of stores
-                    with f.loop(stop, first) as j:
-                        self._put(values[int(node)], array, i, j)
-                    first = stop
+        scale_y, scale_tip, length = e.geometry
+        for i, node in enumerate(scale_tip):
+            self._put(values[int(node)], self.scale_tip, i)
+        self._put(values[int(length[0])], self.length, 0)
+        for k, node in enumerate(scale_y):
+            q, i = divmod(k, e.ny)
+            if self.strands == 1:
+                self._put(values[int(node)], self.scale_y, i)
+                continue
+            with f.loop(self._count("points of strand")) as j:
+                self._put(values[int(node)], self.scale_y, i, self._of_strand(q, j))
+        whole = self._spread(self._get(self.length, 0))
+        for source, target in ((self.s_parts, self.s), (self.h_parts, self.h)):
+            # also in the lanes beyond the last place
+            with self._places(source.count if not self.batch else self._used_places(source)) as j:
+                self._write_wide(whole * self._wide(source, 0, j), target, 0, j)
+
+    def _of_strand(self, q: int, j: Index) -> Index:
+        """Return the place j of strand q in loops over the places of a strand."""
+        return j + self._count(f"base {q}") if q else j
 
     def _inputs_of(
         self, array: Array, inputs: Sequence[np.ndarray], outputs: Iterable[int]
@@ -232,7 +235,7 @@ class RodCode(Memory):
         if not e.place_terms:
             return
         known = {node: values[node] for node in e.step_terms} | state
-        with self._places(self.count) as j:
+        with self._places(self._count("count")) as j:
             here = known | {e.s.item(): self._wide(self.s, 0, j)}
             values = f.evaluate(e.program, e.place_terms, here, self.L)
             self._put_terms(values, self.place_terms, e.place_terms, j, self.L)
@@ -278,25 +281,29 @@ class RodCode(Memory):
         e = self.equations
         far = y if self.far is None else self.far
         if self.far is not None:
-            self._copy_wide(y, far, self.points)
-            with self._places(self.pieces) as j:
+            self._copy_wide(y, far, self._count("points"))
+            with self._places(self._count("pieces")) as j:
                 results = (far, e.far), *(self.jumps if slopes else ())
                 self._write_results(results, j, self._state(y, history, j) | self._acting_at(j))
-        # also in the lanes beyond, where a loop of the equations would not end
-        beyond = 0 if self.batch else -self.ends % self.L
-        for k, point in enumerate([*self.near, *self.near[-1:] * beyond]):
+        for k in self.near:
             for i in range(e.ny):
-                self._put(self._get(y, i, point), far, i, self.points + k)
+                self._put(self._get(y, i, self._place(f"near {k}")), far, i, self._place("points") + k)
+        # also in the lanes beyond, where a loop of the equations would not end
+        if self.near and not self.batch:
+            with self._now.loop(self._count("ends of vectors"), self._count("ends")) as j:
+                for i in range(e.ny):
+                    self._put(self._get(y, i, self._place(f"near {self.near[-1]}")), far, i, j)
         return far
 
     def _write_ends(self, source: Array, target: Array) -> None:
         """Copy values at places to the ends of pieces, if these are other places."""
         if target is source:
             return
-        self._copy_wide(source, target, self.pieces, shift=1)
-        for k, point in enumerate(self.near):
+        self._copy_wide(source, target, self._count("pieces"), shift=1)
+        for k in self.near:
             for i in range(source.size):
-                self._put(self._get(source, i, self.points + k), target, i, point - 1)
+                value = self._get(source, i, self._place("points") + k)
+                self._put(value, target, i, self._place(f"near {k}") + -1)
 
     def _write_residual(self, name: str, y: Array, history: Array) -> Function:
         """Rates at all ends of pieces by y, and the defects of all pieces and of the tip."""
@@ -308,7 +315,7 @@ class RodCode(Memory):
     def _write_places(self, function: Function, y: Array, history: Array, slopes: bool = False) -> None:
         """Evaluate a function of rates at all places that the scheme uses."""
         far = self._write_far(y, history, slopes)
-        with self._places(self.ends) as j:
+        with self._places(self._count("ends")) as j:
             self._rates_at(function, far, history, j)
         self._write_ends(self.f, self.fe)
         for k, stage in enumerate(self.space.formula.stages):
@@ -318,30 +325,37 @@ class RodCode(Memory):
         self, function: Function, k: int, stage: Stage, y: Array, history: Array
     ) -> None:
         """Evaluate a function of rates at a stage of all pieces."""
-        first = self.check_stages[k]
         far = y if self.far is None else self.far
         self._write_between(k, stage, (far, y), (self.f, self.fe), self.between)
-        with self._places(self.pieces) as j:
-            self._rates_at(function, self.between, history, j + (first - self.ends), j + first)
+        with self._places(self._count("pieces")) as j:
+            self._rates_at(function, self.between, history, self._before_stage(k, j), self._at_stage(k, j))
+
+    def _at_stage(self, k: int, j: Index) -> Index:
+        """Return the place of stage k of a piece."""
+        return j + self._count(f"stage {k}")
+
+    def _before_stage(self, k: int, j: Index) -> Index:
+        """Return the place of stage k of a piece among those between ends."""
+        return j + self._count(f"pieces {k}") if k else j
 
     def _write_between(
         self, k: int, stage: Stage, y: tuple[Array, Array], rates: tuple[Array, Array], target: Array
     ) -> None:
         """Write y at stage k, from y at starts of pieces and at points, and earlier rates."""
-        for i, j in self._components(self.equations.ny, self.pieces):
+        for i, j in self._components(self.equations.ny, self._count("pieces")):
             ends = self._wide(y[0], i, j), self._wide(y[1], i, j + 1)
             mean = self._weighted((1.0 - stage.end, stage.end), ends)
             moved = self._increment(stage.rates, rates, i, j)
-            self._write_wide(mean + moved, target, i, j + k * self.pieces)
+            self._write_wide(mean + moved, target, i, self._before_stage(k, j))
         with self._idle_pieces() as j:
             for i in range(self.equations.ny):
-                self._put(self._get(y[0], i, j), target, i, j + k * self.pieces)
+                self._put(self._get(y[0], i, j), target, i, self._before_stage(k, j))
 
     @contextlib.contextmanager
     def _idle_pieces(self) -> Iterator[Index]:
         """Write a loop over the pieces between strands."""
         with self._now.loop(self.strands - 1) as q:
-            yield self._now.index(q.value * self.strand_points) + (self.strand_points - 1)
+            yield self._now.index((q.value + 1) * self._count("points of strand")) + -1
 
     def _increment(self, weights: Sequence[float], rates: tuple[Array, Array], i: int, j: Index) -> Value:
         """Return h times the weighted sum of a piece's rates: at its start, its end and its stages."""
@@ -352,7 +366,8 @@ class RodCode(Memory):
     def _places_of(self, rates: tuple[Array, Array], j: Index) -> list[tuple[Array, Index]]:
         """Return where a piece's rates are: at its start, its end and its stages."""
         at, end = rates
-        return [(at, j), (end, j + int(end is at)), *((at, j + first) for first in self.check_stages)]
+        stages = ((at, self._at_stage(k, j)) for k in self.check_stages)
+        return [(at, j), (end, j + int(end is at)), *stages]
 
     def _weighted(self, weights: Sequence[float], values: Sequence[Value], unit: Any = 1.0) -> Value:
         """Return a weighted sum times a unit, by one product for each size of a weight."""
@@ -377,12 +392,15 @@ class RodCode(Memory):
         """Return the arrays of the state that was evaluated last, from y at the points."""
         return StateArrays(y if self.far is None else self.far, self.between, self.z, self.f)
 
-    def _numbers_of(self, state: StateArrays, stop: int) -> Iterator[tuple[int, Index, Value]]:
-        """Write loops over places, and yield components of their records, places and numbers."""
+    def _numbers_of(self, state: StateArrays, between: str) -> Iterator[tuple[int, Index, Value]]:
+        """Write loops over places, and yield components of their records, places and numbers.
+
+        `between` is the count of places between ends.
+        """
         e = self.equations
-        for y, start, end in ((state.far, 0, self.ends), (state.between, self.ends, stop)):
-            with self._places(end - start) as j:
-                here, first = j + start, 0
+        for y, count in (state.far, "ends"), (state.between, between):
+            with self._places(self._count(count)) as j:
+                here, first = j if count == "ends" else j + self._count("ends"), 0
                 for array, size, at in (
                     (y, e.ny, j), (state.z, e.nz, here), (state.f, e.numbers - e.ny - e.nz, here)
                 ):  # fmt: skip
@@ -392,7 +410,7 @@ class RodCode(Memory):
 
     def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
         """Write the defects of all pieces: y at their ends by the scheme, minus y."""
-        for i, j in self._components(self.equations.ny, self.pieces):
+        for i, j in self._components(self.equations.ny, self._count("pieces")):
             change = self._wide(y[0], i, j) - self._wide(y[1], i, j + 1)
             value = change + self._increment(self.space.formula.weights, rates, i, j)
             self._write_wide(value, self.r, i, j)
@@ -418,7 +436,7 @@ class RodCode(Memory):
         }
         return state | self._history_of_strands(history, self.tips)
 
-    def _history_of_strands(self, history: Array, points: Sequence[int]) -> dict[int, Value]:
+    def _history_of_strands(self, history: Array, points: Sequence[Any]) -> dict[int, Value]:
         """Return the values of the history of each strand at its point."""
         e = self.equations
         return {
@@ -432,7 +450,7 @@ class RodCode(Memory):
         state = {int(node): self._get(unknowns, i) for i, node in enumerate(e.unknowns)}
         return state | self._history_of_strands(history, self.bases)
 
-    def _norms(self, array: Array, count: int, *weights: Array) -> list[Value]:
+    def _norms(self, array: Array, count: Any, *weights: Array) -> list[Value]:
         """Return the largest component in natural units, and by further weights; infinite for NaN."""
         f, zero = self._now, self._now.splat(self._now.value(0.0), self.L)
         every = self.scale_y, *weights

@@ -68,8 +68,8 @@ class StepMap(EliminationCode):
         e, a = self.equations, self._array
         ny, nx, numbers, k = e.ny, e.ny + e.nz, e.numbers, e.k
         # derivatives at all places
-        self.z_by_y = a(len(e.z_by_y), self.used)
-        self.places = {"rates": self.used, "far": self.pieces, "tip": 1, "base": 1}
+        self.z_by_y = a(len(e.z_by_y), "used")
+        self.places: dict[str, int | str] = {"rates": "used", "far": "pieces", "tip": 1, "base": 1}
         self.by_history = {name: a(len(e.by_history[name]), n) for name, n in self.places.items()}
         self.by_control = {name: a(len(e.by_control[name]), n) for name, n in self.places.items()}
         #: numbers of the results at fixed y that are not always zero; all slopes act on rates at stages
@@ -82,19 +82,19 @@ class StepMap(EliminationCode):
         reached = range(ny) if self.stages else self.rows["far"]
         slopes = {i for i, c in e.pattern if c in reached}
         self.rows["rates"] = sorted(slopes.union(self.rows["rates"]))
-        groups, blocks = self.groups[1] * self.strands, range(0, self.own, COLUMNS)
+        blocks = range(0, self.own, COLUMNS)
         #: columns of X and T in lanes, in as many vectors as are needed
         self.width = len(blocks) * COLUMNS
         self.X, self.T = (
             dataclasses.replace(self._columns(rows * len(blocks), count), component=1)
-            for rows, count in ((ny, self.points), (self.own, groups))
+            for rows, count in ((ny, "points"), (self.own, "groups"))
         )
         #: component of a packed row for each number of each strand's record
         self.packed = e.by_strand(np.arange(self.strands * numbers))
         many = a if transposed else self._columns
         whole, self._size = self._size, 0
         #: arrays of a state, which last from step to step, and its size
-        self.lasting = [many(numbers, self.used, STATE) for _ in range(settings.memory + 1)]
+        self.lasting = [many(numbers, "used", STATE) for _ in range(settings.memory + 1)]
         self._reserve_state()
         self.state_size, self._size = self._size, whole
         #: records change places from step to step; the new one takes the place of the oldest
@@ -103,20 +103,21 @@ class StepMap(EliminationCode):
             for n, each in enumerate(self.lasting[:-1])
         ]
         # without jumps, y at the points is part of the new record
-        y = dataclasses.replace(records[-1], size=ny, count=self.points)
+        y = dataclasses.replace(records[-1], size=ny, count=self.room["points"], where="points")
         t = self.tangents = Tangents(
-            records, self.lasting[-1], many(numbers, self.used), many(nx, self.used), many(ny, self.pieces),
-            many(ny, self.used - self.ends), many(1, self.pieces), many(k, 1), many(ny * self.strands, 1),
-            many(ny, self.pieces), many(ny, self.points), many(self.own, groups + self.strands),
-            many(self.own, groups), y if self.far is None else many(ny, self.points), many(ny, self.used),
+            records, self.lasting[-1], many(numbers, "used"), many(nx, "used"), many(ny, "pieces"),
+            many(ny, "used between"), many(1, "pieces"), many(k, 1), many(ny * self.strands, 1),
+            many(ny, "pieces"), many(ny, "points"), many(self.own, "groups and tips"),
+            many(self.own, "groups"), y if self.far is None else many(ny, "points"), many(ny, "used"),
             records[-1],
         )  # fmt: skip
         #: the results of the equations at fixed y, by the names of their derivatives
         self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
 
-    def _columns(self, size: int, count: int, memory: int = 0) -> Array:
+    def _columns(self, size: int, where: int | str, memory: int = 0) -> Array:
         """Reserve an array of tangents side by side."""
-        found = Array(self._size, size, count, COLUMNS, size * COLUMNS, memory)
+        count, name = self._room(where)
+        found = Array(self._size, size, count, COLUMNS, size * COLUMNS, memory, where=name)
         self._size += size * count * COLUMNS
         return found
 
@@ -140,18 +141,19 @@ class StepMap(EliminationCode):
 
     def _write_along(self) -> None:
         """X along the strands from their bases; at the tips the inverse of M X."""
-        k, own, (size, count) = self.equations.k, self.own, self.groups
+        k, own = self.equations.k, self.own
         self.along = f = self._function("along")
+        size, count = self.groups
 
         advance = functools.partial(Loop, body=self._columns_advanced)
         with f.loop(self.strands) as strand:
-            base = strand.value * self.strand_points
+            base = strand.value * self._count("points of strand")
             with f.loop(count) as g:
                 first = base + g.value * size
                 last = f.index(first + size)
                 write(self, [advance(first, last.value)], COLUMNS, False)
                 self._write_change(last, f.index(strand.value * count + g.value))
-            tip = f.index(base + self.grid.tip)
+            tip = f.index(base + self._count("tip 0"))
             write(self, [advance(base + count * size, tip.value)], COLUMNS, False)
             column = strand.value * (own * self._padded(k))
             for i, block in itertools.product(range(k), range(0, own, COLUMNS)):
@@ -206,11 +208,11 @@ class StepMap(EliminationCode):
         def by_data(name: str, places: Sequence[Any], j: Any) -> list[Operation]:
             return self._by_data(name, j, places, (weights, control))
 
-        found: list[Operation] = [Loop(0, self.used, lambda j: by_data("rates", [j], j))]
+        found: list[Operation] = [Loop(0, self._count("used"), lambda j: by_data("rates", [j], j))]
         if self.rows["far"]:
-            found.append(Loop(0, self.pieces, lambda j: by_data("far", [j], j)))
+            found.append(Loop(0, self._count("pieces"), lambda j: by_data("far", [j], j)))
         if self.equations.moves_lengths:
-            found.append(Loop(0, self.pieces, lambda j: [Scale(Number(t.lengths, 0, j))]))
+            found.append(Loop(0, self._count("pieces"), lambda j: [Scale(Number(t.lengths, 0, j))]))
         return [*found, *by_data("tip", self.tips, 0), *by_data("base", self.bases, 0)]
 
     def _by_data(self, name: str, j: Any, places: Sequence[Any], data: Any) -> list[Operation]:
@@ -242,20 +244,23 @@ class StepMap(EliminationCode):
         t, c0 = self.tangents, self._now.load(coefficients, 0)
         found = self._near_ends(t.rates) + self._correction()
         if self.far is not None:
-            found.append(Loop(0, self.points, lambda j: _copies(self.equations.ny, (t.newest, j), (t.y, j))))
-        for k, point in enumerate(self.near):
-            found += _copies(self.equations.ny, (t.newest, self.points + k), (t.y, point))
+            found.append(
+                Loop(0, self._count("points"), lambda j: _copies(self.equations.ny, (t.newest, j), (t.y, j)))
+            )
+        for k in self.near:
+            near = t.y, self._place(f"near {k}")
+            found += _copies(self.equations.ny, (t.newest, self._place("points") + k), near)
         if self.far is not None:
-            found.append(Loop(0, self.pieces, self._jumped))
+            found.append(Loop(0, self._count("pieces"), self._jumped))
         if self.stages or self.equations.system.mixed:
-            found += [Loop(0, self.ends, self._change_of_rates), *self._near_ends(t.change)]
+            found += [Loop(0, self._count("ends"), self._change_of_rates), *self._near_ends(t.change)]
             for k in range(len(self.stages)):
-                found.append(Loop(0, self.pieces, functools.partial(self._solved_between, k)))
+                found.append(Loop(0, self._count("pieces"), functools.partial(self._solved_between, k)))
         if self.far is not None and self.rows["far"]:
-            found.append(Loop(0, self.pieces, self._behind))
-        found.append(Loop(0, self.used, functools.partial(self._recorded, c0)))
-        found.append(Loop(0, len(self.grid.nodes), functools.partial(self._shown, row)))
-        last = ((c % self.own, c // self.own * (self.groups[1] + 1)) for c in range(self.equations.k))
+            found.append(Loop(0, self._count("pieces"), self._behind))
+        found.append(Loop(0, self._count("used"), functools.partial(self._recorded, c0)))
+        found.append(Loop(0, self._count("nodes"), functools.partial(self._shown, row)))
+        last = ((c % self.own, self._place(f"first alpha {c // self.own}")) for c in range(self.equations.k))
         return found + [Show(Number(unknowns, c), Number(t.alpha, *at)) for c, at in enumerate(last)]
 
     def _near_ends(self, rates: Array) -> list[Operation]:
@@ -264,10 +269,15 @@ class StepMap(EliminationCode):
             return []
         t, ny = self.tangents, self.equations.ny
         found: list[Operation] = [
-            Loop(0, self.pieces, lambda j: _copies(ny, (t.ends, j), (rates, j + 1), self._rows_of(rates)))
+            Loop(
+                0,
+                self._count("pieces"),
+                lambda j: _copies(ny, (t.ends, j), (rates, j + 1), self._rows_of(rates)),
+            )
         ]
-        for k, point in enumerate(self.near):
-            found += _copies(ny, (t.ends, point - 1), (rates, self.points + k), self._rows_of(rates))
+        for k in self.near:
+            end, near = self._place(f"near {k}") + -1, self._place("points") + k
+            found += _copies(ny, (t.ends, end), (rates, near), self._rows_of(rates))
         return found
 
     def _rows_of(self, rates: Array) -> list[int]:
@@ -329,7 +339,7 @@ class StepMap(EliminationCode):
 
     def _stage(self, k: int, j: Index) -> tuple[Any, Index, Index]:
         """Return a stage, its place in a piece, and that among the places between ends."""
-        return self.space.formula.stages[k], j + self.stages[k], j + k * self.pieces
+        return self.space.formula.stages[k], self._at_stage(k, j), self._before_stage(k, j)
 
     def _advanced(self, j: Index) -> list[Operation]:
         """Set w at the end of a piece: its defect at fixed y, and w at its start by the factors."""
@@ -376,7 +386,7 @@ class StepMap(EliminationCode):
 
     def _correction(self) -> list[Operation]:
         """Return the map from the results at fixed y to y and the unknowns."""
-        e, t, k, own, count = self.equations, self.tangents, self.equations.k, self.own, self.groups[1]
+        e, t, k, own = self.equations, self.tangents, self.equations.k, self.own
         found = _set(
             (
                 Number(t.w, i % e.ny, self.bases[i // e.ny]),
@@ -389,7 +399,7 @@ class StepMap(EliminationCode):
             strand, component = divmod(c, e.ny)
             entry = self._entry_at(self.M, k, i, component, strand)
             found.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))
-        alpha = [Number(t.alpha, i % own, i // own * (count + 1) + count) for i in range(k)]
+        alpha = [Number(t.alpha, i % own, self._place(f"alpha {i // own}")) for i in range(k)]
         found += map(Scale, alpha)
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
@@ -398,7 +408,7 @@ class StepMap(EliminationCode):
 
     def _strand_ahead(self, strand: Index) -> list[Operation]:
         """Set w along a strand; after every few pieces the unknowns change."""
-        t, (size, count), base = self.tangents, self.groups, strand.value * self.strand_points
+        t, (size, count), base = self.tangents, self.groups, strand.value * self._count("points of strand")
 
         def group(g: Index) -> list[Operation]:
             first = base + g.value * size
@@ -407,12 +417,15 @@ class StepMap(EliminationCode):
             changed = self._by_unknowns(t.w, last, t.beta, at, is_negative=True)
             return [Loop(first, last.value, self._advanced), *_set(pivots), *changed]
 
-        return [Loop(0, count, group), Loop(base + count * size, base + self.grid.tip, self._advanced)]
+        return [Loop(0, count, group), Loop(base + count * size, base + self._count("tip 0"), self._advanced)]
 
     def _strand_back(self, strand: Index) -> list[Operation]:
         """Set y along a strand from its tip, by the unknowns of each group of pieces."""
         t, (size, count), own, f = self.tangents, self.groups, self.own, self._now
-        base, first = f.index(strand.value * self.strand_points), f.index(strand.value * (count + 1))
+        base, first = (
+            f.index(strand.value * self._count("points of strand")),
+            f.index(strand.value * (count + 1)),
+        )
 
         def solved(group: Any, j: Any) -> list[Operation]:
             copies = _copies(self.equations.ny, (t.y, j), (t.w, j))
@@ -434,7 +447,7 @@ class StepMap(EliminationCode):
                 found.append(Add(Number(t.alpha, i, alpha), change[c], entry, is_negative=True))
             return [*found, Loop(start + 1, end.value, functools.partial(solved, alpha))]
 
-        stop = base.value + self.strand_points
+        stop = base.value + self._count("points of strand")
         return [
             Loop(base.value + (count * size + 1), stop, functools.partial(solved, first + count)),
             Loop(0, count, group_back, descends=True), *solved(first, base),
@@ -497,7 +510,7 @@ class StepMap(EliminationCode):
         return [
             Show(
                 Number(own, int(component)),
-                Number(t.y if i < self.equations.ny else t.newest, i, point + self.bases[q]),
+                Number(t.y if i < self.equations.ny else t.newest, i, self._of_strand(q, point)),
             )
             for (q, i), component in np.ndenumerate(self.packed)
         ]

@@ -52,10 +52,8 @@ class _TangentCode(StepMap):
         for arrays, nonzeros in (self.by_history, e.by_history), (self.by_control, e.by_control):
             self.jumps.append((arrays["far"], _nodes(nonzeros["far"])))
         # the solved motion
-        self.records = [a(e.numbers, self.used) for _ in range(settings.memory)]
-        self.rate = a(e.numbers, self.used)
-        #: stages of the pieces between strands
-        self.idle = [first + tip for first in self.stages for tip in self.tips[:-1]]
+        self.records = [a(e.numbers, "used") for _ in range(settings.memory)]
+        self.rate = a(e.numbers, "used")
         #: arrays of further values of the rates, and their nodes
         self.shared = list[tuple[Array, Any]]()
         self._reserve_products()
@@ -78,9 +76,9 @@ class _TangentCode(StepMap):
         self._write_factor()
         self._write_along()
         self._write_linearise()
-        if self.transposed or len(self.grid.between):
+        if self.transposed or self.near:
             self.rates = self._write_rates("rates")
-        if len(self.grid.between):
+        if self.near:
             self.solved = self._write_solved()
             self.slopes = self._write_rates("slopes", [(self.slope, e.nonzeros)])
         self._write_data()
@@ -97,7 +95,7 @@ class _TangentCode(StepMap):
         _, coefficients, control, unknowns = f.arguments
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         weights = [f.load(coefficients, k) for k in self._history_weights]
-        for i, j in self._components(e.numbers, self.used):
+        for i, j in self._components(e.numbers, self._count("used")):
             parts = [self._wide(each, i, j) for each in (*self.records, self.rate)]
             products = [weight * part for weight, part in zip(weights, parts, strict=False)]
             self._write_wide(sum(products[1:], products[0]), self.H, i, j)
@@ -106,24 +104,22 @@ class _TangentCode(StepMap):
 
     def _write_solution(self) -> None:
         """The solution y at all points, from its row at the nodes (see `StepProblem.filled`)."""
-        e, grid = self.equations, self.grid
+        e = self.equations
         self.solution = f = self._function("solution", "row")
-        row = f.arguments[1]
-        with f.loop(len(self.grid.nodes)) as node:
+        memory, row = f.arguments
+        with f.loop(self._count("nodes")) as node:
             at, here = f.pointer(row, node.value * self.packed.size), self._node(node)
             for q, i in np.ndindex(self.strands, e.ny):
-                self._put(f.load(at, int(self.packed[q, i])), self.y, i, here + self.bases[q])
-        if not len(grid.between):
+                self._put(f.load(at, int(self.packed[q, i])), self.y, i, self._of_strand(q, here))
+        if not self.near:
             return
-        for base, cut in itertools.product(self.bases, map(int, grid.between)):
-            point = base + cut
-            start, end = (base + int(grid.nodes[grid.segment[cut] + k]) for k in (0, 1))
-            part = float(grid.bounds[cut, 0])
+        with f.loop(self._count("filled")) as cut:
+            point, start, end = (self._from_table(self.filled.offset + k, cut.value * 3) for k in range(3))
+            part = f.load(f.pointer(memory, self.filled_parts.offset), cut.value)
             for i in range(e.ny):
                 low, high = self._get(self.y, i, start), self._get(self.y, i, end)
                 self._put(low + part * (high - low), self.y, i, point)
-        most = int(np.max(np.diff(grid.nodes))) - 1
-        self._write_filling(f.value(most, "i64"), self.slopes, self.rates)
+        self._write_filling(self._count("most"), self.slopes, self.rates)
 
     def _write_derivatives(self) -> None:
         """The derivatives of a step at its solution."""
@@ -145,8 +141,8 @@ class _TangentCode(StepMap):
         """The records after a step."""
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
-        self._write_shift(self.records, self.used)
-        for i, j, newest in self._numbers_of(self._evaluated_at(self.y), self.used):
+        self._write_shift(self.records, self._count("used"))
+        for i, j, newest in self._numbers_of(self._evaluated_at(self.y), "used between"):
             self._write_wide(newest, self.records[0], i, j)
             if self.settings.uses_rate:
                 self._write_wide(c0 * newest + self._wide(self.H, i, j), self.rate, i, j)
@@ -161,14 +157,6 @@ class _TangentCode(StepMap):
             known[node] = self._term(node, self.step_terms, first, 0, self.P)
         return self._now.evaluate(e.program, nodes, known, 1)
 
-    def _of_places(self, nodes: Any) -> Iterator[tuple[int, int]]:
-        """Yield all places with their nodes, from the nodes of a strand's places."""
-        yield from ((k, int(nodes[place])) for k, (_, place) in enumerate(self.origins[: self.used]))
-
-    def _of_pieces(self, nodes: Any) -> Iterator[tuple[int, int]]:
-        """Yield all pieces but the idle ones with their nodes, from the nodes of a strand's pieces."""
-        yield from ((base + k, int(node)) for base in self.bases for k, node in enumerate(nodes))
-
     def _states_at(self, name: str) -> Iterator[tuple[Index, Value | bool, dict[int, Value]]]:
         """Write loops over places on which rates and strains, or y behind jumps, depend.
 
@@ -176,14 +164,17 @@ class _TangentCode(StepMap):
         """
         far = self.y if self.far is None else self.far
         if name == "far":
-            with self._places(self.pieces) as j:
-                yield j, self._inside(j, self.pieces), self._state(self.y, self.H, j) | self._acting_at(j)
+            pieces = self._count("pieces")
+            with self._places(pieces) as j:
+                yield j, self._inside(j, pieces), self._state(self.y, self.H, j) | self._acting_at(j)
             return
-        for y, first, count in ((far, 0, self.ends), (self.between, self.ends, self.used - self.ends)):
-            if count:
+        for y, name in ((far, "ends"), (self.between, "used between")):
+            if name == "ends" or self.stages:
+                count = self._count(name)
                 with self._places(count) as j:
-                    place = {self.equations.s.item(): self._wide(self.s, 0, j + first)}
-                    yield j + first, self._inside(j, count), self._state(y, self.H, j, j + first) | place
+                    here = j if name == "ends" else j + self._count("ends")
+                    place = {self.equations.s.item(): self._wide(self.s, 0, here)}
+                    yield here, self._inside(j, count), self._state(y, self.H, j, here) | place
 
     # running
 
@@ -194,9 +185,9 @@ class _TangentCode(StepMap):
         return [f.pointer(coefficients, step.value * (self.settings.memory + 3)), *found]
 
     @property
-    def _sizes(self) -> tuple[int, int, int]:
+    def _sizes(self) -> tuple[int, Value, int]:
         """Numbers of a step's control, row and unknowns."""
-        return self.equations.nc, len(self.grid.nodes) * self.packed.size, self.equations.k
+        return self.equations.nc, self._count("nodes") * self.packed.size, self.equations.k
 
     def _begin_turns(self) -> None:
         """Begin a run, in which the records of a state change places from step to step."""
@@ -215,7 +206,8 @@ class _TangentCode(StepMap):
         first, second = self.lasting[:2]
         strides = self.state_size, 1, second.offset - first.offset, first.place, first.component
         found = np.lib.stride_tricks.as_strided(
-            states[:, first.offset :], (len(states), lanes, len(self.lasting), self.used, first.size),
+            states[:, first.offset :],
+            (len(states), lanes, len(self.lasting), self.layout["used"], first.size),
             [8 * each for each in strides],
         )  # fmt: skip
         memory = self.settings.memory
@@ -267,12 +259,12 @@ class TangentCore(_TangentCode):
 
     def _reserve_products(self) -> None:
         e, a = self.equations, self._array
-        self.common = a(len(e.common), self.used)
+        self.common = a(len(e.common), "used")
         self.shared.append((self.common, e.common))
         whole, self._size = self._size, 0
         # of one direction of the system
         self.dparameters = a(len(e.dparameters), memory=1)
-        self.ds, self.dh = a(1, self.used, 1), a(1, self.pieces if e.moves_lengths else 0, 1)
+        self.ds, self.dh = a(1, "used", 1), a(1, "pieces" if e.moves_lengths else 0, 1)
         self.moved = {name: a(len(rows), self.places[name], 1) for name, rows in e.moving_rows.items()}
         self.direction_size, self._size = self._size, whole
 
@@ -290,12 +282,12 @@ class TangentCore(_TangentCode):
         """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
         e = self.equations
         self.direction = self._function("direction", "direction")
-        every = [*e.moved_terms, *e.dplaces, *e.dlengths]
+        every = [*e.moved_terms, e.dlength]
         moves = self._inputs_of(self.dparameters, [e.dparameters], every)
         values = self._terms_known(every, moves)
-        for array, nodes in ((self.ds, self._of_places(e.dplaces)), (self.dh, self._of_pieces(e.dlengths))):
-            for k, node in nodes if array.count else ():
-                self._put(values[node], array, 0, k)
+        for array, parts in (self.ds, self.s_parts), (self.dh, self.h_parts):
+            for _, j in self._components(1, self._used_places(array)) if array.count else ():
+                self._write_wide(values[e.dlength] * self._wide(parts, 0, j), array, 0, j)
         known = {node: values[node] for node in e.moved_terms} | moves
         for name in ("rates", "far"):
             for j, _, here in self._states_at(name) if e.moving_rows[name] else ():
@@ -331,7 +323,7 @@ class TangentCore(_TangentCode):
         for source, rows, target in (*parts, (self.dh, [0], self.tangents.lengths)):
             if not source.size or (source is self.dh and not e.moves_lengths):
                 continue
-            with f.loop(source.count) as j:
+            with f.loop(self._used_places(source)) as j:
                 for k, i in enumerate(rows):
                     number = f.load(j.address(direction, source.place), source.at(k, 0))
                     moved = self._get(target, i, j, COLUMNS) + weight * number
@@ -390,7 +382,7 @@ class TangentCore(_TangentCode):
         if np.any(d_tip):
             added = filled(np.broadcast_to(d_tip, (k, m))).reshape(k, blocks, L).transpose(1, 0, 2)
             states[:, self.added_tip.offset :][:, : k * L] = added.reshape(blocks, -1)
-        shapes = (len(self.grid.nodes), self.packed.size), (k,)
+        shapes = (self.layout["nodes"], self.packed.size), (k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
         arrays = *begun, moved, states, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._functions["run"](*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
@@ -410,8 +402,8 @@ class CotangentCore(_TangentCode):
     def _reserve_state(self) -> None:
         e, a = self.equations, self._array
         #: cotangents of the moving parameters, of places, and of lengths of pieces
-        self.parameter, self.place = a(len(e.by_terms) - len(e.moving_arrays), memory=1), a(1, self.used, 1)
-        self.length_of_piece = a(1, self.pieces, 1)
+        self.parameter, self.place = a(len(e.by_terms) - len(e.moving_arrays), memory=1), a(1, "used", 1)
+        self.length_of_piece = a(1, "pieces", 1)
 
     def _reserve_products(self) -> None:
         #: cotangents of the terms of a step, for each lane of places
@@ -464,21 +456,21 @@ class CotangentCore(_TangentCode):
         given = self._parameters(e.by_terms) | terms
         given |= {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
         self._add_parameters(e.by_terms, given)
-        with self._places(self.pieces) as j:
+        with self._places(self._count("pieces")) as j:
             total = self._wide(self.length_of_piece, 0, j) + self._wide(t.lengths, 0, j)
             self._write_wide(total, self.length_of_piece, 0, j)
 
     def _write_geometry(self) -> None:
         """Add the cotangents of parameters from those of places and lengths: once a run."""
         e = self.equations
-        self.by_geometry = self._function("by_geometry", "state")
-        known = self._parameters(e.by_geometry)
-        for nodes, array in (
-            (self._of_places(e.of_places), self.place), (self._of_pieces(e.of_lengths), self.length_of_piece)
-        ):  # fmt: skip
-            for k, node in nodes:
-                value = self._get(array, 0, k)
-                known[node] = known[node] + value if node in known else value
+        self.by_geometry = f = self._function("by_geometry", "state")
+        total = Variable(f, f.splat(f.value(0.0), self.L))
+        for array, parts in (self.place, self.s_parts), (self.length_of_piece, self.h_parts):
+            count = self._used_places(array)
+            for _, j in self._components(1, count):
+                product = self._wide(array, 0, j) * self._wide(parts, 0, j)
+                total.set(total.get() + self._before(count, j, product))
+        known = self._parameters(e.by_geometry) | {e.of_length.item(): f.total(total.get())}
         self._add_parameters(e.by_geometry, known)
 
     def _parted(self, cotangents: Sequence[int]) -> tuple[list[int], list[tuple[int, Value]]]:
@@ -511,21 +503,16 @@ class CotangentCore(_TangentCode):
     def _write_run(self) -> None:
         """All solved steps in turn, which keeps what each starts from; then their cotangents in reverse."""
         names = ["memory", "controls", "coefficients", "rows", "unknowns", "kept", "states"]
-        names += ["d_controls", "d_rows", "d_unknowns", "n_steps", "n_columns"]
+        names += ["d_controls", "d_rows", "d_unknowns", "n_size", "n_steps", "n_columns"]
         f = self._now = self.module.function("run", names, exported=True)
-        memory, controls, coefficients, rows, unknowns, kept, states, *moved, steps, width = f.arguments
+        memory, controls, coefficients, rows, unknowns, kept, states, *moved, size, steps, width = f.arguments
         self._begin_turns()
 
         def copy(step: Index, forth: bool) -> None:
             """Keep the arrays that a step starts from, or restore them."""
-            at = 0
-            for array in self._kept:
-                inside = f.pointer(memory, array.offset)
-                outside = f.pointer(kept, step.value * self._kept_size + at)
+            for inside, outside in self._packed_vectors(self._kept, f.pointer(kept, step.value * size)):
                 source, target = (inside, outside) if forth else (outside, inside)
-                with f.loop(self._length_of(array), 0, self.L) as k:
-                    f.store(f.load(source, k.value, self.L), target, k.value)
-                at += self._length_of(array)
+                f.store(f.load(source, 0, self.L), target, 0)
 
         f.call(self.setup, memory)
         with f.loop(steps) as step:
@@ -551,13 +538,6 @@ class CotangentCore(_TangentCode):
         """Arrays from which the derivatives of a step are evaluated."""
         return self.y, *self.records, self.rate
 
-    def _length_of(self, array: Array) -> int:
-        return array.size * array.component
-
-    @property
-    def _kept_size(self) -> int:
-        return sum(map(self._length_of, self._kept))
-
     def solve(self, solved: SolvedSteps, cotangents: Any) -> tuple[Any, Any, Any, Any]:
         """Return the cotangents of moving parameters (n, m), controls (solves, c, m), records and rate.
 
@@ -572,11 +552,12 @@ class CotangentCore(_TangentCode):
         lasting = self._lasting(states, 1)
         lasting[:] = self._by_strand(self.rate, columns)
         # idle pieces have no results
-        lasting[..., self.idle, :] = 0.0
+        lasting[..., self.layout.idle, :] = 0.0
         d_controls = np.zeros((count, self.equations.nc, m))
-        kept = np.empty((count, self._kept_size))
+        size = sum(map(self._size_of, self._packed(self._kept)))
+        kept = np.empty((count, size))
         arrays = *begun, kept, states, d_controls, d_rows, d_unknowns
-        self._functions["run"](*(each.ctypes.data for each in arrays), count, m)
+        self._functions["run"](*(each.ctypes.data for each in arrays), size, count, m)
         before = self._joined(self.rate, self._lasting(states, 1, count)[:, 0], places).transpose(1, 2, 3, 0)
         return self._numbers(states, self.parameter)[:, 0, 0].T, d_controls, before[:-1], before[-1]
 

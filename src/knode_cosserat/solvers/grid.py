@@ -91,6 +91,21 @@ class Grid:
         return _joined([start + part * (end - start), values[-1:]])
 
     @functools.cached_property
+    def lengths(self) -> Float[np.ndarray, " pieces"]:
+        """Lengths of the pieces, as parts of the rod's."""
+        return (self.bounds[:, 1] - self.bounds[:, 0]) / (len(self.nodes) - 1)
+
+    @functools.cached_property
+    def along(self) -> Float[np.ndarray, " places"]:
+        """Places as parts of the rod's length; at discontinuities they are a little inside of pieces."""
+        low, high = ((self.segment + self.bounds[:, k]) / (len(self.nodes) - 1) for k in (0, 1))
+        first, last, near = low, high[-1:], high[self.near - 1]
+        if self.acting.shape[1]:
+            first, last = inside(first, low, high), inside(last, low[-1:], high[-1:])
+            near = inside(near, low[self.near - 1], near)
+        return np.concatenate([first, last, near, *(low + stage * (high - low) for stage in self._stages)])
+
+    @functools.cached_property
     def stencils(self) -> tuple[_Stencil, _Stencil]:
         """Interpolation stencils from nodes to places: for y, and for values that jump (z and y_s)."""
         points = np.append(self.segment + self.bounds[:, 0], self.nodes.size - 1.0)

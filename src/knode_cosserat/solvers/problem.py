@@ -24,7 +24,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import Grid, grid_of, inside, taken
+from knode_cosserat.solvers.grid import Grid, grid_of, taken
 from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.solvers.space import Formula, SpaceScheme
 
@@ -47,26 +47,9 @@ def row_of(
     return numeric.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
 
 
-def _bounds(system: System) -> tuple[Any, Any]:
-    """Return the arclength (m) of the start and the end of every piece."""
-    grid, ds = grid_of(system), system.length / (system.nodes - 1)
-    if not system.discontinuities.places:
-        s = np.linspace(0.0, 1.0, system.nodes) * system.length
-        return s[:-1], s[1:]
-    low, high = (ds * (grid.segment + grid.bounds[:, k]) for k in (0, 1))
-    return low, high
-
-
 def places_of(system: System, space: SpaceScheme) -> Float[Any, " places"]:
     """Return the arclength (m) of all places where a step evaluates the equations (`Grid`)."""
-    grid, (low, high) = grid_of(system, space), _bounds(system)
-    first, last, near = low, high[-1:], high[grid.near - 1]
-    if system.discontinuities.places:
-        first, last = inside(first, low, high), inside(last, low[-1:], high[-1:])
-        near = inside(near, low[grid.near - 1], near)
-    stages = [low + stage.place * (high - low) for stage in space.check.stages]
-    numeric: Any = jnp if is_traced(low) else np
-    return numeric.concatenate([first, last, near, *stages])
+    return grid_of(system, space).along * system.length
 
 
 class _Stages(NamedTuple):
@@ -166,8 +149,7 @@ class StepProblem(eqx.Module):
 
     def lengths(self) -> Float[Any, "pieces 1"]:
         """Return the lengths of all pieces (m)."""
-        low, high = _bounds(self.system)
-        return (high - low)[:, None]
+        return (self.grid.lengths * self.system.length)[:, None]
 
     def at_ends(self, values: Any) -> tuple[Any, Any]:
         """Return values at the starts and at the ends of pieces; 0 at the ends if they were not evaluated."""
