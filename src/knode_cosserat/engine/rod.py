@@ -97,7 +97,7 @@ class RodCode(Memory):
         whole = found.view(np.int64)
         whole[: len(layout.counts)] = list(layout.counts.values())
         whole[self.node_table.offset :][: len(layout.nodes)] = layout.nodes
-        whole[self.filled.offset :][: layout.filled.size] = layout.filled.T.ravel()
+        whole[self.filled.offset :][: layout.filled.size] = layout.filled.ravel()
         found[self.filled_parts.offset :][: len(layout.filled_parts)] = layout.filled_parts
         return found
 
