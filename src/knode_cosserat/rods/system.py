@@ -141,7 +141,7 @@ class System(Parametrised):
 
     @property
     def turn_of_segments(self) -> float:
-        """Angle (rad) through which parts turn in one segment; beyond `SEEN_TURN` no estimate sees the turns."""
+        """Angle (rad) through which parts turn in one segment; estimates see it up to `SEEN_TURN`."""
         return self.winding / (self.nodes - 1)
 
     def replace(self, **changes: Any) -> Self:
@@ -176,6 +176,11 @@ class System(Parametrised):
             raise ParameterError(
                 f"nodes is {self.nodes!r}; allowed is a whole number from {FEWEST_NODES} to {MOST_NODES}"
             )
+
+
+def nodes_text(system: System) -> str:
+    """Return the number of nodes in words, and whether it was chosen."""
+    return f"{system.nodes} nodes" + (", chosen" if isinstance(system.nodes, ChosenNodes) else "")
 
 
 def unknowns_of(system: System, y: Float[Any, "*n y"]) -> Float[Any, "*n k"]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, Literal
@@ -18,7 +17,7 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.history import unloaded_shape
-from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refined
+from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refined, resampled
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
@@ -144,7 +143,7 @@ def _solved(
     if initial is not None and not isinstance(initial, Trajectory):
         initial = _guess(robot, initial, controls[(0,) * (np.ndim(controls) - 1)])
     elif initial is not None and isinstance(robot, System) and has_chosen(robot):
-        initial = _resampled(initial, robot)
+        initial = resampled(initial, robot)
     if initial is not None:
         check_initial(system, initial, batch)
     bare = without_range(system)
@@ -173,21 +172,7 @@ def _solved(
     found = Trajectory(
         system, settings, time, control=controls, **rows_of(system, rows), stability=tested
     )  # fmt: skip
-    return Solved(found := marked(found, None), found, said)
-
-
-def _resampled(initial: Trajectory, system: System) -> Trajectory:
-    """Return the last row of a trajectory, as a guess on the grid of a system."""
-    nodes = initial.y.shape[-2]
-    if nodes == system.nodes:
-        return initial
-    at, known = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, nodes)
-    last = initial[-1:]
-    y, z = (
-        jnp.stack([jnp.interp(at, known, column) for column in packed[0].T], axis=1)[None]
-        for packed in (last.y, last.z)
-    )
-    return dataclasses.replace(last, y=y, z=z, initial_state=None, final_state=None, stages=None)
+    return Solved.of(marked(found, None), said)
 
 
 @functools.partial(jax.jit, static_argnames=("task", "pattern"))

@@ -7,6 +7,7 @@ the nodes of the next grid; there are few different ones, and so few programs to
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 import warnings
@@ -31,18 +32,28 @@ Found = TypeVar("Found")
 
 
 class Solved(NamedTuple, Generic[Found]):
-    """What was found on a grid."""
+    """What was found on a grid, with the results of its rows and their estimated errors of positions (m)."""
 
     found: Found
-    #: its rows
-    trajectory: Trajectory
+    result: Any
+    position_error: Any
     #: warnings of the rows, which are given on the last grid only
     warnings: tuple[Callable[[], None], ...] = ()
+    #: True if a verdict needs a finer grid
+    undecided: bool = False
+
+    @classmethod
+    def of(cls, found: Trajectory, warnings: tuple[Callable[[], None], ...] = ()) -> Solved[Trajectory]:
+        """Return a trajectory."""
+        known = found.stability is not None and not is_traced(found.stability)
+        undecided = known and bool(np.any(np.asarray(found.stability) == Verdict.UNTESTED_GRID))
+        return Solved(found, found.result, found.position_error, warnings, undecided)
 
 
 def refined(
-    solve: Callable[[Any], Solved[Found]], robot: Any, space: SpaceScheme, tolerance: float | None = None
-) -> Found:
+    solve: Callable[[Any], Solved[Found]], robot: Any, space: SpaceScheme, tolerance: float | None = None,
+    stays: bool = False,
+) -> Found:  # fmt: skip
     """Return what is found on the first grid that is fine enough, of one robot or a batch.
 
     Args:
@@ -50,16 +61,15 @@ def refined(
         robot: the robot, or a sequence of robots.
         space: scheme along the rod.
         tolerance: largest position error (m); None: no row may be COARSE, if the robot's nodes are chosen.
+        stays: True if the robot must stay on its grid.
     """
     if tolerance is not None:
         robot = on_grid(robot, ChosenNodes(FIRST_SEGMENTS + 1))
     first, before = nodes_of(robot) - 1, np.inf
     while True:
-        found, trajectory, said = solve(robot)
-        segments, excess = nodes_of(robot) - 1, 0.0
-        if not is_traced((trajectory.y, trajectory.result)) and trajectory.all_valid:
-            excess = _excess(trajectory, tolerance, 2.0**space.order)
-        may = tolerance is not None or (has_chosen(robot) and not isinstance(space, Euler))
+        solved = solve(robot)
+        segments, excess = nodes_of(robot) - 1, _excess(solved, robot, tolerance, 2.0**space.order)
+        may = tolerance is not None or (has_chosen(robot) and not isinstance(space, Euler) and not stays)
         # errors that do not fall are not those of the grid
         if excess <= 1.0 or not may or segments >= MOST_SEGMENTS or not excess < before:
             break
@@ -68,31 +78,31 @@ def refined(
         ladder = (math.ceil(first * 2**n * k / 4) for n in itertools.count() for k in range(4, 8))
         wanted = min(MOST_SEGMENTS, next(count for count in ladder if count >= factor * segments))
         robot = on_grid(robot, ChosenNodes(wanted + 1))
-    for warn in said:
+    for warn in solved.warnings:
         warn()
     if tolerance is not None and excess > 1.0:
         warnings.warn(
             f"position_tolerance of {tolerance:g} m is not reached with {segments + 1} nodes, where the "
-            f'estimate is {np.max(trajectory.position_error):.2g} m: use space="lobatto4", or a larger '
+            f'estimate is {np.max(solved.position_error):.2g} m: use space="lobatto4", or a larger '
             "tolerance",
             stacklevel=3,
         )
-    return found
+    return solved.found
 
 
-def _excess(trajectory: Trajectory, tolerance: float | None, unknown: float) -> float:
-    """Return the largest error of a trajectory over the allowed one; `unknown` where there is no number."""
-    errors = np.asarray(trajectory.position_error)
+def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: float) -> float:
+    """Return the largest error over the allowed one; `unknown` where there is no number, 0 where none is."""
+    if is_traced(solved[1:3]) or np.any(np.asarray(solved.result) < 0):
+        return 0.0
+    errors = np.asarray(solved.position_error)
     if tolerance is not None:
         return unknown if np.any(np.isnan(errors)) else float(np.max(errors) / tolerance)
-    coarse = np.asarray(trajectory.result) == Result.COARSE
-    if trajectory.stability is not None:
-        coarse = coarse | (np.asarray(trajectory.stability) == Verdict.UNTESTED_GRID)
-    if not np.any(coarse):
+    coarse = np.asarray(solved.result) == Result.COARSE
+    if not np.any(coarse) and not solved.undecided:
         return 0.0
-    length = np.asarray(trajectory.system.length)[..., None]
-    shares = np.where(coarse, errors / (COARSE_SHARE * length), 0.0)
-    largest = float(np.max(shares, initial=0.0, where=~np.isnan(shares)))
+    lengths = [float(one.length) for one in ([robot] if isinstance(robot, System) else robot)]
+    shares = errors / (COARSE_SHARE * np.reshape(lengths, (-1, *[1] * (errors.ndim - 1))))
+    largest = float(np.max(shares, initial=0.0, where=coarse & ~np.isnan(shares)))
     # of orientations, and of verdicts, no number is known
     return largest if largest > 1.0 else unknown
 
@@ -111,8 +121,28 @@ def nodes_of(robot: Any) -> int:
 def on_grid(robot: Any, nodes: int) -> Any:
     """Return a robot, or each of a batch, with other nodes."""
     if isinstance(robot, System):
-        return robot if robot.nodes == nodes else robot.replace(nodes=nodes)
+        same = robot.nodes == nodes and isinstance(nodes, ChosenNodes) == isinstance(robot.nodes, ChosenNodes)
+        return robot if same else robot.replace(nodes=nodes)
     return [on_grid(one, nodes) for one in robot]
+
+
+def fixed(system: System) -> System:
+    """Return a system whose nodes stay, for functions that keep to its grid."""
+    return on_grid(system, int(system.nodes)) if has_chosen(system) else system
+
+
+def resampled(initial: Trajectory, system: System) -> Trajectory:
+    """Return the last row of a trajectory, as a guess on the grid of a system."""
+    nodes = initial.y.shape[-2]
+    if nodes == system.nodes:
+        return initial
+    at, known = np.linspace(0.0, 1.0, system.nodes), np.linspace(0.0, 1.0, nodes)
+    last = initial[-1:]
+    y, z = (
+        jnp.stack([jnp.interp(at, known, column) for column in packed[0].T], axis=1)[None]
+        for packed in (last.y, last.z)
+    )
+    return dataclasses.replace(last, y=y, z=z, initial_state=None, final_state=None, stages=None)
 
 
 def mark_unseen(system: System, rows: StepRows) -> StepRows:

@@ -20,7 +20,16 @@ from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
 from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages, no_rows
 from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, nodes_of, on_grid, refined
+from knode_cosserat.solvers.refinement import (
+    Solved,
+    fixed,
+    has_chosen,
+    mark_unseen,
+    nodes_of,
+    on_grid,
+    refined,
+    resampled,
+)
 from knode_cosserat.solvers.rollout import Solves, rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -125,7 +134,8 @@ def simulate(
         check_initial(system, initial, batch)
 
     def solve(robot: Any) -> Solved[Trajectory]:
-        system, before = stacked(robot)[0], initial
+        system = stacked(robot)[0]
+        before = initial if initial is None else _again_at_rest(initial, system, settings, newton)
         # ranges are not part of the equations: programs are compiled for systems without them
         bare = without_range(system)
         if before is not None:
@@ -133,13 +143,26 @@ def simulate(
         task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
         if is_traced((system, controls, before)):
             found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
-            return Solved(found := marked(dataclasses.replace(found, system=system), initial), found)
+            return Solved.of(marked(dataclasses.replace(found, system=system), initial))
         run = _initial(bare, controls, before, settled, task)
         every, last, said = _plain(bare, run, on_failure, progress)
-        found = marked(_trajectory(system, run, every, last), initial)
-        return Solved(found, found, said)
+        return Solved.of(marked(_trajectory(system, run, every, last), initial), said)
 
-    return refined(solve, robot, settings.space, position_tolerance)
+    # the state of a motion is known on its own grid only
+    moving = initial is not None and (initial.settings is None or initial.settings.time is not None)
+    return refined(solve, robot, settings.space, position_tolerance, stays=moving)
+
+
+def _again_at_rest(initial: Trajectory, system: System, settings: Settings, newton: Any) -> Trajectory:
+    """Return the last equilibrium of a trajectory on the grid of a system."""
+    from knode_cosserat.solvers.equilibrium import equilibrium
+
+    if initial.y.shape[-2] == system.nodes:
+        return initial
+    return equilibrium(
+        fixed(system), initial.control[-1], space=settings.space, initial=resampled(initial, system),
+        newton=newton, with_stability=False,
+    )  # fmt: skip
 
 
 def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
@@ -195,9 +218,11 @@ def check_tolerance(robot: Any, initial: Any, tolerance: Any) -> None:
 
 
 def on_grid_of(robot: Any, initial: Trajectory) -> Any:
-    """Return a robot whose nodes are chosen on the grid of a trajectory that it continues, which stays."""
-    alone = isinstance(robot, System) and has_chosen(robot)
-    return on_grid(robot, int(initial.y.shape[-2])) if alone else robot
+    """Return a robot whose nodes are chosen on the grid of a trajectory that it continues."""
+    if not isinstance(robot, System) or not has_chosen(robot):
+        return robot
+    nodes = initial.y.shape[-2]
+    return on_grid(robot, ChosenNodes(nodes) if nodes >= robot.needed_nodes else nodes)
 
 
 def stacked(robot: Any) -> tuple[System, int | None]:

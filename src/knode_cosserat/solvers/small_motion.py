@@ -21,8 +21,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
 from knode_cosserat.solvers.history import StepCoefficients, StepRows, used_places
-from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.refinement import is_too_coarse
+from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
