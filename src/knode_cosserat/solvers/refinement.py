@@ -145,17 +145,22 @@ def resampled(initial: Trajectory, system: System) -> Trajectory:
     return dataclasses.replace(last, y=y, z=z, initial_state=None, final_state=None, stages=None)
 
 
-def mark_unseen(system: System, rows: StepRows) -> StepRows:
-    """Return rows that are COARSE and have no estimate if parts turn too far in a segment for one.
+def as_seen(system: System, result: Any, position_error: Any) -> tuple[Any, Any]:
+    """Return results that are COARSE, without an estimate, if parts turn too far in a segment for one.
 
-    Rows of NumPy are changed in place.
+    The system's own numbers must be known, not traced.
     """
     if system.turn_of_segments <= SEEN_TURN:
-        return rows
-    numeric: Any = jnp if is_traced(rows) else np
-    result = numeric.where(rows.result == int(Result.CONVERGED), int(Result.COARSE), rows.result)
-    error = numeric.full(numeric.shape(rows.position_error), numeric.nan)
-    if numeric is np and np.ndim(rows.result):
+        return result, position_error
+    numeric: Any = jnp if is_traced((result, position_error)) else np
+    result = numeric.where(result == int(Result.CONVERGED), int(Result.COARSE), result)
+    return result, numeric.full(numeric.shape(position_error), numeric.nan)
+
+
+def mark_unseen(system: System, rows: StepRows) -> StepRows:
+    """Return rows with the results of `as_seen`; those of NumPy are changed in place."""
+    result, error = as_seen(system, rows.result, rows.position_error)
+    if isinstance(rows.result, np.ndarray) and rows.result.ndim:
         rows.result[...], rows.position_error[...] = result, error
         return rows
     return rows._replace(result=result, position_error=error)

@@ -22,9 +22,9 @@ from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages, no
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.refinement import (
     Solved,
+    as_seen,
     fixed,
     has_chosen,
-    mark_unseen,
     nodes_of,
     on_grid,
     refined,
@@ -143,7 +143,9 @@ def simulate(
         task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
         if is_traced((system, controls, before)):
             found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
-            return Solved.of(marked(dataclasses.replace(found, system=system), initial))
+            result, error = as_seen(system, found.result, found.position_error)
+            found = dataclasses.replace(found, system=system, result=result, position_error=error)
+            return Solved.of(marked(found, initial))
         run = _initial(bare, controls, before, settled, task)
         every, last, said = _plain(bare, run, on_failure, progress)
         return Solved.of(marked(_trajectory(system, run, every, last), initial), said)
@@ -387,7 +389,6 @@ def _traced(system, controls, initial, settled, spec):  # type: ignore[no-untype
     if np.ndim(controls) == 3:
         solve = jax.vmap(solve, in_axes=(0 if np.ndim(system.length) else None, 0, 0))
     rows, history = solve(system, acting, at_start.state.history)
-    rows = mark_unseen(system, rows)
     result = refuse_far_turns(system, rows.result, acting, at_start.control)
     rows = rows._replace(result=carried_results(result, at_start.result))
     axis = np.ndim(controls) - 2
