@@ -219,6 +219,38 @@ def test_a_file_keeps_the_choice(tmp_path):
     assert kc.load_robot(tmp_path / "fine.yaml").nodes == found.system.nodes
 
 
+def test_an_equilibrium_that_a_coarse_grid_does_not_have_is_found():
+    loads = [
+        ROBOTS.loads.PointWrench(at=at, force=force)
+        for at, force in ((0.37, (1.6e-5, 5.1e-5, -1.12e-4)), (1.0, (1.7e-5, 8.3e-5, -2.0e-5)))
+    ]
+    rod = ROBOTS.SlenderRod(
+        length=0.5, radius=2e-3, density=1200.0, youngs_modulus=7.26e5, gravity=(3.76, 1.27, 4.48),
+        bending_damping=1e-5, loads=tuple(loads),
+    )  # fmt: skip
+    with pytest.raises(kc.SimulationError):
+        kc.equilibrium(rod.replace(nodes=10), with_stability=False)
+    found = kc.equilibrium(rod, with_stability=False)
+    fine = kc.equilibrium(rod.replace(nodes=201), space="lobatto4", with_stability=False)
+    assert found.result[0] >= 0 and found.result[0] != kc.Result.COARSE
+    assert np.linalg.norm(tip(found) - tip(fine)) < 0.02 * 0.5
+
+
+def test_equilibria_fail_on_two_grids_before_they_fail():
+    grids = []
+
+    def solve(robot):
+        grids.append(int(robot.nodes))
+        raise kc.SimulationError(0, 0.0, 1.0, kc.Result.NO_CONVERGENCE, "")
+
+    rod = ROBOTS.SlenderRod(**ROD)
+    for robot, tried in ((rod, [10, 19]), (rod.replace(nodes=10), [10])):
+        grids.clear()
+        with pytest.raises(kc.SimulationError, match="no solution found"):
+            refinement.refined(solve, robot, LOBATTO2)
+        assert grids == tried
+
+
 def test_errors_that_no_grid_mends_end_the_refinement():
     grids = []
 

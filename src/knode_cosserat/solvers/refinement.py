@@ -19,7 +19,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import SEEN_TURN, ChosenNodes, System, is_traced
 from knode_cosserat.solvers.history import COARSE_SHARE, StepRows
-from knode_cosserat.solvers.result import Result, Verdict
+from knode_cosserat.solvers.result import Result, SimulationError, Verdict
 from knode_cosserat.solvers.space import Euler, SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -65,15 +65,24 @@ def refined(
     """
     if tolerance is not None:
         robot = on_grid(robot, ChosenNodes(FIRST_SEGMENTS + 1))
-    first, before = nodes_of(robot) - 1, np.inf
+    may = tolerance is not None or (has_chosen(robot) and not isinstance(space, Euler) and not stays)
+    first, before = nodes_of(robot) - 1, None
     while True:
-        solved = solve(robot)
-        segments, excess = nodes_of(robot) - 1, _excess(solved, robot, tolerance, 2.0**space.order)
-        may = tolerance is not None or (has_chosen(robot) and not isinstance(space, Euler) and not stays)
+        segments = nodes_of(robot) - 1
+        try:
+            solved = solve(robot)
+        except SimulationError as failure:
+            # an equilibrium may exist on a finer grid only; a motion fails for other reasons
+            if not may or failure.step or segments > first:
+                raise
+            robot = on_grid(robot, ChosenNodes(2 * segments + 1))
+            continue
+        excess, error = _excess(solved, robot, tolerance, 2.0**space.order)
         # errors that do not fall are not those of the grid
-        if excess <= 1.0 or not may or segments >= MOST_SEGMENTS or not excess < before:
+        falls = tolerance is not None or before is None or error < before
+        if excess <= 1.0 or not may or segments >= MOST_SEGMENTS or not falls:
             break
-        before = excess
+        before = error
         factor = np.clip(1.1 * excess ** (1.0 / space.order), 1.2, LARGEST_FACTOR)
         ladder = (math.ceil(first * 2**n * k / 4) for n in itertools.count() for k in range(4, 8))
         wanted = min(MOST_SEGMENTS, next(count for count in ladder if count >= factor * segments))
@@ -90,21 +99,27 @@ def refined(
     return solved.found
 
 
-def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: float) -> float:
-    """Return the largest error over the allowed one; `unknown` where there is no number, 0 where none is."""
+def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: float) -> tuple[float, float]:
+    """Return the largest error over the allowed one, and that of positions in lengths; zero if all are fine.
+
+    The first is `unknown` where no number is known, of orientations and verdicts. The second is infinite
+    where there is no estimate.
+    """
     if is_traced(solved[1:3]) or np.any(np.asarray(solved.result) < 0):
-        return 0.0
-    errors = np.asarray(solved.position_error)
-    if tolerance is not None:
-        return unknown if np.any(np.isnan(errors)) else float(np.max(errors) / tolerance)
-    coarse = np.asarray(solved.result) == Result.COARSE
-    if not np.any(coarse) and not solved.undecided:
-        return 0.0
+        return 0.0, 0.0
     lengths = [float(one.length) for one in ([robot] if isinstance(robot, System) else robot)]
-    shares = errors / (COARSE_SHARE * np.reshape(lengths, (-1, *[1] * (errors.ndim - 1))))
-    largest = float(np.max(shares, initial=0.0, where=coarse & ~np.isnan(shares)))
-    # of orientations, and of verdicts, no number is known
-    return largest if largest > 1.0 else unknown
+    errors = np.asarray(solved.position_error)
+    errors = np.nan_to_num(errors, nan=np.inf) / np.reshape(lengths, (-1, *[1] * (errors.ndim - 1)))
+    if tolerance is not None:
+        allowed, counts = tolerance / lengths[0], np.ones(errors.shape, dtype=bool)
+    else:
+        allowed, counts = COARSE_SHARE, np.asarray(solved.result) == Result.COARSE
+        if not np.any(counts) and not solved.undecided:
+            return 0.0, 0.0
+    error = float(np.max(errors, initial=0.0, where=counts | solved.undecided))
+    excess = error / allowed
+    known = excess < np.inf and (tolerance is not None or excess > 1.0)
+    return (excess if known else unknown), error
 
 
 def has_chosen(robot: Any) -> bool:
