@@ -34,7 +34,7 @@ class Routing(Part):
     end: float = place("where the tendon is anchored", low=1e-3, default=1.0, kw_only=True)
 
     @property
-    def winding(self) -> float:
+    def total_turn(self) -> float:
         """Angle (rad) through which the tendon turns over the rod: its way across it over its distance."""
         return 0.0
 
@@ -98,7 +98,7 @@ class Helical(Routing):
     )
 
     @property
-    def winding(self) -> float:
+    def total_turn(self) -> float:
         """Angle of its turns (rad)."""
         return 2.0 * np.pi * known_size(self.turns)
 
@@ -137,7 +137,7 @@ class FunctionRouting(Routing):
     function: Callable[[Any], tuple[Any, Any]] = eqx.field(static=True)  # type: ignore[misc]
 
     @property
-    def winding(self) -> float:
+    def total_turn(self) -> float:
         """Angle of the path of the function's values."""
         return _path_winding(self.function)
 
@@ -233,7 +233,7 @@ class RoutedPaths(NamedTuple):
     @property
     def winding(self) -> float:
         """Largest angle (rad) through which a tendon turns about the rod."""
-        return max(routing.winding for routing in self.routings)
+        return max(routing.total_turn for routing in self.routings)
 
     @property
     def straight(self) -> bool:

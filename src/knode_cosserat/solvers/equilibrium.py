@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax
@@ -150,7 +150,8 @@ def _solved(
     y = before = None
     if initial is not None:
         y, before = grid_of(system).spread(initial.y[-1]), initial.control[-1]
-    task, said = TimeIntegration(settings, steps=np.shape(controls)[-2], recovery_budget=recovery_budget), ()
+    task = TimeIntegration(settings, steps=np.shape(controls)[-2], recovery_budget=recovery_budget)
+    said: tuple[Callable[[], None], ...] = ()
     if is_traced((system, controls, y)):
         rest = unloaded_shape(bare, settings.space) if y is None else y
         if batch and rest.ndim == 2:

@@ -206,10 +206,11 @@ def inverse_kinematics(
             row, last, shape = _one(search, each, last, shape, int(starts))
             rows.append(row)
         rests = [row.equilibrium for row in rows]
-        known = (
+        found = rows[0] if single else _path(rows)
+        results, errors = (
             np.concatenate([getattr(rest, name) for rest in rests]) for name in ("result", "position_error")
         )
-        return Solved(rows[0] if single else _path(rows), *known)
+        return Solved(found, results, errors)
 
     return refined(solve, robot, settings.space)
 
