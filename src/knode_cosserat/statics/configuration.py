@@ -71,7 +71,7 @@ class Configuration:
     jacobian: np.ndarray
     _compliance: np.ndarray
     _length: float
-    _coarse: bool
+    _coarse: bool = False
 
     def __repr__(self) -> str:
         turned = "" if self.quaternion is None else f", quaternion {quantity(self.quaternion)}"
