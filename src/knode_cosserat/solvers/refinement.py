@@ -32,7 +32,7 @@ Found = TypeVar("Found")
 
 
 class Solved(NamedTuple, Generic[Found]):
-    """What was found on a grid, with the results of its rows and their estimated errors of positions (m)."""
+    """Solution on a grid, with the results of its rows and their estimated errors of positions (m)."""
 
     found: Found
     result: Any

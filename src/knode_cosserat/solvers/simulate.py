@@ -18,12 +18,12 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import ChosenNodes, System, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages, no_rows
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.refinement import (
     Solved,
     as_seen,
-    fixed,
     has_chosen,
     nodes_of,
     on_grid,
@@ -44,6 +44,7 @@ from knode_cosserat.solvers.run import (
 )
 from knode_cosserat.solvers.settings import Errors, NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.static_run import static_run
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -135,7 +136,7 @@ def simulate(
 
     def solve(robot: Any) -> Solved[Trajectory]:
         system = stacked(robot)[0]
-        before = initial if initial is None else _again_at_rest(initial, system, settings, newton)
+        before = initial if initial is None else _again_at_rest(initial, system, settings)
         # ranges are not part of the equations: programs are compiled for systems without them
         bare = without_range(system)
         if before is not None:
@@ -155,16 +156,17 @@ def simulate(
     return refined(solve, robot, settings.space, position_tolerance, stays=moving)
 
 
-def _again_at_rest(initial: Trajectory, system: System, settings: Settings, newton: Any) -> Trajectory:
+def _again_at_rest(initial: Trajectory, system: System, settings: Settings) -> Trajectory:
     """Return the last equilibrium of a trajectory on the grid of a system."""
-    from knode_cosserat.solvers.equilibrium import equilibrium
-
     if initial.y.shape[-2] == system.nodes:
         return initial
-    return equilibrium(
-        fixed(system), initial.control[-1], space=settings.space, initial=resampled(initial, system),
-        newton=newton, with_stability=False,
-    )  # fmt: skip
+    guess, bare = resampled(initial, system), without_range(system)
+    task = TimeIntegration(Settings(None, settings.space, newton=settings.newton))
+    y, control = grid_of(bare).spread(guess.y[-1]), np.asarray(guess.control[-1:])
+    rows, _, cause = static_run(task, bare, control, y, control[0])
+    if rows.result[0] < 0:
+        raise failure(rows, cause, None)
+    return dataclasses.replace(guess, system=system, settings=task.settings, **rows_of(bare, rows))
 
 
 def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
