@@ -28,7 +28,7 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, parameters_of, slots_of
 from knode_cosserat.rods.strands import strand_count
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import ChosenNodes, System, is_traced, nodes_text
 from knode_cosserat.solvers.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.solvers.result import Result, ResultCodes, Verdict, VerdictCodes
 from knode_cosserat.solvers.settings import Settings
@@ -271,6 +271,8 @@ class Trajectory:
             for where, error in (("along the rod", self.position_error), ("in time", self.time_error))
             if error is not None and np.any(np.isfinite(error))
         ]
+        if isinstance(self.system.nodes, ChosenNodes):
+            lines.append(nodes_text(self.system))
         if self.settings is not None and not self.settings.errors:
             lines.append("errors not estimated")
         elif errors and self.position_error is not None:

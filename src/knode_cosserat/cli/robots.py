@@ -122,8 +122,8 @@ def simulate(
         drawing.overview(trajectory).savefig(figure)
     summary = summaries.motion_summary(trajectory)
     errors = [
-        summaries.error_text(summary[f"largest_{name}_error"], float(system.length))
-        for name in ("position", "time")
+        summaries.error_text(summary[f"largest_{name}_error"], float(system.length), grid)
+        for name, grid in (("position", trajectory.system), ("time", None))
     ]
     facts: dict[str, Any] = {"robot": model.robot, "steps": len(sequence), "dt": dt}
     facts |= {"computing_time": round(seconds, 4), **summary}
@@ -217,7 +217,7 @@ def equilibrium(
         f"tip: {vector_text(facts['tip_position'])} m",
         f"inclination of the tip from the z axis: {np.degrees(facts['tip_inclination']):.2f} degrees",
         f"scaled residual {facts['residual']:.1e}; largest estimated position error: "
-        f"{summaries.error_text(facts['position_error'], float(system.length))}",
+        f"{summaries.error_text(facts['position_error'], float(system.length), rest.system)}",
     ]
     if "base_force" in facts:
         lines.append(f"internal force at the base: {vector_text(facts['base_force'])} N")

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from knode_cosserat.rods.system import ChosenNodes, nodes_text
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.result import Result, Verdict
 
@@ -37,7 +38,13 @@ def motion_summary(trajectory: Trajectory) -> dict[str, Any]:
         "largest_time_error": _largest_error(trajectory.time_error, trajectory.valid),
         "extrapolated": _extrapolated(trajectory),
         "tip_position": np.asarray(trajectory.tip_position)[valid][-1].tolist(),
+        **grid_facts(trajectory.system),
     }
+
+
+def grid_facts(system: System) -> dict[str, Any]:
+    """Return the number of nodes, and whether it was chosen."""
+    return {"nodes": int(system.nodes), "nodes_chosen": isinstance(system.nodes, ChosenNodes)}
 
 
 def _extrapolated(trajectory: Trajectory) -> int | None:
@@ -54,11 +61,13 @@ def _largest_error(errors: Any, valid: Any) -> float | None:
     return largest if np.isfinite(largest) else None
 
 
-def error_text(error: float | None, length: float) -> str:
-    """Return a position error as text: in mm, and as a percentage of the length."""
+def error_text(error: float | None, length: float, system: System | None = None) -> str:
+    """Return a position error as text: in mm, as a percentage of the length, and the nodes if chosen."""
+    chosen = system is not None and isinstance(system.nodes, ChosenNodes)
+    grid = f" with {nodes_text(system)}" if chosen and system is not None else ""
     if error is None:
-        return "no estimate"
-    return f"{1e3 * error:.2g} mm ({100 * error / length:.2g} % of the length)"
+        return f"no estimate{grid}"
+    return f"{1e3 * error:.2g} mm ({100 * error / length:.2g} % of the length){grid}"
 
 
 def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
@@ -72,6 +81,7 @@ def equilibrium_summary(rest: Trajectory) -> dict[str, Any]:
         "residual": float(rest.residual[0]),
         "position_error": _largest_error(rest.position_error, rest.valid),
         "extrapolated": _extrapolated(rest),
+        **grid_facts(rest.system),
         "result": Result(int(rest.result[0])).message,
     }
     if "tension" in rest.system.control_layout.names:
@@ -108,7 +118,8 @@ def parameters(system: System) -> dict[str, dict[str, Any]]:
     """Return the parameters by name, with value, unit and meaning; for a model, of its nominal robot."""
     system = nominal_model(system)
     stated = {name: (getattr(system, name), it.unit, it.meaning) for name, it in system.parameters().items()}
-    nodes = {"nodes": (system.nodes, "1", "nodes along the rod, base and tip included")}
+    chosen = ", chosen; solutions may use more" if isinstance(system.nodes, ChosenNodes) else ""
+    nodes = {"nodes": (int(system.nodes), "1", f"nodes along the rod, base and tip included{chosen}")}
     return {name: _quantity(*parts) for name, parts in (stated | nodes).items()}
 
 

@@ -19,6 +19,7 @@ from knode_cosserat.control.planning import Knots, Tracking, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.simulate import simulate
 
 #: training motions: their number and duration (s), and the time for which a random control is approached (s)
@@ -169,7 +170,7 @@ def _training_motions(
                 wanted = low + wide * rng.uniform(size=len(low)) * (high - low)
             control = motion[k] = limits.applied(control + 0.3 * (wanted - control), control, dt)
     acting = np.array([lagged(motion, dt, limits.lag, limits.safe) for motion in controls])
-    motions = simulate(robot, acting, dt)
+    motions = simulate(fixed(robot), acting, dt)
     y, z = np.asarray(motions.y)[:, :-1], np.asarray(motions.z)[:, :-1]
     outputs = [
         [np.asarray(target.value(robot, *state)) for state in zip(ys, zs, strict=True)]

@@ -17,6 +17,7 @@ from knode_cosserat.estimation.online import Belief, Spread, errors_along
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.refinement import fixed
 
 #: preload of all controls, as a part of their range: tendons only pull, so that each needs room to let go
 PRELOAD = 0.25
@@ -37,7 +38,7 @@ def linear_model(
         SimulationError: there is no such equilibrium.
     """
     count = len(control)
-    observer = KalmanObserver(robot, dt, output, initial=equilibrium(robot, control))
+    observer = KalmanObserver(robot, dt, output, initial=equilibrium(fixed(robot), control))
     used, size = observer.belief.spread.rate.shape[1:]
     rows = np.zeros((count, 2, used, size))
     belief = Belief(np.zeros(0), observer.belief.past, Spread(rows, rows[:, 0], np.zeros((count, 0))))

@@ -22,6 +22,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -126,7 +127,7 @@ def predict(
         SimulationError: an equilibrium or a step has no solution.
     """
     check_arguments(predict, locals())
-    measured = Measurements.of(measured)
+    robot, measured = fixed(robot), Measurements.of(measured)
     initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
     if first is not None:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)

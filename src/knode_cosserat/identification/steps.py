@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import undelayed
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import BDF2, LIGHTLY_DAMPED, TWO_STAGES, TimeScheme
@@ -89,7 +90,7 @@ def simulated_rows(
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
     acting = undelayed(robot, tension, dt / count, initial)
     motion = simulate(
-        robot, acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
+        fixed(robot), acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
         initial=start, recovery_budget=recovery,
     )  # fmt: skip
     return motion[::count] if count > 1 else motion

@@ -16,6 +16,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import undelayed
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -101,7 +102,7 @@ def moved(
     robot: System, tension: Float[np.ndarray, "T c"], like: Experiment, space: str | SpaceScheme
 ) -> tuple[Trajectory, Trajectory]:
     """Return the equilibrium under a recording's initial tensions, and the rows from there."""
-    initial, dt = np.asarray(like.held), like.dt
+    robot, initial, dt = fixed(robot), np.asarray(like.held), like.dt
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")

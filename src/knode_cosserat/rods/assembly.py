@@ -179,6 +179,11 @@ class Assembly(System):
             )
 
     @property
+    def winding(self) -> float:
+        """Largest angle (rad) through which a part of a rod turns along it."""
+        return max(rod.winding for rod in self.rods)
+
+    @property
     def reached(self) -> dict[str, str]:
         """Rods that lead from the ground, in order, each with the body that it places, if any."""
         order: dict[str, str] = {}

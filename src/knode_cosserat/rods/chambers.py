@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, as_number, choice, parameter
+from knode_cosserat.rods.parameters import ParameterError, as_number, choice, known_size, parameter
 from knode_cosserat.rods.parts import Effect, RodPoint, Stretched
 from knode_cosserat.rods.routing import OffsetPaths, path_lengths
 from knode_cosserat.rods.tendon_law import Stretching, Tendons, stretches
@@ -88,6 +88,10 @@ class Chambers(Stretched, Effect):
                     f"Chambers overlap: radius is {self.radius:g} m, and centres are {gap:.3g} m apart; "
                     f"allowed is up to {gap / 2.0:.3g} m, or the area of chambers of another shape"
                 )
+
+    def winding(self, rod: Any) -> float:
+        """Return the angle by which they turn about the rod."""
+        return known_size(self.twist)
 
     @property
     def count(self) -> int:

@@ -458,6 +458,13 @@ def as_number(value: Any) -> float | None:
     return None if value is None or isinstance(value, jax.core.Tracer) or np.ndim(value) else float(value)
 
 
+def known_size(value: Any) -> float:
+    """Return the largest size of numbers, also those of a batch; 0 for absent or traced ones."""
+    if value is None or isinstance(value, jax.core.Tracer):
+        return 0.0
+    return float(np.max(np.abs(value), initial=0.0))
+
+
 def _as_matrix(value: Any) -> Any:
     """Return one number or three as a diagonal matrix."""
     value = _as_array(value)

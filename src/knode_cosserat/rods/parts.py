@@ -92,6 +92,10 @@ class Contribution:
         """Places of discontinuity, as fractions of the length."""
         return ()
 
+    def winding(self, rod: Any) -> float:
+        """Return the angle (rad) through which the part turns along the rod (`System.winding`)."""
+        return 0.0
+
     def check(self, rod: Any) -> None:
         """Raise `ParameterError` if the part and others of its robot exclude each other."""
 

@@ -44,7 +44,7 @@ from knode_cosserat.rods.parameters import (
     slots_of,
 )
 from knode_cosserat.rods.rod import SlenderRod
-from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES, System, is_traced
+from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES, ChosenNodes, System, is_traced
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot, VirtualRobot
 from knode_cosserat.rods.tubes import ConcentricTubeRobot
 
@@ -129,11 +129,14 @@ def file_mapping(name_or_path: str | Path) -> dict[Any, Any]:
 def save_robot(robot: System, path: str | Path, *, description: str = "") -> None:
     """Write a robot to a file that `load_robot` reads back equal. The file is complete or not written.
 
+    Nodes are stated in it unless the robot's parts alone chose them.
+
     Raises:
         RobotFileError: the robot's class has no kind, it is a batch, or the file cannot be written.
     """
     check_arguments(save_robot, locals())
-    text = format_robot(robot, description)
+    chosen = isinstance(robot.nodes, ChosenNodes) and robot.nodes == robot.needed_nodes
+    text = format_robot(robot, description, with_nodes=not chosen)
     try:
         with replacing(Path(path)) as temporary:
             temporary.write_text(text, encoding="utf-8")
@@ -228,8 +231,11 @@ def _mapping(text: str, source: str) -> dict[Any, Any]:
 # robot to text
 
 
-def format_robot(robot: System, description: str = "") -> str:
-    """Return the text of a robot's file, with the unit beside each value; see `save_robot` for the errors."""
+def format_robot(robot: System, description: str = "", with_nodes: bool = True) -> str:
+    """Return the text of a robot's file, with the unit beside each value; see `save_robot` for the errors.
+
+    Without nodes, the robot that is read chooses them.
+    """
     kind = next((name for name, cls in KINDS.items() if type(robot) is cls), None)
     if kind is None:
         raise RobotFileError(
@@ -248,7 +254,8 @@ def format_robot(robot: System, description: str = "") -> str:
         value = getattr(robot, name)
         if value is not None:
             lines.append(f"  {name}: {parameter.written(value)}  # {parameter.unit}, {parameter.meaning}")
-    lines.append(f"  nodes: {robot.nodes}  # base and tip included")
+    if with_nodes:
+        lines.append(f"  nodes: {robot.nodes}  # base and tip included")
     return "\n".join(lines + more) + "\n"
 
 
@@ -276,8 +283,7 @@ NODES = {
     "type": "integer",
     "minimum": FEWEST_NODES,
     "maximum": MOST_NODES,
-    "default": 10,
-    "description": "nodes along the rod, base and tip included",
+    "description": "nodes along the rod, base and tip included; by default as many as parts and shapes need",
 }
 
 

@@ -214,6 +214,11 @@ class SlenderRod(System):
             )
         )
 
+    @property
+    def winding(self) -> float:
+        """Largest angle (rad) through which a part turns along the rod."""
+        return max((part.winding(self) for part in self.parts.values()), default=0.0)
+
     def inputs(self, control: Any) -> list[tuple[Contribution, Any]]:
         """Return the parts, each with its control."""
         inputs: list[tuple[Contribution, Any]] = []

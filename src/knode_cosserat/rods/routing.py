@@ -8,6 +8,7 @@ anchored before the tip.
 from __future__ import annotations
 
 import abc
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, NamedTuple
 
@@ -17,18 +18,25 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.parameters import ParameterError, parameter, place
+from knode_cosserat.rods.parameters import ParameterError, known_size, parameter, place
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rods.tendon_law import stretches
 
 #: points of Gauss quadrature for the length of a tendon in the unloaded robot
 GAUSS = 24
+#: points at which the turns of a function's path are measured
+SAMPLES = 1001
 
 
 class Routing(Part):
     """The path of one tendon. `end` is the fraction of the length at which it is anchored."""
 
     end: float = place("where the tendon is anchored", low=1e-3, default=1.0, kw_only=True)
+
+    @property
+    def total_turn(self) -> float:
+        """Angle (rad) through which the tendon turns over the rod: its way across it over its distance."""
+        return 0.0
 
     @abc.abstractmethod
     def at(self, sigma: Any) -> tuple[Any, Any]:
@@ -89,6 +97,11 @@ class Helical(Routing):
         "", "turns over the whole length of the rod, from x to y if positive", low=-1e3, high=1e3
     )
 
+    @property
+    def total_turn(self) -> float:
+        """Angle of its turns (rad)."""
+        return 2.0 * np.pi * known_size(self.turns)
+
     def at(self, sigma: Any) -> tuple[Any, Any]:
         """Return the point on a circle about the axis."""
         angle = self.phase + 2.0 * np.pi * self.turns * sigma
@@ -123,6 +136,11 @@ class FunctionRouting(Routing):
 
     function: Callable[[Any], tuple[Any, Any]] = eqx.field(static=True)  # type: ignore[misc]
 
+    @property
+    def total_turn(self) -> float:
+        """Angle of the path of the function's values."""
+        return _path_winding(self.function)
+
     def at(self, sigma: Any) -> tuple[Any, Any]:
         """Return the function's value."""
         x, y = self.function(sigma)
@@ -145,6 +163,15 @@ class FunctionRouting(Routing):
             raise ParameterError(f"FunctionRouting: function gives shapes {shapes}; {allowed}")
 
 
+@functools.lru_cache(maxsize=256)
+def _path_winding(function: Callable[[Any], tuple[Any, Any]]) -> float:
+    """Return the length of a tendon's path across the rod, over its largest distance from the axis."""
+    with jax.ensure_compile_time_eval():
+        x, y = map(np.asarray, jax.vmap(function)(jnp.linspace(0.0, 1.0, SAMPLES)))
+    way, most = np.sum(np.hypot(np.diff(x), np.diff(y))), np.max(np.hypot(x, y))
+    return float(way / most) if most > 0.0 else 0.0
+
+
 class OffsetPaths(NamedTuple):
     """Paths of tendons at one distance (m) from the axis; they turn about it by `twist` (rad) to the tip."""
 
@@ -152,6 +179,11 @@ class OffsetPaths(NamedTuple):
     angles: Float[Any, " c"]
     twist: Any
     length: Any
+
+    @property
+    def winding(self) -> float:
+        """Angle (rad) through which the tendons turn about the rod."""
+        return known_size(self.twist)
 
     @property
     def straight(self) -> bool:
@@ -197,6 +229,11 @@ class RoutedPaths(NamedTuple):
 
     routings: tuple[Routing, ...]
     length: Any
+
+    @property
+    def winding(self) -> float:
+        """Largest angle (rad) through which a tendon turns about the rod."""
+        return max(routing.total_turn for routing in self.routings)
 
     @property
     def straight(self) -> bool:

@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.ends import Pose
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, as_number, choice, parameter, places
+from knode_cosserat.rods.parameters import ParameterError, as_number, choice, known_size, parameter, places
 from knode_cosserat.rods.parts import Part, Stretched
 from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, turned
@@ -400,6 +400,10 @@ class Stretch(SectionChange):
             elif gain:
                 field = field._replace(high=min(field.high, float(np.nextafter(least / gain, -np.inf))))
         return (field,) if self.controlled else ()
+
+    def winding(self, rod: Any) -> float:
+        """Return the angle of a rod with its curvature all along."""
+        return (known_size(self.curvature) + known_size(self.curvature_slope)) * known_size(rod.length)
 
     def differences(self, part: Any, control: Any) -> Differences:
         """Return the polynomial factors, with the control's changes."""

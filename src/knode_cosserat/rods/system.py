@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -29,8 +30,15 @@ from knode_cosserat.rods.parameters import (
     with_value,
 )
 
-#: smallest and largest number of nodes of a rod
-FEWEST_NODES, MOST_NODES = 2, 10_000
+#: smallest and largest number of nodes of a rod, and the number that is chosen if its parts need no more
+FEWEST_NODES, MOST_NODES, USUAL_NODES = 2, 10_000, 10
+#: angle (rad) through which parts turn in one segment: of the nodes that are chosen, and the largest at which
+#: an estimate of errors sees the turns
+CHOSEN_TURN, SEEN_TURN = math.pi / 3.0, math.pi
+
+
+class ChosenNodes(int):
+    """Number of nodes that the user did not state: solvers may refine it."""
 
 
 class Scales(NamedTuple):
@@ -73,8 +81,8 @@ class System(Parametrised):
 
     if TYPE_CHECKING:  # every system has a length (m) among its own parameters
         length: Any
-    #: number of nodes of the rod, both ends included
-    nodes: int = eqx.field(static=True, default=10, kw_only=True)
+    #: number of nodes of the rod, both ends included; by default `needed_nodes`, as `ChosenNodes`
+    nodes: int = eqx.field(static=True, default=None, kw_only=True)
 
     # the equations
 
@@ -116,8 +124,30 @@ class System(Parametrised):
         """Return the natural sizes of y and of the tip's residuals; ones by default."""
         return Scales(jnp.ones(self.y_layout.size), jnp.ones(unknown_count(self)))
 
+    # the grid
+
+    @property
+    def winding(self) -> float:
+        """Angle (rad) through which parts turn along the rod at rest, at their highest rate, such as helices.
+
+        Parameters that are traced count as zero.
+        """
+        return 0.0
+
+    @property
+    def needed_nodes(self) -> int:
+        """Number of nodes that the parts need."""
+        return max(USUAL_NODES, 1 + math.ceil(self.winding / CHOSEN_TURN))
+
+    @property
+    def turn_of_segments(self) -> float:
+        """Angle (rad) through which parts turn in one segment; estimates see it up to `SEEN_TURN`."""
+        return self.winding / (self.nodes - 1)
+
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
+
+        The nodes stay, unless other parts need more and nobody stated them.
 
         Parameters of parts have names with dots, and indices if there are several parts:
         `base_end.position`, `loads.0.mass`. They are passed as `replace(**{"loads.0.mass": 0.1})`.
@@ -137,12 +167,20 @@ class System(Parametrised):
         return dataclasses.replace(self, **changes)
 
     def __check_init__(self) -> None:
+        check_fields(self)
         count: Any = self.nodes
-        if not isinstance(count, int) or not FEWEST_NODES <= self.nodes <= MOST_NODES:
+        if count is None or isinstance(count, ChosenNodes):
+            count = min(MOST_NODES, max(count or 0, self.needed_nodes))
+            object.__setattr__(self, "nodes", ChosenNodes(count))
+        elif not isinstance(count, int) or not FEWEST_NODES <= self.nodes <= MOST_NODES:
             raise ParameterError(
                 f"nodes is {self.nodes!r}; allowed is a whole number from {FEWEST_NODES} to {MOST_NODES}"
             )
-        check_fields(self)
+
+
+def nodes_text(system: System) -> str:
+    """Return the number of nodes in words, and whether it was chosen."""
+    return f"{system.nodes} nodes" + (", chosen" if isinstance(system.nodes, ChosenNodes) else "")
 
 
 def unknowns_of(system: System, y: Float[Any, "*n y"]) -> Float[Any, "*n k"]:

@@ -62,6 +62,11 @@ class TendonRod(SlenderRod):
         return OffsetPaths(self.tendon_offset, self.tendon_angles, None, self.length)
 
     @property
+    def winding(self) -> float:
+        """Largest angle (rad) through which a tendon or another part turns along the rod."""
+        return max(self.paths.winding, super().winding)
+
+    @property
     def tendon_count(self) -> int:
         """Number of tendons."""
         return len(self.paths.ends)

@@ -21,10 +21,10 @@ neglected.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any, ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +32,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.parameters import ParameterError, as_number, parameter, place, slot
+from knode_cosserat.rods.parameters import ParameterError, as_number, known_size, parameter, place, slot
 from knode_cosserat.rods.parts import Part, RodPoint
 from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
@@ -44,6 +44,7 @@ from knode_cosserat.rods.section import (
     round_section,
     shear_modulus,
 )
+from knode_cosserat.rods.system import CHOSEN_TURN
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 #: default number of segments of each interval: of order 4, their error is below 1e-4 of the length at rest
@@ -279,8 +280,6 @@ class ConcentricTubeRobot(SlenderRod):
     bending_stiffness: ClassVar[Any] = None  # type: ignore[misc]
     sections: ClassVar[Any] = ()  # type: ignore[misc]
 
-    #: by default four segments for each interval between the places where tubes begin to be curved, or end
-    nodes: int = eqx.field(static=True, default=None, kw_only=True)
     tubes: tuple[Tube, ...] = slot("tubes, the innermost first", Tube, many=True, default=())
     tube_friction: Any = parameter(
         "N s", "viscous torque between neighbouring tubes, by length and relative rate of rotation", low=0.0,
@@ -290,9 +289,6 @@ class ConcentricTubeRobot(SlenderRod):
     def __check_init__(self) -> None:
         if not self.tubes:
             raise ParameterError("tubes is []; allowed is one or more, the innermost first")
-        if self.nodes is None:
-            intervals = len(self.cross_section.cuts) + 1
-            object.__setattr__(self, "nodes", SEGMENTS * intervals + 1)
         if max(tube.end for tube in self.tubes) < 1.0:
             raise ParameterError("no tube ends at the tip; allowed is an end of 1 for the longest")
         moved = [
@@ -311,6 +307,16 @@ class ConcentricTubeRobot(SlenderRod):
                     f"tube {k} has a radius of {radius:g} m, and tube {k + 1} an inner_radius of {hole:g} m; "
                     "allowed are tubes in one another, the innermost first"
                 )
+
+    @property
+    def needed_nodes(self) -> int:
+        """Four segments, or more for strongly curved tubes, for each interval of the grid."""
+        bent = [
+            known_size(tube.curvature) * known_size(self.length if tube.curved is None else tube.curved)
+            for tube in self.tubes
+        ]
+        segments = max(SEGMENTS, math.ceil(max(bent) / CHOSEN_TURN))
+        return segments * (len(self.cross_section.cuts) + 1) + 1
 
     #: all tubes
     cross_section: ClassVar[Any] = property(  # type: ignore[misc]

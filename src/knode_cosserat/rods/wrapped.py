@@ -38,6 +38,8 @@ class Wrapped(System):
     control_layout = _member("knowledge.control_layout")
     base_unknowns = _member("knowledge.base_unknowns")
     mixed = _member("knowledge.mixed")
+    winding = _member("knowledge.winding")
+    needed_nodes = _member("knowledge.needed_nodes")
     constitutive = _member("adapted.constitutive")
     balance = _member("adapted.balance")
     rest = _member("adapted.rest")

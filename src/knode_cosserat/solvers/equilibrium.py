@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import jax
@@ -17,6 +17,7 @@ from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
 from knode_cosserat.solvers.history import unloaded_shape
+from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refined, resampled
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
@@ -30,9 +31,9 @@ from knode_cosserat.solvers.run import (
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import (
     check_initial,
+    check_tolerance,
     checked_controls,
     marked,
-    refined_trajectory,
     stacked,
 )
 from knode_cosserat.solvers.small_motion import verdicts
@@ -86,17 +87,13 @@ def equilibrium(
     """
     check_arguments(equilibrium, locals())
     control = _checked_control(robot, control)
-    if position_tolerance is not None:
-        solve = functools.partial(
-            equilibrium, control=control, space=space, initial=initial, newton=newton,
-            recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
-        )  # fmt: skip
-        order = Settings.of(None, space, "paper", newton).space.order
-        return refined_trajectory(solve, robot, initial, position_tolerance, order)
-    return equilibria(
-        robot, control[..., None, :], space=space, initial=initial, newton=newton,
-        recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
+    check_tolerance(robot, initial, position_tolerance)
+    solve = functools.partial(
+        _solved, controls=control[..., None, :], settings=Settings.of(None, space, "paper", newton),
+        initial=initial, recovery_budget=recovery_budget, on_failure=on_failure,
+        with_stability=with_stability,
     )  # fmt: skip
+    return refined(solve, robot, solve.keywords["settings"].space, position_tolerance)
 
 
 def equilibria(
@@ -129,11 +126,24 @@ def equilibria(
         ValueError: arguments of a wrong shape or name.
     """
     check_arguments(equilibria, locals())
-    settings = Settings.of(None, space, "paper", newton)
+    solve = functools.partial(
+        _solved, controls=controls, settings=Settings.of(None, space, "paper", newton), initial=initial,
+        recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
+    )  # fmt: skip
+    return refined(solve, robot, solve.keywords["settings"].space)
+
+
+def _solved(
+    robot: Any, controls: Any, settings: Settings, initial: Any, recovery_budget: float | None,
+    on_failure: str, with_stability: bool,
+) -> Solved[Trajectory]:  # fmt: skip
+    """Return the equilibria of a robot or a batch on its grid; arguments as in `equilibria`."""
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
     if initial is not None and not isinstance(initial, Trajectory):
         initial = _guess(robot, initial, controls[(0,) * (np.ndim(controls) - 1)])
+    elif initial is not None and isinstance(robot, System) and has_chosen(robot):
+        initial = resampled(initial, robot)
     if initial is not None:
         check_initial(system, initial, batch)
     bare = without_range(system)
@@ -141,11 +151,12 @@ def equilibria(
     if initial is not None:
         y, before = grid_of(system).spread(initial.y[-1]), initial.control[-1]
     task = TimeIntegration(settings, steps=np.shape(controls)[-2], recovery_budget=recovery_budget)
+    said: tuple[Callable[[], None], ...] = ()
     if is_traced((system, controls, y)):
         rest = unloaded_shape(bare, settings.space) if y is None else y
         if batch and rest.ndim == 2:
             rest = jnp.broadcast_to(rest, (batch, *rest.shape))
-        rows = _traced(bare, controls, rest, task, Pattern.of(bare))
+        rows = mark_unseen(system, _traced(bare, controls, rest, task, Pattern.of(bare)))
         tested: Any = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
     else:
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
@@ -153,14 +164,16 @@ def equilibria(
             raise failure(rows, causes, None)
         tested = verdicts(bare, settings, rows, np.asarray(controls) if with_stability else None)
         rows.result[(tested > 0) & (rows.result != Result.OTHER_TURNS)] = Result.UNSTABLE
-        warn_of_coarse_grids(system, settings, rows)
-        warn_of_results(rows)
-        warn_outside_rod_theory(system, rows)
+        said = (
+            functools.partial(warn_of_coarse_grids, system, settings, rows),
+            functools.partial(warn_of_results, rows),
+            functools.partial(warn_outside_rod_theory, system, rows),
+        )
     time = np.arange(float(task.steps))
     found = Trajectory(
         system, settings, time, control=controls, **rows_of(system, rows), stability=tested
     )  # fmt: skip
-    return marked(found, None)
+    return Solved.of(marked(found, None), said)
 
 
 @functools.partial(jax.jit, static_argnames=("task", "pattern"))

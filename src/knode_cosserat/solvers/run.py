@@ -25,7 +25,7 @@ from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import SEEN_TURN, System, is_traced
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, materials, turns_between, turns_within
 from knode_cosserat.solvers.history import (
@@ -39,6 +39,7 @@ from knode_cosserat.solvers.history import (
     no_rows,
 )
 from knode_cosserat.solvers.recovery import Budget, SolvedStep, StaticRecovery, StepRecovery, recovered_stages
+from knode_cosserat.solvers.refinement import mark_unseen
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import Euler
@@ -96,7 +97,9 @@ class TimeIntegration:
         A batch of robots has controls (B, T, c) and as many states; each is solved until one of its steps
         fails. Rows are written to `rows` if they are given.
         """
-        return engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps), rows)
+        found = engine.solve_steps(system, self.coefficients, controls, state, span or (0, self.steps), rows)
+        mark_unseen(system, found[2])
+        return found
 
     def motions(self, system: System, state: Any) -> Motions:
         """Return the motion of one robot from a state, for steps one by one."""
@@ -107,13 +110,15 @@ class TimeIntegration:
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
         if self.settings.time is None:
-            return StaticRecovery(system, self.settings, state, budget).recover(controls)
+            found = StaticRecovery(system, self.settings, state, budget).recover(controls)
+            return found._replace(row=mark_unseen(system, found.row))
         step = TimeStep.of(self.coefficients, state, i)
         recovery = StepRecovery(system, self.settings, step, self.dt, budget)
         recover = (
             functools.partial(recovered_stages, recovery) if self.settings.stages > 1 else recovery.recover
         )
         found = recover(controls)
+        found = found._replace(row=mark_unseen(system, found.row))
         last, now = (np.asarray(each)[-system.control_layout.size :] for each in controls)
         if recovery.largest_part((last, now)) == 1.0:
             return found
@@ -249,6 +254,8 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
         causes.append(f"orientations are off by more than about {COARSE_ANGLE:g} rad")
     causes += [f"{lost} rows have no estimate of the error"] if lost else []
     turn = _turn_of_segments(system, np.asarray(rows.records)[coarse])
+    wound = system.turn_of_segments
+    causes += [f"parts turn by {wound:.2g} rad from node to node"] if wound > SEEN_TURN else []
     causes += [f"frames turn by up to {turn:.2g} rad from node to node"] if turn > LARGEST_TURN else []
     said = ", ".join(causes)
     warnings.warn(

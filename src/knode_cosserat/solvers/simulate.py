@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import itertools
 import reprlib
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import jax
@@ -16,11 +15,21 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import ChosenNodes, System, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
+from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages, no_rows
 from knode_cosserat.solvers.initial import continued_state, initial_state
+from knode_cosserat.solvers.refinement import (
+    Solved,
+    as_seen,
+    has_chosen,
+    nodes_of,
+    on_grid,
+    refined,
+    resampled,
+)
 from knode_cosserat.solvers.rollout import Solves, rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -35,13 +44,12 @@ from knode_cosserat.solvers.run import (
 )
 from knode_cosserat.solvers.settings import Errors, NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.static_run import static_run
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: shortest and longest time steps (s): shorter ones are lost in rounding errors of the times
 SHORTEST_STEP, LONGEST_STEP = 1e-9, 1e6
-#: first and largest number of segments for position_tolerance
-FIRST_SEGMENTS, MOST_SEGMENTS = 8, 512
 #: negative tensions up to this part of the largest tension may be measurement noise
 PUSHING = 0.02
 #: largest relative difference in length between a robot and the one whose motion it continues
@@ -117,31 +125,48 @@ def simulate(
     dt = checked_dt(dt)
     if position_tolerance is not None and not errors:
         raise ValueError("position_tolerance needs estimates of errors: leave out errors=False")
+    check_tolerance(robot, initial, position_tolerance)
+    robot = robot if initial is None else on_grid_of(robot, initial)
+    warn_if_undamped(robot, dt)
+    warn_of_long_steps(robot, dt)
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
     if initial is not None:
         check_initial(system, initial, batch)
-    warn_if_undamped(robot, dt)
-    warn_of_long_steps(robot, dt)
-    if position_tolerance is not None:
-        refine = functools.partial(
-            simulate, controls=controls, dt=dt, time=time, space=space, start=start, between=between,
-            initial="equilibrium" if settled else None, newton=newton, errors=errors,
-            recovery_budget=recovery_budget, on_failure=on_failure, progress=progress,
-        )  # fmt: skip
-        return refined_trajectory(refine, robot, initial, position_tolerance, settings.space.order)
-    # ranges are not part of the equations: programs are compiled for systems without them
-    bare, before = without_range(system), None
-    if initial is not None:
-        before = without_range(dataclasses.replace(initial, extrapolated=None))
-    task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
-    if is_traced((system, controls, initial)):
-        found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
-        found = dataclasses.replace(found, system=system)
-    else:
+
+    def solve(robot: Any) -> Solved[Trajectory]:
+        system = stacked(robot)[0]
+        before = initial if initial is None else _again_at_rest(initial, system, settings)
+        # ranges are not part of the equations: programs are compiled for systems without them
+        bare = without_range(system)
+        if before is not None:
+            before = without_range(dataclasses.replace(before, extrapolated=None))
+        task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
+        if is_traced((system, controls, before)):
+            found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
+            result, error = as_seen(system, found.result, found.position_error)
+            found = dataclasses.replace(found, system=system, result=result, position_error=error)
+            return Solved.of(marked(found, initial))
         run = _initial(bare, controls, before, settled, task)
-        found = _trajectory(system, run, *_plain(bare, run, on_failure, progress))
-    return marked(found, initial)
+        every, last, said = _plain(bare, run, on_failure, progress)
+        return Solved.of(marked(_trajectory(system, run, every, last), initial), said)
+
+    # the state of a motion is known on its own grid only
+    moving = initial is not None and (initial.settings is None or initial.settings.time is not None)
+    return refined(solve, robot, settings.space, position_tolerance, stays=moving)
+
+
+def _again_at_rest(initial: Trajectory, system: System, settings: Settings) -> Trajectory:
+    """Return the last equilibrium of a trajectory on the grid of a system."""
+    if initial.y.shape[-2] == system.nodes:
+        return initial
+    guess, bare = resampled(initial, system), without_range(system)
+    task = TimeIntegration(Settings(None, settings.space, newton=settings.newton))
+    y, control = grid_of(bare).spread(guess.y[-1]), np.asarray(guess.control[-1:])
+    rows, _, cause = static_run(task, bare, control, y, control[0])
+    if rows.result[0] < 0:
+        raise failure(rows, cause, None)
+    return dataclasses.replace(guess, system=system, settings=task.settings, **rows_of(bare, rows))
 
 
 def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
@@ -177,10 +202,13 @@ def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
     return dataclasses.replace(trajectory, extrapolated=outside)
 
 
-def refined_trajectory(
-    solve: Callable[[System], Trajectory], robot: Any, initial: Any, tolerance: Any, order: int
-) -> Trajectory:
-    """Return the trajectory of `solve` with enough nodes for a position tolerance (m)."""
+# checks of the arguments
+
+
+def check_tolerance(robot: Any, initial: Any, tolerance: Any) -> None:
+    """Check a position tolerance (m), if there is one. Raises `ValueError`."""
+    if tolerance is None:
+        return
     if not isinstance(robot, System) or np.ndim(robot.length):
         raise ValueError(
             "position_tolerance chooses the nodes of one robot; a batch has the nodes of its robots"
@@ -191,27 +219,14 @@ def refined_trajectory(
         )
     if not isinstance(tolerance, int | float) or not 0.0 < tolerance < np.inf:
         raise ValueError(f"position_tolerance is {tolerance!r}; allowed is a positive number of metres")
-    segments = FIRST_SEGMENTS
-    while True:
-        found = solve(robot.replace(nodes=segments + 1))
-        error = float(np.max(found.position_error))
-        if error <= tolerance or not found.all_valid:
-            return found
-        if segments == MOST_SEGMENTS:
-            warnings.warn(
-                f"position_tolerance of {tolerance:g} m is not reached with {segments + 1} nodes, where the "
-                f'estimate is {error:.2g} m: use space="lobatto4", or a larger tolerance',
-                stacklevel=3,
-            )
-            return found
-        wanted = 2 * segments if np.isnan(error) else 1.1 * segments * (error / tolerance) ** (1.0 / order)
-        wanted = max(wanted, 1.2 * segments)
-        # few different numbers of nodes, so few programs to compile
-        ladder = (k * (FIRST_SEGMENTS // 4) * 2**n for n in itertools.count() for k in range(4, 8))
-        segments = min(MOST_SEGMENTS, next(n for n in ladder if n >= min(wanted, MOST_SEGMENTS)))
 
 
-# checks of the arguments
+def on_grid_of(robot: Any, initial: Trajectory) -> Any:
+    """Return a robot whose nodes are chosen on the grid of a trajectory that it continues."""
+    if not isinstance(robot, System) or not has_chosen(robot):
+        return robot
+    nodes = initial.y.shape[-2]
+    return on_grid(robot, ChosenNodes(nodes) if nodes >= robot.needed_nodes else nodes)
 
 
 def stacked(robot: Any) -> tuple[System, int | None]:
@@ -221,6 +236,8 @@ def stacked(robot: Any) -> tuple[System, int | None]:
     robots = list(robot) if isinstance(robot, Sequence) else []
     if not robots or not all(isinstance(one, System) for one in robots):
         raise ValueError(f"robot is {type(robot).__name__}; allowed is a robot or a non-empty list of robots")
+    if has_chosen(robots):
+        robots = on_grid(robots, ChosenNodes(nodes_of(robots)))
     if len({jax.tree.structure(one) for one in robots}) > 1:
         raise ValueError("the robots of a batch must be of one class, with the same nodes and options given")
     numeric: Any = jnp if is_traced(robots) else np
@@ -329,8 +346,11 @@ def _initial(system: Any, controls: Any, initial: Any, settled: bool, task: Time
     return at_start, task, acting
 
 
-def _plain(system: System, run: Any, on_failure: str, progress: bool) -> tuple[StepRows, StateHistory]:
-    """Return the initial row and those of the steps, and the last history; `run` as from `_initial`."""
+def _plain(system: System, run: Any, on_failure: str, progress: bool) -> tuple[StepRows, StateHistory, Any]:
+    """Return the initial row and those of the steps, the last history, and warnings to be given.
+
+    `run` is as from `_initial`.
+    """
     at_start, task, controls = run
     batch = np.shape(controls)[:-2]
     every = _initial_rows(system, task, (*batch, task.steps + 1))
@@ -343,9 +363,11 @@ def _plain(system: System, run: Any, on_failure: str, progress: bool) -> tuple[S
         times = float(np.ravel(at_start.state.history.t0)[0]) + (1.0 + np.arange(task.steps)) * task.dt
         raise failure(rows, causes, times)
     rows.result[:] = carried_results(rows.result, at_start.result)
-    warn_of_coarse_grids(system, task.settings, rows)
-    warn_outside_rod_theory(system, rows)
-    return every, history
+    said = (
+        functools.partial(warn_of_coarse_grids, system, task.settings, rows),
+        functools.partial(warn_outside_rod_theory, system, rows),
+    )
+    return every, history, said
 
 
 def _initial_rows(system: System, task: TimeIntegration, shape: tuple[int, ...]) -> StepRows:

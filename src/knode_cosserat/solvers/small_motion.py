@@ -21,12 +21,13 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
 from knode_cosserat.solvers.history import StepCoefficients, StepRows, used_places
+from knode_cosserat.solvers.refinement import is_too_coarse
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import Euler, SpaceScheme
+from knode_cosserat.solvers.space import SpaceScheme
 
 #: vectors side by side; most vectors for each factor that is wanted
 BLOCK, MOST = 16, 16
@@ -67,7 +68,7 @@ def verdicts(system: System, settings: Settings, rows: StepRows, controls: np.nd
         return found
     many, by_energy = np.ndim(system.length) > 0, is_tested(system)
     for at in zip(*np.nonzero(found == int(Verdict.UNTESTED_MANY)), strict=True):
-        if rows.result[at] == Result.COARSE and not isinstance(settings.space, Euler):
+        if is_too_coarse(settings.space, rows.result[at]):
             found[at] = int(Verdict.UNTESTED_GRID)
         elif by_energy and not many:
             y = rows.records[at][:, : system.y_layout.size]

@@ -27,6 +27,7 @@ from knode_cosserat.solvers.guess import (
     turns_between,
 )
 from knode_cosserat.solvers.history import StepRows, unloaded_shape
+from knode_cosserat.solvers.refinement import is_too_coarse
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.run import TimeIntegration, run_batch, run_one
 
@@ -74,7 +75,7 @@ def static_batch(
         for k, i in enumerate(plain):
             one, state = jax.tree.map(lambda leaf, k=k: leaf[k], (rows, states))
             runs[i] = one, state, causes.get(k, "")
-            solved = np.flatnonzero(one.result >= 0)
+            solved = np.flatnonzero(walk(i)._testable(one.result))
             if y is None and any(walk(i).is_unstable(one.records[j], controls[i, j]) for j in solved):
                 alone.add(i)
     for i in alone:
@@ -110,7 +111,7 @@ class _Walk:
                 rows, state, cause = run_one(self.task, self.system, controls, (y, before))
         else:
             rows, state, cause = self.along(controls, guess, controls[0])
-        for k in np.flatnonzero((rows.result >= 0) & (rows.result != Result.OTHER_TURNS)):
+        for k in np.flatnonzero(self._testable(rows.result)):
             if self.is_unstable(rows.records[k], controls[k]):
                 rows.result[k] = Result.UNSTABLE
         return rows, state, cause
@@ -160,6 +161,11 @@ class _Walk:
         pairs = zip(every[:-1], controls, counts, strict=True)
         parts = [np.linspace(start, end, n + 1)[1:] for start, end, n in pairs]
         return np.concatenate([*first, *parts]), np.cumsum(counts) - 1 + len(first)
+
+    def _testable(self, results: Any) -> Any:
+        """True for solved rows with the control's turns, unless the grid is too coarse for a verdict."""
+        coarse = is_too_coarse(self.task.settings.space, results)
+        return (results >= 0) & (results != Result.OTHER_TURNS) & ~coarse
 
     def is_unstable(self, records: Any, control: Any) -> bool:
         """True if an equilibrium is unstable; false where that is not tested."""

@@ -10,6 +10,7 @@ import numpy as np
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refined
 from knode_cosserat.solvers.settings import NewtonOptions
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, static_settings
@@ -70,6 +71,7 @@ class Configuration:
     jacobian: np.ndarray
     _compliance: np.ndarray
     _length: float
+    _coarse: bool = False
 
     def __repr__(self) -> str:
         turned = "" if self.quaternion is None else f", quaternion {quantity(self.quaternion)}"
@@ -101,6 +103,8 @@ class Configuration:
         the robot with its tip held together (Haynsworth). Buckling with a free tip is therefore detected.
         Buckling between a clamped base and a held tip is not. Only valid for the tip's own pose.
         """
+        if self._coarse:
+            raise ValueError("stability is not tested: the grid is too coarse for the shape; use more nodes")
         C = self.compliance
         if C.shape[0] != C.shape[1]:
             raise ValueError(f"compliance has shape {C.shape}: the robot's pose and wrench do not match")
@@ -151,10 +155,16 @@ def configuration(
         ValueError: arguments of a wrong shape.
     """
     check_arguments(configuration, locals())
-    control = checked_control(robot, control)
-    found = first_solved(robot, static_settings(space, newton), pose, control)
-    turned = None if found.quaternion is None else np.asarray(found.quaternion)
-    return Configuration(
-        control, np.asarray(found.position), turned, np.asarray(found.jacobian),
-        np.asarray(found.compliance), float(robot.length),
-    )  # fmt: skip
+    control, settings = checked_control(robot, control), static_settings(space, newton)
+
+    def solve(robot: System) -> Solved[Configuration]:
+        found = first_solved(robot, settings, pose, control)
+        turned = None if found.quaternion is None else np.asarray(found.quaternion)
+        linearised = Configuration(
+            control, np.asarray(found.position), turned, np.asarray(found.jacobian),
+            np.asarray(found.compliance), float(robot.length),
+            bool(is_too_coarse(settings.space, found.result)),
+        )  # fmt: skip
+        return Solved(linearised, found.result, found.position_error)
+
+    return refined(solve, robot, settings.space)

@@ -72,7 +72,9 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
 
     Raises `ValueError`, with a reason, if they cannot be computed.
     """
-    grids = next((pair for pair in GRIDS if system.nodes <= pair[1]), GRIDS[-1])
+    needed = system.needed_nodes
+    grids = next((pair for pair in GRIDS if max(system.nodes, needed) <= pair[1]), GRIDS[-1])
+    grids = grids if needed <= grids[1] else (needed, 2 * needed - 1)
     if used_places(system.replace(nodes=grids[1]), Lobatto4()) * history_size(system) > MOST_TERMS:
         raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
     if not strand_of(system).y_layout.ranges("q"):

@@ -111,6 +111,7 @@ def equilibrium_path(
     found = equilibrium(
         robot, first, space=settings.space, initial=initial, newton=newton, with_stability=False
     )
+    robot = found.system
     walk = _Walk(robot, settings, (first, last), np.asarray(found.y[0]))
     directions: list[int] = []
 

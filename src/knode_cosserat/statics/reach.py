@@ -23,6 +23,7 @@ from knode_cosserat._reprs import packed_text, quantity, wrapped
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refined
 from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import SpaceScheme
@@ -43,7 +44,7 @@ from knode_cosserat.statics.response import (
 from knode_cosserat.trajectory import Trajectory
 
 #: fields of a trajectory with one entry per row
-OF_A_ROW = ("y", "z", "control", "result", "residual", "iterations")
+OF_A_ROW = ("y", "z", "control", "result", "residual", "iterations", "position_error")
 #: tolerance of the equilibria, in natural units. The search compares distances to rounding; the residual at
 #: Newton's own tolerance would hide an optimum from it
 EXACT = 1e-13
@@ -73,6 +74,7 @@ class Reach(Code):
     UNREACHABLE = -1
     NOT_CONVERGED = -2
     NO_EQUILIBRIUM = -3
+    COARSE = -4
 
     @property
     def message(self) -> str:
@@ -82,6 +84,7 @@ class Reach(Code):
             Reach.UNREACHABLE: "not reachable from there: the nearest pose that was found",
             Reach.NOT_CONVERGED: "stopped before it was certain that nothing is nearer",
             Reach.NO_EQUILIBRIUM: "no equilibrium to begin with",
+            Reach.COARSE: "not tested: the grid is too coarse for the shape; use more nodes",
         }[self]
 
 
@@ -160,7 +163,9 @@ def inverse_kinematics(
     fraction of the way from `low` to `high`). For an unreachable pose the result is the nearest pose found,
     by weights, and `result` says so. The search is local. It starts at `initial`; if the pose is not reached,
     it restarts from other controls, up to `starts` in total. It follows shapes continuously: for a robot with
-    several equilibria the result may differ from that of `kc.equilibrium` (see `from_rest`).
+    several equilibria the result may differ from that of `kc.equilibrium` (see `from_rest`). On a grid that
+    is too coarse for the shape nothing is said to be reached or unreachable: nodes that were not stated are
+    refined, and otherwise the result is COARSE.
 
     Args:
         robot: one robot or model.
@@ -191,15 +196,27 @@ def inverse_kinematics(
     if not _whole(starts):
         raise ValueError(f"starts is {starts!r}; allowed is a whole number from 1")
     wanted, single = _checked_wanted(robot, pose, position, quaternion, (weights, tolerance))
-    search = _Search(robot, settings, pose, *limits)
-    free = np.where(search.free, search.span, 1.0)
-    last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
-    rows, shape = [], None
-    for each in wanted:
-        row, last, shape = _one(search, each, last, shape, int(starts))
-        rows.append(row)
-    if single:
-        return rows[0]
+
+    def solve(robot: System) -> Solved[InverseKinematics]:
+        search = _Search(robot, settings, pose, *limits)
+        free = np.where(search.free, search.span, 1.0)
+        last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
+        rows, shape = [], None
+        for each in wanted:
+            row, last, shape = _one(search, each, last, shape, int(starts))
+            rows.append(row)
+        rests = [row.equilibrium for row in rows]
+        found = rows[0] if single else _path(rows)
+        results, errors = (
+            np.concatenate([getattr(rest, name) for rest in rests]) for name in ("result", "position_error")
+        )
+        return Solved(found, results, errors)
+
+    return refined(solve, robot, settings.space)
+
+
+def _path(rows: list[InverseKinematics]) -> InverseKinematics:
+    """Return the results of several poses as one."""
     names = [field.name for field in dataclasses.fields(InverseKinematics)]
     columns = {name: [getattr(row, name) for row in rows] for name in names}
     rests = columns.pop("equilibrium")
@@ -238,7 +255,11 @@ def _one(
         return _outcome(search, wanted, begin, None, Reach.NO_EQUILIBRIUM), begin, None
     _, u, found, settled = best
     result = Reach.UNREACHABLE if settled else Reach.NOT_CONVERGED
-    return _outcome(search, wanted, u, found, Reach.REACHED if wanted.reached(found) else result), u, found
+    if is_too_coarse(search.settings.space, found.result):
+        result = Reach.COARSE
+    elif wanted.reached(found):
+        result = Reach.REACHED
+    return _outcome(search, wanted, u, found, result), u, found
 
 
 def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
@@ -253,20 +274,20 @@ def _outcome(
     """Return the result for an equilibrium, or for none: NaN."""
     system, control = search.system, search.control(u)
     errors, same, code, residual = (np.nan, np.nan), False, Result.NO_CONVERGENCE, np.inf
+    off = np.nan
     if found is None:
         position, quaternion = search.pose(system, np.full(system.y_layout.size, np.nan))
         y, z = (np.full((system.nodes, each.size), np.nan) for each in (system.y_layout, system.z_layout))
     else:
-        position, quaternion, code, residual = (
-            found.position, found.quaternion, Result.CONVERGED, float(found.error)
-        )  # fmt: skip
+        position, quaternion, residual = found.position, found.quaternion, float(found.error)
+        code, off = Result(max(int(found.result), 0)), float(found.position_error)
         errors = tuple(float(np.linalg.norm(each)) for each in wanted.errors(found))  # type: ignore[assignment]
         same = _from_rest(search, control, found)
         y, z = node_values(system, search.settings, control, found.y)
     rest = Trajectory(
         system=system, settings=search.settings, time=np.zeros(1), control=control[None],
         y=np.asarray(y)[None], z=np.asarray(z)[None], result=np.array([int(code)]),
-        residual=np.array([residual]), iterations=np.zeros(1, int),
+        residual=np.array([residual]), iterations=np.zeros(1, int), position_error=np.array([off]),
     )  # fmt: skip
     return InverseKinematics(
         result, control, np.asarray(position), None if quaternion is None else np.asarray(quaternion),

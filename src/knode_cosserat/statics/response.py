@@ -18,6 +18,7 @@ from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.solvers.history import rest_record, unloaded_shape
 from knode_cosserat.solvers.problem import row_of
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, static_tangents
@@ -51,6 +52,9 @@ class Response(NamedTuple):
     jacobian: Any
     #: twist per force (N) and moment (N m) at the tip along the global axes (p, w); w is 0 if unavailable
     compliance: Any
+    #: a `Result`, and the estimated error of positions (m)
+    result: Any
+    position_error: Any
 
 
 def node_values(system: System, settings: Settings, control: Any, y: Any) -> tuple[Any, Any]:
@@ -84,7 +88,8 @@ def respond(system: System, settings: Settings, pose: Pose, control: Any, guess:
     changes = Changes(d_controls, tip=d_tip)
     d_rows, _, _ = static_tangents(settings, solved, (system, control[None]), changes)
     position, quaternion, twists = _pose_of(system, pose, y[-1], d_rows[0, -1, :ny])
-    return Response(y, rows.error[0], position, quaternion, twists[:, :c], twists[:, c:])
+    known = rows.error[0], position, quaternion, twists[:, :c], twists[:, c:]
+    return Response(y, *known, rows.result[0], rows.position_error[0])
 
 
 @functools.partial(jax.jit, static_argnames="pose")
@@ -97,7 +102,7 @@ def _pose_of(system, pose, y, d_y):  # type: ignore[no-untyped-def]
 def equilibrium_poses(system: System, settings: Settings, pose: Pose, controls: np.ndarray) -> Any:
     """Return the poses of many equilibria (B, c), each solved from rest.
 
-    Position, quaternion, error, and the largest change from rest of each strain's magnitude.
+    Position, quaternion, error, the largest change from rest of each strain's magnitude, and result.
     """
     y, size, ny = unloaded_shape(system, settings.space), len(controls), system.y_layout.size
     y = np.broadcast_to(y, (size, *y.shape))
@@ -105,7 +110,8 @@ def equilibrium_poses(system: System, settings: Settings, pose: Pose, controls: 
     records = rows.records[:, 0]
     strain = (records - rest_record(system))[..., ny : ny + system.z_layout.size]
     lengths = [np.max(np.linalg.norm(part, axis=-1), axis=-1) for part in system.z_layout.split(strain)]
-    return *poses_of(system, pose, records[:, -1, :ny]), rows.error[:, 0], np.stack(lengths, axis=-1)
+    poses = poses_of(system, pose, records[:, -1, :ny])
+    return *poses, rows.error[:, 0], np.stack(lengths, axis=-1), rows.result[:, 0]
 
 
 @functools.partial(jax.jit, static_argnames="pose")
@@ -128,7 +134,7 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any) -
         found = respond(system, settings, pose, control, unloaded_shape(system, settings.space))
     if found is None or not found.error <= settings.newton.acceptable:
         recovered = equilibrium(
-            system, control, space=settings.space, newton=settings.newton, with_stability=False
+            fixed(system), control, space=settings.space, newton=settings.newton, with_stability=False
         )
         found = respond(
             system, settings, pose, control, still_state(system, settings.space, control, recovered.y[0]).y

@@ -27,11 +27,12 @@ from scipy.linalg import block_diag
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import count_of
 from knode_cosserat.rods.aspects import Observed
-from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
+from knode_cosserat.rods.strands import in_strands, of_rods, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
 from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
@@ -142,20 +143,27 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     check_arguments(stability, locals())
     system, y, z, control = checked_equilibrium(equilibrium, row)
     space = (equilibrium.settings or Settings()).space
+    result = equilibrium.result[row]
     if not isinstance(space, Lobatto4):
         one = Trajectory(
             system=system, settings=equilibrium.settings, time=np.zeros(1), y=y[None], z=z[None],
             control=control[None], result=np.zeros(1, int), residual=np.zeros(1), iterations=np.zeros(1, int),
         )  # fmt: skip
         found = rests(
-            system, control, space="lobatto4", initial=one, on_failure="return", with_stability=False
+            fixed(system), control, space="lobatto4", initial=one, on_failure="return", with_stability=False
         )
         if found.result[0] not in NEARBY:
             raise ValueError(
                 f"row {row} cannot be decided: by Lobatto4 along the rod no equilibrium is found near it; "
                 'allowed is one that was solved with space="lobatto4"'
             )
-        y = np.asarray(found.y[0])
+        y, result = np.asarray(found.y[0]), found.result[0]
+    if result == Result.COARSE:
+        reason = f"the grid of {system.nodes} nodes is too coarse for the shape; more nodes can decide"
+        unknown = np.full(np.shape(of_rods(system, y, "p")), np.nan)
+        return Stability(
+            -1, np.nan, unknown[:, 0] if unknown.shape[1] == 1 else unknown, np.nan, None, reason
+        )
     # the velocities of an equilibrium are rounding of the solver
     y, layout = y.copy(), strand_of(system).y_layout
     for name in set(Observed.of(strand_of(system)).velocities) & set(layout.names):

@@ -19,6 +19,7 @@ from knode_cosserat.io import container
 from knode_cosserat.io.container import Variable
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
@@ -259,16 +260,15 @@ def _joined(
         None if parts[0] is None else np.concatenate(parts)
         for parts in zip(*(chunks[first] for first in sorted(chunks)), strict=True)
     ]
-    index, position, quaternion, residual, strain = joined
-    solved = residual <= settings.newton.acceptable
-    result = np.where(solved, int(Result.CONVERGED), int(Result.NO_CONVERGENCE))
+    index, position, quaternion, residual, strain, result = joined
+    result = np.where(residual <= settings.newton.acceptable, result, int(Result.NO_CONVERGENCE))
     return Workspace(system, controls[index], position, quaternion, ResultCodes.of(result), residual, strain)
 
 
 def _recovered(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:
     """Replace sample i by the result of `kc.equilibrium` with its recoveries, solved or not."""
     rest = equilibrium(
-        found.system,
+        fixed(found.system),
         found.controls[i],
         space=settings.space,
         newton=settings.newton,

@@ -366,7 +366,7 @@ def view_live(
     checked_port(port)
     # in equilibrium under the sliders' initial controls: nothing moves by itself
     still = equilibrium(robot, [slider["start"] for slider in sliders(robot)], space=space)
-    stepper = Stepper(robot, usual_step(robot) if dt is None else dt, space=space, initial=still)
+    stepper = Stepper(still.system, usual_step(robot) if dt is None else dt, space=space, initial=still)
     page = live_page(stepper, title, target)
     interval = sys.getswitchinterval()
     gc.collect()
