@@ -50,6 +50,10 @@ def test_a_quaternion_is_searched_by_its_turn(nominal, turn):
             {"loads": [loads.PointWrench(force=[0.0] * 3)]},
             {"loads": [loads.PointWrench(force=[0.02, -0.01, 0.0])]}, "loads.0.force",
         ),
+        (
+            {"loads": [loads.AttachedMass(mass=0.0), loads.PointWrench(force=PUSH)]},
+            {"loads": [loads.AttachedMass(mass=4e-3), loads.PointWrench(force=PUSH)]}, "loads.0.mass",
+        ),
         ({"drag": 0.0}, {"drag": 2e-3}, "drag"),
         (
             {"base_end": ends.Clamped(position=[0.0] * 3)},
