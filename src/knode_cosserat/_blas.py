@@ -19,7 +19,7 @@ def _functions() -> tuple[Any, Any] | None:
     """Return the functions that read and set the number of threads; None for another library."""
     with contextlib.suppress(OSError, AttributeError):
         # also finds what the module is linked to, but on Windows
-        library = ctypes.CDLL(np.linalg._umath_linalg.__file__)  # type: ignore[attr-defined]
+        library = ctypes.CDLL(np.linalg._umath_linalg.__file__)
         for name in _NAMES:
             if hasattr(library, name % "set_num_threads"):
                 return getattr(library, name % "get_num_threads"), getattr(library, name % "set_num_threads")

@@ -83,6 +83,24 @@ def test_a_follower_load_makes_a_column_flutter():
     assert "by flutter" in str(found)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("part", "verdict"), [(0.9, Verdict.STABLE), (1.1, Verdict.FLUTTER)])
+def test_a_load_along_the_line_makes_a_column_flutter(part, verdict):
+    """Leipholz's column flutters at q L³/EI = 40.05."""
+    load = r.loads.DistributedWrench(force=(0.0, 0.0, -part * 40.05 * EI / L**3), follows=True)
+    column = r.SlenderRod(**ROD | {"bending_damping": 0.0, "nodes": 21}, gravity=(0, 0, 0), loads=(load,))
+    assert rest(column)[0].stability[0] == verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("part", "verdict"), [(0.9, Verdict.STABLE), (1.1, Verdict.FLUTTER)])
+def test_a_damped_shaft_whirls_beyond_its_first_frequency(part, verdict):
+    """Gyroscopic forces stabilise it there, and damping of the material undoes that (Thomson and Tait)."""
+    rate = part * 3.516 * np.sqrt(EI / (RHO * AREA)) / L**2
+    shaft = r.SlenderRod(**ROD, gravity=(0, 0, 0), effects=(r.SpinningFrame(rate=rate, axis=(0, 0, 1)),))
+    assert rest(shaft)[0].stability[0] == verdict
+
+
 def test_tendons_that_compress_a_straight_rod_do_not_buckle_it():
     """The force of a tendon turns with the line and bends nothing: stable at ten times Euler's load."""
     robot = kc.load_robot("delrin-tendon-robot").replace(gravity=(0.0, 0.0, 0.0))

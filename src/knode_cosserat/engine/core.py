@@ -446,8 +446,10 @@ class Core(EliminationCode):
         f.call(self.products, memory)
 
     def _write_linear_step(self) -> None:
-        """The linear map of a step at y, from changes of the history to those of the records (`LinearStep`)."""
-        f = self._now = self.module.function("linearise", ["memory", "coefficients", "control"], exported=True)
+        """The map of a linearised step at y, from changes of history to those of records (`LinearStep`)."""
+        f = self._now = self.module.function(
+            "linearise", ["memory", "coefficients", "control"], exported=True
+        )
         memory, coefficients, control = f.arguments
         f.call(self.setup, memory)
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)

@@ -11,7 +11,7 @@ from knode_cosserat.engine.core import Core
 
 
 class LinearStep:
-    """The step y_t = c0 (y - y_before) of one robot from an equilibrium: changes of its record by those before.
+    """The step y_t = c0 (y - y_before) from an equilibrium: changes of its record by those of the one before.
 
     Attributes:
         still: the equilibrium at all places.
@@ -26,7 +26,9 @@ class LinearStep:
         self._evaluate = core.evaluator(parameters, self._memory)
         self._none = np.zeros((core.grid.count, width))
         self.still = self._evaluate(0.0, 0.0, control, self._none, y)
-        inverse, tip = (core._numbers(self._memory[None], each)[0, 0] for each in (core.scale_y, core.scale_tip))
+        inverse, tip = (
+            core._numbers(self._memory[None], each)[0, 0] for each in (core.scale_y, core.scale_tip)
+        )
         bases = core.bases if core.strands > 1 else [0]
         self.scale_y, self.scale_tip = 1.0 / core.equations.joined(inverse[bases]), 1.0 / tip[0]
         #: where the numbers of a record are in the memory of a change

@@ -67,8 +67,8 @@ def equilibrium(
             it; by default it is the robot's.
         recovery_budget: seconds that recovery may take; see `simulate`.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with its row marked invalid.
-        with_stability: test the stability: 20 to 500 ms of CPU time where the energy does not decide, and
-            1 to 5 s once for new code. False for many equilibria in a loop.
+        with_stability: test the stability: 4 to 40 ms of CPU time for one rod where the energy does not
+            decide, 80 to 180 ms for several. False for many equilibria in a loop.
 
     Returns:
         A `Trajectory` of one row, at time 0 and without a solver state; it can be the `initial` of a
