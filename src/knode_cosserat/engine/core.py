@@ -461,13 +461,13 @@ class Core(EliminationCode):
         size = self.move.size * self.move.component
         with f.loop(columns) as column:
             own, inside = f.pointer(changes, column.value * size), self._pointer(self.move, 0)
-            with f.loop(size, 0, self.L) as k:
-                f.store(f.load(own, k.value, self.L), inside, k.value)
+            with f.loop(size, 0, self.L) as at:
+                f.store(f.load(own, at.value, self.L), inside, at.value)
             f.call(self.moved, memory)
             for i, j, value in self._numbers_of(self.tangents, self.used):
                 self._write_wide(value, self.move, i, j)
-            with f.loop(size, 0, self.L) as k:
-                f.store(f.load(inside, k.value, self.L), own, k.value)
+            with f.loop(size, 0, self.L) as at:
+                f.store(f.load(inside, at.value, self.L), own, at.value)
 
     def _write_products(self) -> None:
         """Products of derivatives with `dy` at the points and `move` of the history: defects, tip, record."""

@@ -16,7 +16,7 @@ from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.strands import of_rods, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
-from knode_cosserat.solvers.history import StepRows, used_places
+from knode_cosserat.solvers.history import StepRows, repeated_record_history, used_places
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.run import TimeIntegration
@@ -46,6 +46,9 @@ SAME = 0.02
 #: time (s) at which an equilibrium must still be one, and largest residual then, in natural units; no common
 #: rate of a frame makes whole turns in it
 LATER, BALANCED = 0.618, 1e-6
+#: motion from an unstable equilibrium: its first change in natural units, its time step as a multiple of the
+#: time in which it grows by e, and its number of steps
+FIRST, GROWN, MOTION = 0.02, 0.5, 300
 
 
 def verdicts(system: System, settings: Settings, rows: StepRows, controls: np.ndarray | None) -> np.ndarray:
@@ -125,8 +128,49 @@ def fastest_growth(system: System, step: LinearStep) -> complex | None:
     return None if np.any(growing & near & (rates.real > np.abs(rates.imag))) else 0j
 
 
+def stable_near(system: System, settings: Settings, row: StepRows, control: np.ndarray) -> StepRows | None:
+    """Return a stable equilibrium that an unstable one moves to; None if none is found.
+
+    The motion begins along the mode that grows fastest. Long steps of implicit Euler damp it, until it rests.
+    """
+    space, ny = settings.space, system.y_layout.size
+    step = linear_step(system, space, control, row.records[:, :ny])
+    rate = fastest_growth(system, step)
+    if not rate or abs(rate.imag) > rate.real:
+        return None
+    image, kept = _reduced(step, history_size(system))
+    with one_thread():
+        factors, vectors = np.linalg.eig(image)
+    mode = np.zeros(len(step.unit))
+    mode[kept] = np.real(vectors[:, np.argmin(np.abs(factors - RATE / (RATE - rate)))])
+    moved = step((step.unit * mode)[:, None]).reshape(-1, history_size(system))
+    moved = moved[: len(step.still.y), :ny]
+    y = step.still.y + FIRST * moved / np.max(np.abs(moved / step.scale_y))
+    dt = GROWN * natural_time(system, step) / rate.real
+    damped = Settings.of("bdf1", space, "paper", settings.newton)
+    past = repeated_record_history(system, damped, still_state(system, space, control, y).records, y, 0.0)
+    motion = TimeIntegration(damped, dt, MOTION)
+    done, past, _ = motion.solve(system, np.repeat(control[None], MOTION, axis=0), past)
+    if done < MOTION:
+        return None
+    _, _, rows = TimeIntegration(settings).solve(system, control[None], past.y[0])
+    found = StepRows(*(leaf[0] for leaf in rows))
+    if not found.error <= settings.newton.acceptable:
+        return None
+    if verdict_by_motion(system, settings, found, control) != Verdict.STABLE:
+        return None
+    coarse = found.result == Result.COARSE
+    return found if coarse else found._replace(result=int(Result.RECOVERED_RELAXATION))
+
+
 def _eigenvalues(step: LinearStep, size: int) -> np.ndarray:
     """Return the eigenvalues of a map of history with `size` terms at each place, but zeros."""
+    with one_thread():
+        return np.linalg.eigvals(_reduced(step, size)[0])
+
+
+def _reduced(step: LinearStep, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a map of history, in its units, between terms that act, and the places of these terms."""
     unit = step.unit
     # terms whose rates are in no equation; a random history shows them
     random = np.random.default_rng(0).normal(size=(len(unit) // size, size, 1)) * np.eye(size)
@@ -134,8 +178,7 @@ def _eigenvalues(step: LinearStep, size: int) -> np.ndarray:
     kept = np.flatnonzero(np.tile(np.any(seen, axis=0), len(unit) // size) & np.any(seen, axis=1))
     image = step((unit[:, None] * np.eye(len(unit)))[:, kept])[kept] / unit[kept, None]
     acts = np.any(image != 0.0, axis=0)
-    with one_thread():
-        return np.linalg.eigvals(image[np.ix_(acts, acts)])
+    return image[np.ix_(acts, acts)], kept[acts]
 
 
 def natural_time(system: System, step: LinearStep) -> float:
