@@ -5,6 +5,8 @@ import warnings
 import jax
 import numpy as np
 import pytest
+from scipy.optimize import brentq
+from scipy.special import ellipe, ellipk
 
 import knode_cosserat as kc
 from knode_cosserat.rods.tendons import TendonFriction
@@ -15,6 +17,8 @@ L, A, E, RHO = 1.0, 0.004, 1e8, 1000.0
 EI, AREA = E * np.pi * A**4 / 4, np.pi * A**2
 #: Greenhill's load: weight per length times L³ over EI, of a column that stands
 GREENHILL = 7.83735
+#: positions of a guess
+UPRIGHT = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, L], 9)
 ROD = {"length": L, "radius": A, "density": RHO, "youngs_modulus": E, "bending_damping": 1e-4, "nodes": 15}
 
 
@@ -62,9 +66,32 @@ def rest(robot, control=None, **options):
 def test_a_rod_is_unstable_beyond_its_critical_load_whatever_its_parts(kind):
     below, quiet = rest(KINDS[kind](0.93))
     assert below.result[0] == kc.Result.CONVERGED and below.stability[0] == Verdict.STABLE and not quiet
-    above, said = rest(KINDS[kind](1.07))
+    above, said = rest(KINDS[kind](1.07), initial=UPRIGHT)
     assert above.result[0] == kc.Result.UNSTABLE and above.stability[0] == Verdict.UNSTABLE and said
     assert np.max(np.abs(above.position[0, :, :2])) < 1e-9
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", KINDS)
+def test_without_a_guess_an_unstable_rod_is_given_in_the_shape_to_which_it_falls(kind):
+    """Under weight it falls as a column does from a bent guess, and in a field it is an elastica."""
+    found, said = rest(KINDS[kind](2.0))
+    assert found.result[0] == kc.Result.RECOVERED_RELAXATION and found.stability[0] == Verdict.STABLE
+    assert found.residual[0] < 1e-8 and not said
+    if kind == "magnet":
+        # Euler's elastica: K(m) = π/2 √2, height 2 E / K - 1
+        m = brentq(lambda m: ellipk(m) - np.pi / 2 * np.sqrt(2.0), 0.1, 0.99)
+        height = 2.0 * ellipe(m) / ellipk(m) - 1.0
+    else:
+        angle = np.linspace(0.0, 2.0, 21)
+        bent = np.stack([1.0 - np.cos(angle), 0.0 * angle, np.sin(angle)], axis=1) / 2.0
+        height = float(rest(column(2.0), initial=bent)[0].position[0, -1, 2])
+    assert float(found.position[0, -1, 2]) == pytest.approx(height, abs=0.01)
+
+
+def test_a_search_that_may_take_no_time_is_not_made():
+    found, said = rest(magnetic(2.0), recovery_budget=0.0)
+    assert found.stability[0] == Verdict.UNSTABLE and said
 
 
 @pytest.mark.slow
@@ -72,7 +99,7 @@ def test_the_length_that_is_fed_decides_on_a_fed_column():
     robot = column(1.0, effects=(r.Insertion(reserve=0.1, retraction=0.1),))
     # Greenhill's load grows with the cube of the length
     assert rest(robot, [-0.03])[0].stability[0] == Verdict.STABLE
-    assert rest(robot, [0.03])[0].stability[0] == Verdict.UNSTABLE
+    assert rest(robot, [0.03], initial=UPRIGHT)[0].stability[0] == Verdict.UNSTABLE
 
 
 @pytest.mark.slow
@@ -81,6 +108,24 @@ def test_a_follower_load_makes_a_column_flutter():
     found, said = rest(follower(1.1))
     assert found.stability[0] == Verdict.FLUTTER and found.result[0] == kc.Result.UNSTABLE and said
     assert "by flutter" in str(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("part", "verdict"), [(0.9, Verdict.STABLE), (1.1, Verdict.FLUTTER)])
+def test_a_load_along_the_line_makes_a_column_flutter(part, verdict):
+    """Leipholz's column flutters at q L³/EI = 40.05."""
+    load = r.loads.DistributedWrench(force=(0.0, 0.0, -part * 40.05 * EI / L**3), follows=True)
+    column = r.SlenderRod(**ROD | {"bending_damping": 0.0, "nodes": 21}, gravity=(0, 0, 0), loads=(load,))
+    assert rest(column)[0].stability[0] == verdict
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("part", "verdict"), [(0.9, Verdict.STABLE), (1.1, Verdict.FLUTTER)])
+def test_a_damped_shaft_whirls_beyond_its_first_frequency(part, verdict):
+    """Gyroscopic forces stabilise it there, and damping of the material undoes that (Thomson and Tait)."""
+    rate = part * 3.516 * np.sqrt(EI / (RHO * AREA)) / L**2
+    shaft = r.SlenderRod(**ROD, gravity=(0, 0, 0), effects=(r.SpinningFrame(rate=rate, axis=(0, 0, 1)),))
+    assert rest(shaft)[0].stability[0] == verdict
 
 
 def test_tendons_that_compress_a_straight_rod_do_not_buckle_it():
@@ -94,8 +139,7 @@ def test_tendons_that_compress_a_straight_rod_do_not_buckle_it():
 
 def test_an_unstable_guess_is_kept_and_said():
     robot = column(1.5)
-    upright = np.linspace([0.0, 0.0, 0.0], [0.0, 0.0, L], 9)
-    found, said = rest(robot, initial=upright)
+    found, said = rest(robot, initial=UPRIGHT)
     assert found.result[0] == kc.Result.UNSTABLE and found.stability[0] == Verdict.UNSTABLE and said
     # hanging over is stable
     bent = np.stack(

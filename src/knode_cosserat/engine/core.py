@@ -31,6 +31,7 @@ from knode_cosserat.solvers.history import (
     stage_extrapolations,
 )
 from knode_cosserat.solvers.problem import Evaluated
+from knode_cosserat.solvers.semi_discrete import has_friction
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.time import SDIRK2
 
@@ -53,6 +54,10 @@ class Core(EliminationCode):
     def __init__(self, system: System, settings: Settings, robots: bool):
         self.settings, self.scheme = settings, settings.time
         super().__init__(Equations(system, space=settings.space), robots)
+        #: true if the code linearises steps of one robot from an equilibrium, too
+        self.is_linear_step = isinstance(settings.time, SDIRK2) and not robots
+        #: true if there is no linearisation at rest
+        self.has_friction = self.is_linear_step and has_friction(system)
         e = self.equations
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: its options, a trial point, and the correction from the last accepted one
@@ -412,20 +417,50 @@ class Core(EliminationCode):
             # the difference of the rates at both stages, and its product with the equations' derivatives
             for i, j in self._components(e.numbers, self._count("used")):
                 self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
-            for i, j in self._components(e.ny, self._count("points")):
-                self._write_wide(0.0, self.dy, i, j)
-            f.call(self.products, memory)
-            state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
-            moved = self._evaluated(e.products["base"], 0, False, state)
-            for k, value in enumerate(moved):
-                self._put(value, self.w, k % e.ny, self.bases[k // e.ny])
-            f.call(self.correct, memory)
-            for k in range(len(moved)):
-                self._put(0.0, self.w, k % e.ny, self.bases[k // e.ny])
-            f.call(self.products, memory)
+            f.call(self.moved, memory)
             for i, j, product in self._numbers_of(self.tangents, "used between"):
                 once = product - self._wide(self.difference, i, j)
                 self._write_wide(carried(i, j) - c0 * scheme.defect * once, self.time_dH, i, j)
+
+    def _write_moved(self) -> None:
+        """Changes of a linearised step by `move` of the history: of the solution, and of its record."""
+        e = self.equations
+        self.moved = f = self._function("moved")
+        memory = f.arguments[0]
+        for i, j in self._components(e.ny, self._count("points")):
+            self._write_wide(0.0, self.dy, i, j)
+        f.call(self.products, memory)
+        state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
+        moved = self._evaluated(e.products["base"], 0, False, state)
+        for k, value in enumerate(moved):
+            self._put(value, self.w, k % e.ny, self.bases[k // e.ny])
+        f.call(self.correct, memory)
+        for k in range(len(moved)):
+            self._put(0.0, self.w, k % e.ny, self.bases[k // e.ny])
+        f.call(self.products, memory)
+
+    def _write_linear_step(self) -> None:
+        """The map of a linearised step at y, from changes of history to those of records (`LinearStep`)."""
+        names = ["memory", "coefficients", "control"]
+        f = self._now = self.module.function("linearise", names, exported=True)
+        memory, coefficients, control = f.arguments
+        f.call(self.setup, memory)
+        self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
+        for k, (i, base) in enumerate(self._unknown_numbers()):
+            self._put(self._get(self.y, i, base), self.unknowns, k)
+        f.call(self.linearised, memory)
+        names = ["memory", "changes", "n_columns", "n_size"]
+        f = self._now = self.module.function("move", names, exported=True)
+        memory, changes, columns, size = f.arguments
+        with f.loop(columns) as column:
+            own = f.pointer(changes, column.value * size)
+            for inside, outside in self._packed_vectors([self.move], own):
+                f.store(f.load(outside, 0, self.L), inside, 0)
+            f.call(self.moved, memory)
+            for i, j, value in self._numbers_of(self.tangents, "used between"):
+                self._write_wide(value, self.move, i, j)
+            for inside, outside in self._packed_vectors([self.move], own):
+                f.store(f.load(inside, 0, self.L), outside, 0)
 
     def _write_products(self) -> None:
         """Products of derivatives with `dy` at the points and `move` of the history: defects, tip, record."""
@@ -721,6 +756,8 @@ class Core(EliminationCode):
         self._write_static_errors()
         if isinstance(self.scheme, SDIRK2):
             self._write_products()
+            self._write_moved()
+        if isinstance(self.scheme, SDIRK2):
             self.corrected_in_time = self._write_corrected(
                 "in_time", self.time_errors, self.time_dH, False, TIME
             )
@@ -731,16 +768,18 @@ class Core(EliminationCode):
         self._write_vectors()
         if not self.batch:
             self._write_evaluate()
+        if self.is_linear_step:
+            self._write_linear_step()
 
     # running
 
-    def evaluator(self, parameters: np.ndarray) -> Callable[..., Evaluated]:
+    def evaluator(self, parameters: np.ndarray, memory: Any = None) -> Callable[..., Evaluated]:
         """Return a function that evaluates states of one robot, all in the same memory.
 
         Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at
         the nodes.
         """
-        memory, layout = self._empty_memory(), self.layout
+        memory, layout = self._empty_memory() if memory is None else memory, self.layout
         self._put_in(memory[None], self.params, parameters[None, None, None])
 
         def evaluate(c0: float, t: float, control: Any, history: Any, y: Any) -> Evaluated:

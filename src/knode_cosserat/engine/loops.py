@@ -12,6 +12,7 @@ import numpy as np
 
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.layout import layout_of
+from knode_cosserat.engine.linear_step import LinearStep
 from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
@@ -19,6 +20,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StepCoefficients, StepRows
 from knode_cosserat.solvers.problem import Evaluated
 from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TWO_STAGES
 
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
@@ -102,6 +104,20 @@ def packed(system: System) -> np.ndarray:
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
     """Return a function that evaluates states of a system (see `Core.evaluator`)."""
     return core_of(Pattern.of(system), settings, robots=False).evaluator(parameters_of(system))
+
+
+def linear_step(system: System, space: SpaceScheme, control: Any, y: Any) -> LinearStep:
+    """Return the linearised step of a system from an equilibrium y at all points, or at the nodes."""
+    return LinearStep(_still_core(system, space), parameters_of(system), control, y)
+
+
+def has_friction(system: System, space: SpaceScheme) -> bool:
+    """True if the law has friction (`semi_discrete.has_friction`), as the code of equilibria knows."""
+    return _still_core(system, space).has_friction
+
+
+def _still_core(system: System, space: SpaceScheme) -> Core:
+    return core_of(Pattern.of(system), Settings(None, space), robots=False)
 
 
 def table_of(steps: StepCoefficients, count: int, t0: float) -> np.ndarray:

@@ -14,9 +14,10 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.solvers.energy import is_tested
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
-from knode_cosserat.solvers.history import unloaded_shape
+from knode_cosserat.solvers.history import StepRows, unloaded_shape
 from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refined, resampled
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.rollout import static_rollout
@@ -36,7 +37,7 @@ from knode_cosserat.solvers.simulate import (
     marked,
     stacked,
 )
-from knode_cosserat.solvers.small_motion import verdicts
+from knode_cosserat.solvers.small_motion import stable_near, verdicts
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
@@ -68,8 +69,8 @@ def equilibrium(
             it; by default it is the robot's.
         recovery_budget: seconds that recovery may take; see `simulate`.
         on_failure: "raise" a `SimulationError`, or "return" the trajectory with its row marked invalid.
-        with_stability: test the stability: 20 to 500 ms of CPU time where the energy does not decide, and
-            1 to 5 s once for new code. False for many equilibria in a loop.
+        with_stability: test the stability: 4 to 40 ms of CPU time for one rod where the energy does not
+            decide, 80 to 180 ms for several. False for many equilibria in a loop.
 
     Returns:
         A `Trajectory` of one row, at time 0 and without a solver state; it can be the `initial` of a
@@ -78,8 +79,9 @@ def equilibrium(
         load is applied in parts, or a damped motion is simulated until the robot rests. There may be several
         equilibria. `stability` of the trajectory is the verdict, or the reason why it was not tested: rods
         under dead loads by their energy, one equilibrium of another robot by the growth of its small
-        motions, of batches only the former. An unstable shape of a compressed rod is replaced by a stable one
-        if no guess was given; if there is none near it, and for all other robots, the result is UNSTABLE.
+        motions, of batches only the former. Without a guess, an unstable shape of a compressed rod, or of one
+        robot whose motion does not oscillate as it grows, is replaced by the stable one to which it falls
+        (for the latter, RECOVERED_RELAXATION); if none is found, and for all others, the result is UNSTABLE.
 
     Raises:
         SimulationError: no equilibrium was found.
@@ -163,6 +165,12 @@ def _solved(
         if on_failure == "raise" and causes:
             raise failure(rows, causes, None)
         tested = verdicts(bare, settings, rows, np.asarray(controls) if with_stability else None)
+        alone = tested.shape == (1,) and tested[0] == Verdict.UNSTABLE and not is_tested(bare)
+        if alone and initial is None and recovery_budget != 0.0 and rows.result[0] != Result.OTHER_TURNS:
+            row = StepRows(*(leaf[0] for leaf in rows))
+            if (fallen := stable_near(bare, settings, row, controls[0])) is not None:
+                rows = StepRows(*(np.asarray(leaf)[None] for leaf in fallen))
+                tested[0] = int(Verdict.STABLE)
         rows.result[(tested > 0) & (rows.result != Result.OTHER_TURNS)] = Result.UNSTABLE
         said = (
             functools.partial(warn_of_coarse_grids, system, settings, rows),

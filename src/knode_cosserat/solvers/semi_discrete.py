@@ -18,9 +18,10 @@ import jax.numpy as jnp
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Ends
+from knode_cosserat.rods.law import InternalState, JointLaw, MaterialLaw, StressedLaw
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.wrapped import corrections_of
+from knode_cosserat.rods.wrapped import corrections_of, nominal_model
 from knode_cosserat.solvers.discrete_law import DiscreteLaw, discrete_law
 
 
@@ -117,6 +118,26 @@ def law(system: System, point: Point) -> DiscreteLaw:
     s, t, y, control, history = point
     stated = system.constitutive(s, t, y, point.y_t, control)
     return discrete_law(stated, system.z_layout, history.c0, history.z, system.length)
+
+
+def has_friction(system: System) -> bool:
+    """True if internal variables of the law have bounds, such as friction: no linearisation at rest."""
+    found, size = list[bool](), system.y_layout.size // strand_count(system)
+
+    def is_bounded(law: Any) -> bool:
+        if isinstance(law, StressedLaw):
+            return is_bounded(law.law)
+        if isinstance(law, JointLaw):
+            return any(is_bounded(own) for own, *_ in law.laws)
+        return isinstance(law, InternalState) or (isinstance(law, MaterialLaw) and law.internal is not None)
+
+    def look(system: System, y: Any, control: Any) -> None:
+        s, strand = jnp.zeros(()), strand_of(nominal_model(system))
+        found.append(is_bounded(strand.constitutive(s, s, y, jnp.zeros_like(y), control)))
+
+    # traced only: the kind of law does not depend on numbers
+    jax.eval_shape(look, system, jnp.ones(size), jnp.zeros(system.control_layout.size))
+    return found[0]
 
 
 def strains(system: System, point: Point) -> Float[Any, " z"]:

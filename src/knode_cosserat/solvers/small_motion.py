@@ -8,26 +8,20 @@ step therefore give λ without an error in time. Inertia, damping, relaxation, e
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from typing import Any
-
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.law import InternalState, JointLaw, MaterialLaw
-from knode_cosserat.rods.strands import in_strands, of_rods, strand_of
+from knode_cosserat._blas import one_thread
+from knode_cosserat.engine.linear_step import LinearStep
+from knode_cosserat.engine.loops import has_friction, linear_step
+from knode_cosserat.rods.strands import of_rods, strand_of
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
-from knode_cosserat.solvers.history import StepCoefficients, StepRows, used_places
+from knode_cosserat.solvers.history import StepRows, repeated_record_history, used_places
 from knode_cosserat.solvers.refinement import is_too_coarse
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.settings import Settings
 
 #: vectors side by side; most vectors for each factor that is wanted
 BLOCK, MOST = 16, 16
@@ -52,6 +46,9 @@ SAME = 0.02
 #: time (s) at which an equilibrium must still be one, and largest residual then, in natural units; no common
 #: rate of a frame makes whole turns in it
 LATER, BALANCED = 0.618, 1e-6
+#: motion from an unstable equilibrium: its first change in natural units, its time step as a multiple of the
+#: time in which it grows by e, and its number of steps
+FIRST, GROWN, MOTION = 0.02, 0.5, 300
 
 
 def verdicts(system: System, settings: Settings, rows: StepRows, controls: np.ndarray | None) -> np.ndarray:
@@ -85,14 +82,14 @@ def verdict_by_motion(system: System, settings: Settings, row: StepRows, control
     strand, y = strand_of(system), row.records[:, : system.y_layout.size]
     if not (strand.y_layout.ranges("p") and strand.y_layout.ranges("q")):
         return Verdict.UNTESTED_SYSTEM
-    if has_friction(system, y[0], control):
+    if has_friction(system, settings.space):
         return Verdict.UNTESTED_FRICTION
     if used_places(system, settings.space) * history_size(system) > TOO_MANY:
         return Verdict.UNTESTED_SIZE
-    later, scales = still_state(system, settings.space, control, y, LATER), system.scales()
-    if not max(float(later.error), float(np.max(np.abs(later.tip / scales.tip)))) <= BALANCED:
+    step = linear_step(system, settings.space, control, y)
+    if not step.error_at(LATER) <= BALANCED:
         return Verdict.UNTESTED_TURNING
-    rate = fastest_growth(system, settings, row, control)
+    rate = fastest_growth(system, step)
     if rate is None:
         return Verdict.UNTESTED_GRID
     if rate == 0j:
@@ -103,21 +100,20 @@ def verdict_by_motion(system: System, settings: Settings, row: StepRows, control
     guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), own) for own in y.T], axis=1)
     still = still_state(finer, settings.space, control, guess)
     _, _, rows = TimeIntegration(settings).solve(finer, control[None], still.y)
-    off = np.max(np.abs(of_rods(system, rows.records[0, ::2, : y.shape[1]] - y, "p")))
+    solved = rows.records[0, :, : y.shape[1]]
+    off = np.max(np.abs(of_rods(system, solved[::2] - y, "p")))
     if not (rows.error[0] <= settings.newton.acceptable and off < SAME * float(system.length)):
         return Verdict.UNTESTED_GRID
-    fine = fastest_growth(finer, settings, StepRows(*(leaf[0] for leaf in rows)), control)
+    fine = fastest_growth(finer, linear_step(finer, settings.space, control, solved))
     if fine is None or not fine.real > abs(fine.real - rate.real):
         return Verdict.UNTESTED_GRID
     return Verdict.UNSTABLE if abs(fine.imag) <= fine.real else Verdict.FLUTTER
 
 
-def fastest_growth(system: System, settings: Settings, row: StepRows, control: np.ndarray) -> complex | None:
+def fastest_growth(system: System, step: LinearStep) -> complex | None:
     """Return λ, in natural units, of the motion that grows most; 0 if none grows, None if not resolved."""
-    time = natural_time(system)
-    rows = StepRows(*(np.asarray(leaf)[None] for leaf in row))
-    step, unit = linearised_step(system, settings.space, rows, control, RATE / time)
-    factors = _eigenvalues(step, unit, history_size(system))
+    step.linearise(RATE / natural_time(system, step))
+    factors = _eigenvalues(step, history_size(system))
     rates = RATE * (1.0 - 1.0 / factors[np.abs(factors) > STILL])
     sizes = np.maximum(np.abs(rates), 1.0)
     growing = (rates.real > GROWTH * sizes) & (np.abs(rates) > NEUTRAL)
@@ -132,39 +128,63 @@ def fastest_growth(system: System, settings: Settings, row: StepRows, control: n
     return None if np.any(growing & near & (rates.real > np.abs(rates.imag))) else 0j
 
 
-def _eigenvalues(step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray, size: int) -> np.ndarray:
+def stable_near(system: System, settings: Settings, row: StepRows, control: np.ndarray) -> StepRows | None:
+    """Return a stable equilibrium that an unstable one moves to; None if none is found.
+
+    The motion begins along the mode that grows fastest. Long steps of implicit Euler damp it, until it rests.
+    """
+    space, ny = settings.space, system.y_layout.size
+    step = linear_step(system, space, control, row.records[:, :ny])
+    rate = fastest_growth(system, step)
+    if not rate or abs(rate.imag) > rate.real:
+        return None
+    image, kept = _reduced(step, history_size(system))
+    with one_thread():
+        factors, vectors = np.linalg.eig(image)
+    mode = np.zeros(len(step.unit))
+    mode[kept] = np.real(vectors[:, np.argmin(np.abs(factors - RATE / (RATE - rate)))])
+    moved = step((step.unit * mode)[:, None]).reshape(-1, history_size(system))
+    moved = moved[: len(step.still.y), :ny]
+    y = step.still.y + FIRST * moved / np.max(np.abs(moved / step.scale_y))
+    dt = GROWN * natural_time(system, step) / rate.real
+    damped = Settings.of("bdf1", space, "paper", settings.newton)
+    past = repeated_record_history(system, damped, still_state(system, space, control, y).records, y, 0.0)
+    motion = TimeIntegration(damped, dt, MOTION)
+    done, past, _ = motion.solve(system, np.repeat(control[None], MOTION, axis=0), past)
+    if done < MOTION:
+        return None
+    _, _, rows = TimeIntegration(settings).solve(system, control[None], past.y[0])
+    found = StepRows(*(leaf[0] for leaf in rows))
+    if not found.error <= settings.newton.acceptable:
+        return None
+    if verdict_by_motion(system, settings, found, control) != Verdict.STABLE:
+        return None
+    coarse = found.result == Result.COARSE
+    return found if coarse else found._replace(result=int(Result.RECOVERED_RELAXATION))
+
+
+def _eigenvalues(step: LinearStep, size: int) -> np.ndarray:
     """Return the eigenvalues of a map of history with `size` terms at each place, but zeros."""
-    places = len(unit) // size
+    with one_thread():
+        return np.linalg.eigvals(_reduced(step, size)[0])
+
+
+def _reduced(step: LinearStep, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return a map of history, in its units, between terms that act, and the places of these terms."""
+    unit = step.unit
     # terms whose rates are in no equation; a random history shows them
-    random = np.random.default_rng(0).normal(size=(places, size, 1)) * np.eye(size)
-    seen = step(unit[:, None] * random.reshape(len(unit), size)) / unit[:, None]
-    kept = np.flatnonzero(np.tile(np.any(seen != 0.0, axis=0), places))
-    image = step((unit[:, None] * np.eye(len(unit)))[:, kept]) / unit[:, None]
-    return np.linalg.eigvals(image[kept])
+    random = np.random.default_rng(0).normal(size=(len(unit) // size, size, 1)) * np.eye(size)
+    seen = step(unit[:, None] * random.reshape(len(unit), size)) != 0.0
+    kept = np.flatnonzero(np.tile(np.any(seen, axis=0), len(unit) // size) & np.any(seen, axis=1))
+    image = step((unit[:, None] * np.eye(len(unit)))[:, kept])[kept] / unit[kept, None]
+    acts = np.any(image != 0.0, axis=0)
+    return image[np.ix_(acts, acts)], kept[acts]
 
 
-def natural_time(system: System) -> float:
+def natural_time(system: System, step: LinearStep) -> float:
     """Return the natural time (s) of a robot's first strand: that of its position over its velocity."""
-    layout, scale = strand_of(system).y_layout, np.asarray(strand_of(system).scales().y)
-    return float(scale[layout.ranges("p")[0][0]] / scale[layout.ranges("q")[0][0]])
-
-
-def has_friction(system: System, base: np.ndarray, control: np.ndarray) -> bool:
-    """True if internal variables of the law have bounds, such as friction: no linearisation at rest."""
-    strand, found = strand_of(nominal_model(system)), list[bool]()
-
-    def look(y: Any, control: Any) -> None:
-        s = jnp.zeros(())
-        law = strand.constitutive(s, s, y, jnp.zeros_like(y), control)
-        laws: Iterable[Any] = [own for own, *_ in law.laws] if isinstance(law, JointLaw) else [law]
-        found.extend(
-            isinstance(own, InternalState) or (isinstance(own, MaterialLaw) and own.internal is not None)
-            for own in laws
-        )
-
-    # traced only: the kind of law does not depend on numbers
-    jax.eval_shape(look, in_strands(system, np.asarray(base))[0], np.asarray(control))
-    return any(found)
+    layout = strand_of(system).y_layout
+    return float(step.scale_y[layout.ranges("p")[0][0]] / step.scale_y[layout.ranges("q")[0][0]])
 
 
 def history_size(system: System) -> int:
@@ -172,45 +192,16 @@ def history_size(system: System) -> int:
     return system.y_layout.size * (2 if system.mixed else 1) + system.z_layout.size
 
 
-def linearised_step(
-    system: System, space: SpaceScheme, rows: StepRows, control: np.ndarray, c0: float
-) -> tuple[Callable[[np.ndarray], np.ndarray], np.ndarray]:
-    """Return the map of history by a linearised step from an equilibrium, a row of `rows`, and its units.
-
-    The step is of implicit Euler with y_t = c0 (y - y_before). The map takes vectors side by side (count, m).
-    """
-    ny = system.y_layout.size
-    used, step = used_places(system, space), Settings.of("bdf1", space, "paper", NewtonOptions())
-    records = still_state(system, space, control, rows.records[0, :, :ny]).records[:used]
-    steps = StepCoefficients.of(step, 1.0 / c0, step.memory)
-    before = np.stack([records] * step.memory)
-    unit = np.tile(np.concatenate([system.scales().y, np.ones(records.shape[1] - ny)]), used)
-
-    def stepped(vectors: np.ndarray) -> np.ndarray:
-        m = vectors.shape[1]
-        d_past = np.zeros((step.memory, *records.shape, m))
-        d_past[0] = vectors.reshape(*records.shape, m)
-        state = TangentState(before, np.zeros_like(records), d_past, np.zeros_like(d_past[0]), 0.0)
-        changes = Changes(np.zeros((1, system.control_layout.size, m)))
-        solved = rows.records, rows.unknowns
-        moved, _ = tangent_time_loop(steps, solved, (system, control[None]), changes, state)
-        return np.asarray(moved.d_records[0].reshape(len(vectors), m))
-
-    return stepped, unit
-
-
-def largest_eigenvalues(
-    step: Callable[[np.ndarray], np.ndarray], unit: np.ndarray, wanted: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the largest eigenvalues of a linear map of vectors, and their vectors (count, m).
+def largest_eigenvalues(step: LinearStep, wanted: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the largest eigenvalues of a map of history, and their vectors (count, m).
 
     By a block Krylov method, which finds multiple eigenvalues as well (Saad 2011, section 6.5).
 
     Args:
-        step: map of vectors side by side (count, BLOCK).
-        unit: unit of each number (count,).
+        step: the map, linearised.
         wanted: number of eigenvalues, or more than there are.
     """
+    unit = step.unit
     fresh = np.linalg.qr(np.random.default_rng(0).normal(size=(len(unit), BLOCK)))[0]
     basis = images = np.zeros((len(unit), 0))
     while True:

@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from knode_cosserat.engine.linear_step import LinearStep
+from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.strands import of_rods, strand_count, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import repeated_record_history, used_places
-from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.small_motion import (
     NEUTRAL,
     RATE,
     SAME,
-    has_friction,
     history_size,
     largest_eigenvalues,
-    linearised_step,
     natural_time,
 )
 from knode_cosserat.solvers.space import Lobatto4
@@ -79,19 +77,18 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
         raise ValueError(f"its motions have more than {MOST_TERMS} history terms")
     if not strand_of(system).y_layout.ranges("q"):
         raise ValueError(f"a {type(system).__name__} has no velocity q in y")
-    if has_friction(system, y[0], control):
-        raise ValueError("its friction has no linearisation at rest")
-    time = natural_time(system)
-    found, c0 = [], RATE / time
+    found = []
     for nodes in grids:
         own = system.replace(nodes=nodes)
         at = np.linspace(0.0, 1.0, nodes)
         guess = np.stack([np.interp(at, np.linspace(0.0, 1.0, system.nodes), each) for each in y.T], axis=1)
-        solved, error, step, unit = _step(own, guess, control, c0)
+        if has_friction(own, Lobatto4()):
+            raise ValueError("its friction has no linearisation at rest")
+        solved, error, step = _step(own, guess, control)
         off = np.max(np.abs(of_rods(system, solved - guess, "p")))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
-        factors, vectors = largest_eigenvalues(step, unit, WANTED * strand_count(system))
+        factors, vectors = largest_eigenvalues(step, WANTED * strand_count(system))
         found.append(RATE * (1.0 - 1.0 / factors))
     coarse, fine = found
     nearest = np.abs(fine[:, None] - coarse).argmin(axis=1)
@@ -112,27 +109,29 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     # of motions that neither grow nor decay, the slowest first
     growth = np.where(np.abs(fine.real) <= uncertainty, 0.0, fine.real)
     order = np.lexsort((np.abs(fine), -growth))
+    time = natural_time(own, step)
     found = [each[order] / time for each in (fine, uncertainty, rounding, other)]
     records = vectors.T[order].reshape(len(order), -1, history_size(own))
     motions = records[:, grid_of(own, Lobatto4()).nodes, : own.y_layout.size]
     return _Modes(found[0], found[1], found[2], found[3], motions)
 
 
-def _step(
-    system: System, guess: np.ndarray, control: np.ndarray, c0: float
-) -> tuple[np.ndarray, float, Callable[[np.ndarray], np.ndarray], np.ndarray]:
-    """Return the equilibrium at the nodes, its error, a linearised step of its history, and its units."""
+def _step(system: System, guess: np.ndarray, control: np.ndarray) -> tuple[np.ndarray, float, LinearStep]:
+    """Return the equilibrium at the nodes, its error, and a linearised step from it."""
     space, ny = Lobatto4(), system.y_layout.size
     still, settings = (Settings.of(time, space, "paper", NewtonOptions()) for time in (None, "bdf1"))
-    begun = still_state(system, space, control, guess)
+    begun = linear_step(system, space, control, guess)
+    c0 = RATE / natural_time(system, begun)
     if Ends.of(system).held:
-        found = TimeIntegration(still).solve(system, control[None], begun.y)[2]
+        found = TimeIntegration(still).solve(system, control[None], begun.still.y)[2]
     else:
         # a robot that can move as a whole has no single equilibrium, but a step from rest
-        past = repeated_record_history(system, settings, begun.records, begun.y, 0.0)
+        past = repeated_record_history(system, settings, begun.still.records, begun.still.y, 0.0)
         found = TimeIntegration(settings, 1.0 / c0).solve(system, control[None], past)[2]
-    step, unit = linearised_step(system, space, found, control, c0)
-    return found.records[0, :, :ny], float(found.error[0]), step, unit
+    solved = found.records[0, :, :ny]
+    step = linear_step(system, space, control, solved)
+    step.linearise(c0)
+    return solved, float(found.error[0]), step
 
 
 def displacements(system: System, motion: np.ndarray) -> np.ndarray:
