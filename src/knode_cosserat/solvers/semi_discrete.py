@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Ends
@@ -131,12 +132,12 @@ def has_friction(system: System) -> bool:
             return any(is_bounded(own) for own, *_ in law.laws)
         return isinstance(law, InternalState) or (isinstance(law, MaterialLaw) and law.internal is not None)
 
-    def look(system: System, y: Any, control: Any) -> None:
-        s, strand = jnp.zeros(()), strand_of(nominal_model(system))
+    def look(system: System, s: Any, y: Any, control: Any) -> None:
+        strand = strand_of(nominal_model(system))
         found.append(is_bounded(strand.constitutive(s, s, y, jnp.zeros_like(y), control)))
 
     # traced only: the kind of law does not depend on numbers
-    jax.eval_shape(look, system, jnp.ones(size), jnp.zeros(system.control_layout.size))
+    jax.eval_shape(look, system, np.zeros(()), np.ones(size), np.zeros(system.control_layout.size))
     return found[0]
 
 
