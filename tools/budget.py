@@ -91,14 +91,14 @@ def system_members() -> int:
 def budgets() -> list[Budget]:
     """Return all figures."""
     return [
-        Budget("lines of the library", lines_of(LIBRARY), 37_000, 58_900),
+        Budget("lines of the library", lines_of(LIBRARY), 37_000, 59_700),
         Budget("lines of hardware", lines_of(ROOT / "hardware"), 7_500, 9_300),
         Budget("lines of studies", lines_of(ROOT / "studies"), 6_000, 8_770),
-        Budget("lines of tests", lines_of(ROOT / "tests"), 25_000, 44_950),
-        Budget("public classes of the library", public_classes(LIBRARY), 300, 433),
+        Budget("lines of tests", lines_of(ROOT / "tests"), 25_000, 45_250),
+        Budget("public classes of the library", public_classes(LIBRARY), 300, 438),
         Budget("names in namespaces", namespace_names(), 150, 196),
-        Budget("members of System", system_members(), 14, 14),
-        Budget("functions with more than 5 parameters", long_signatures(LIBRARY), 60, 60),
+        Budget("members of System", system_members(), 14, 16),
+        Budget("functions with more than 5 parameters", long_signatures(LIBRARY), 60, 61),
     ]
 
 

@@ -57,7 +57,9 @@ def test_parts_that_turn_get_nodes_and_stated_nodes_stay(turns, nodes):
     for robot, angle in zip(robots, (*[2.0 * np.pi * abs(turns)] * 3, 40.0), strict=True):
         assert isinstance(robot.nodes, ChosenNodes)
         assert robot.winding == pytest.approx(angle, rel=1e-4)
-        assert robot.nodes == 10 or robot.turn_of_segments <= np.pi / 3.0 < robot.winding / (robot.nodes - 2)
+        assert robot.nodes == 10 or robot.winding / (robot.nodes - 1) <= np.pi / 3.0 < robot.winding / (
+            robot.nodes - 2
+        )
         stated = robot.replace(nodes=nodes)
         assert stated.nodes == nodes and not isinstance(stated.replace(gravity=np.ones(3)).nodes, ChosenNodes)
     # other parts need more; no change of the robot takes nodes away

@@ -139,11 +139,6 @@ class System(Parametrised):
         """Number of nodes that the parts need."""
         return max(USUAL_NODES, 1 + math.ceil(self.winding / CHOSEN_TURN))
 
-    @property
-    def turn_of_segments(self) -> float:
-        """Angle (rad) through which parts turn in one segment; estimates see it up to `SEEN_TURN`."""
-        return self.winding / (self.nodes - 1)
-
     def replace(self, **changes: Any) -> Self:
         """Return a copy with other parameters, by name; derived quantities follow.
 

@@ -165,7 +165,7 @@ def as_seen(system: System, result: Any, position_error: Any) -> tuple[Any, Any]
 
     The system's own numbers must be known, not traced.
     """
-    if system.turn_of_segments <= SEEN_TURN:
+    if system.winding / (system.nodes - 1) <= SEEN_TURN:
         return result, position_error
     numeric: Any = jnp if is_traced((result, position_error)) else np
     result = numeric.where(result == int(Result.CONVERGED), int(Result.COARSE), result)

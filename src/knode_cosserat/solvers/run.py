@@ -254,7 +254,7 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
         causes.append(f"orientations are off by more than about {COARSE_ANGLE:g} rad")
     causes += [f"{lost} rows have no estimate of the error"] if lost else []
     turn = _turn_of_segments(system, np.asarray(rows.records)[coarse])
-    wound = system.turn_of_segments
+    wound = system.winding / (system.nodes - 1)
     causes += [f"parts turn by {wound:.2g} rad from node to node"] if wound > SEEN_TURN else []
     causes += [f"frames turn by up to {turn:.2g} rad from node to node"] if turn > LARGEST_TURN else []
     said = ", ".join(causes)
