@@ -142,4 +142,4 @@ def _part(value: Any) -> str:
 
 def _nodes() -> str:
     allowed = f"{NODES['minimum']} to {NODES['maximum']}"
-    return _row("nodes", str(NODES["description"]), "whole number", "", allowed, str(NODES["default"]))
+    return _row("nodes", str(NODES["description"]), "whole number", "", allowed, "chosen")

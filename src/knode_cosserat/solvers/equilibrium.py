@@ -128,6 +128,7 @@ def equilibria(
         ValueError: arguments of a wrong shape or name.
     """
     check_arguments(equilibria, locals())
+    stacked(robot)
     solve = functools.partial(
         _solved, controls=controls, settings=Settings.of(None, space, "paper", newton), initial=initial,
         recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,

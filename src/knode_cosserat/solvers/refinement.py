@@ -105,7 +105,7 @@ def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: f
     The first is `unknown` where no number is known, of orientations and verdicts. The second is infinite
     where there is no estimate.
     """
-    if is_traced(solved[1:3]) or np.any(np.asarray(solved.result) < 0):
+    if is_traced((solved[1:3], robot)) or np.any(np.asarray(solved.result) < 0):
         return 0.0, 0.0
     lengths = [float(one.length) for one in ([robot] if isinstance(robot, System) else robot)]
     errors = np.asarray(solved.position_error)

@@ -127,12 +127,12 @@ def simulate(
         raise ValueError("position_tolerance needs estimates of errors: leave out errors=False")
     check_tolerance(robot, initial, position_tolerance)
     robot = robot if initial is None else on_grid_of(robot, initial)
-    warn_if_undamped(robot, dt)
-    warn_of_long_steps(robot, dt)
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
     if initial is not None:
         check_initial(system, initial, batch)
+    warn_if_undamped(robot, dt)
+    warn_of_long_steps(robot, dt)
 
     def solve(robot: Any) -> Solved[Trajectory]:
         system = stacked(robot)[0]
