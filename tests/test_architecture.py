@@ -17,6 +17,7 @@ LAYERS = (
     (
         "errors",
         "_arguments",
+        "_blas",
         "_files",
         "_jax",
         "_lazy",

@@ -8,11 +8,9 @@ step therefore give λ without an error in time. Inertia, damping, relaxation, e
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
-from threadpoolctl import ThreadpoolController
 
+from knode_cosserat._blas import one_thread
 from knode_cosserat.engine.linear_step import LinearStep
 from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.strands import of_rods, strand_of
@@ -141,7 +139,7 @@ def stable_near(system: System, settings: Settings, row: StepRows, control: np.n
     if not rate or abs(rate.imag) > rate.real:
         return None
     image, kept = _reduced(step, history_size(system))
-    with _libraries().limit(limits=1, user_api="blas"):
+    with one_thread():
         factors, vectors = np.linalg.eig(image)
     mode = np.zeros(len(step.unit))
     mode[kept] = np.real(vectors[:, np.argmin(np.abs(factors - RATE / (RATE - rate)))])
@@ -165,15 +163,9 @@ def stable_near(system: System, settings: Settings, row: StepRows, control: np.n
     return found if coarse else found._replace(result=int(Result.RECOVERED_RELAXATION))
 
 
-@functools.cache
-def _libraries() -> ThreadpoolController:
-    """Return the libraries of linear algebra. Threads wait longer than they work on some hundred rows."""
-    return ThreadpoolController()
-
-
 def _eigenvalues(step: LinearStep, size: int) -> np.ndarray:
     """Return the eigenvalues of a map of history with `size` terms at each place, but zeros."""
-    with _libraries().limit(limits=1, user_api="blas"):
+    with one_thread():
         return np.linalg.eigvals(_reduced(step, size)[0])
 
 
