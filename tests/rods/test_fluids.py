@@ -227,7 +227,8 @@ def test_a_stream_along_a_rounded_rod_buckles_it():
 
     def least(part):
         fluid = Fluid(drag=0.0, friction=0.0, stream=[0.0, 0.0, part * critical])
-        return kc.statics.stability(kc.equilibrium(wet(6, fluid), np.zeros(0), space="lobatto4")).least
+        rest = kc.equilibrium(wet(6, fluid), np.zeros(0), space="lobatto4", with_stability=False)
+        return kc.statics.stability(rest).least
 
     assert brentq(least, 0.99, 1.01, xtol=1e-5) == pytest.approx(1.0, abs=1e-4)
 

@@ -34,7 +34,7 @@ def uniform(B, nodes=11, magnetisation=UNIT):
 
 
 def rest(robot, space="lobatto4"):
-    return kc.equilibrium(robot, np.zeros(0), space=space)
+    return kc.equilibrium(robot, np.zeros(0), space=space, with_stability=False)
 
 
 # uniform fields

@@ -107,7 +107,8 @@ def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: f
     """
     if is_traced((solved[1:3], robot)) or np.any(np.asarray(solved.result) < 0):
         return 0.0, 0.0
-    lengths = [float(one.length) for one in ([robot] if isinstance(robot, System) else robot)]
+    robots = [robot] if isinstance(robot, System) else robot
+    lengths = np.concatenate([np.ravel(one.length) for one in robots])
     errors = np.asarray(solved.position_error)
     errors = np.nan_to_num(errors, nan=np.inf) / np.reshape(lengths, (-1, *[1] * (errors.ndim - 1)))
     if tolerance is not None:
