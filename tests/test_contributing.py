@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification import effects
+from knode_cosserat.identification import effects, reel_effects, rod_effects, tendon_effects
 from knode_cosserat.identification.effects import Effect, along_axes, register
 
 ROOT = Path(__file__).parents[1]
@@ -19,6 +19,10 @@ EXAMPLES = re.findall(
 
 def tilted(robot, values):
     return robot.replace(gravity=jnp.asarray(robot.gravity) + jnp.stack([*values, 0.0 * values[0]]))
+
+
+#: they register themselves when they are imported, and that is to last
+REGISTERED = reel_effects, rod_effects, tendon_effects
 
 
 @pytest.fixture
