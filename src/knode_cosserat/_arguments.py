@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 import collections.abc
 import functools
 import importlib
@@ -108,12 +109,11 @@ class _Names(dict[str, Any]):
 
     def __missing__(self, name: str) -> Any:
         package = importlib.import_module(__name__.partition(".")[0])
-        for space in (
-            package,
-            *(getattr(package, it) for it in ("recordings", "statics", "control", "robots")),
-        ):
-            if name in space.__all__:
-                return getattr(space, name)
+        # one after the other, because a namespace takes a while to import
+        for space in () if hasattr(builtins, name) else ("", "robots", "recordings", "control", "statics"):
+            names = getattr(package, space) if space else package
+            if name in names.__all__:
+                return getattr(names, name)
         raise KeyError(name)
 
 
