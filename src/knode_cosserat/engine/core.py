@@ -45,6 +45,10 @@ SURELY_SMALL = 1e-2
 ACCEPTABLE = [field.name for field in dataclasses.fields(NewtonOptions)].index("acceptable")
 
 
+#: size of a state, and the arrays of each of its parts
+_Packed = tuple[int, list[list[Array]]]
+
+
 class Core(EliminationCode):
     """Machine code of a system's time loop, and of its equilibria in turn, whose rates are zero (c0 = 0).
 
@@ -94,6 +98,16 @@ class Core(EliminationCode):
         guesses = stage_extrapolations(settings) if settings.stages > 1 else EXTRAPOLATIONS[None]
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
+
+    @functools.cached_property
+    def states(self) -> tuple[_Packed, _Packed]:
+        """Size of the state of a motion and of an equilibrium, and its arrays one after the other."""
+        return self._states_of(self.motion), self._states_of(self.shape)
+
+    def _states_of(self, parts: list[list[Array]]) -> _Packed:
+        arrays = self._packed([*itertools.chain(*parts)])
+        rest = iter(arrays)
+        return sum(map(self._size_of, arrays)), [[next(rest) for _ in part] for part in parts]
 
     def _write_weights(self) -> None:
         """Weights of sizes relative to the state."""

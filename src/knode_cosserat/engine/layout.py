@@ -92,6 +92,8 @@ class GridLayout(Layout):
         self.counts |= {"nodes": len(grid.nodes), "filled": len(self.filled), "most": most}
         near = [base + int(point) for base in bases for point in grid.near]
         self.counts |= {f"near {k}": point for k, point in enumerate(near)}
+        #: counts as they are in memory
+        self.whole = np.array(list(self.counts.values()))
         #: places, and lengths of pieces, as parts of a strand's length
         self.along = grid.along[[place for _, place in self.origins]]
         self.lengths = np.tile(np.append(grid.lengths, 0.0), strands)[:-1]

@@ -43,14 +43,17 @@ def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
 
 def _given(settings: Settings) -> dict[str, Any]:
     """Return the attributes of a core that are no data of its own."""
-    return {"settings": settings, "scheme": settings.time, "space": settings.space}
+    return {"settings": settings, "scheme": settings.time, "space": settings.space, "on_grids": {}}
 
 
 def _on_grid(core: AnyCode, pattern: Pattern) -> AnyCode:
-    """Return code with the layout of a grid."""
-    found = copy.copy(core)
-    found.layout = layout_of(pattern.system, core.space)
-    return found
+    """Return code with the layout of a grid; one object for each, which keeps what follows from it."""
+    layout, grids = layout_of(pattern.system, core.space), core.on_grids
+    if layout not in grids:
+        found = grids[layout] = copy.copy(core)
+        # no cycle: machine code is freed with the last code that has it
+        found.layout, found.on_grids = layout, {}
+    return grids[layout]
 
 
 def tangents_for(

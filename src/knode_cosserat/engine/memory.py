@@ -45,11 +45,12 @@ class Array:
 class Memory:
     """Arrays of a run, and the function that is being written."""
 
-    #: counts of the grid that runs
+    #: counts of the grid that runs, and this code with those of other grids
     layout: GridLayout
+    on_grids: dict[GridLayout, Any]
 
     def __init__(self, robots: bool, room: Layout):
-        self.batch, self.L, self.room = robots, vector_lanes(), room
+        self.batch, self.L, self.room, self.on_grids = robots, vector_lanes(), room, {}
         #: lanes of a plain value
         self.P = self.L if robots else 1
         #: distance between components of a single robot's arrays

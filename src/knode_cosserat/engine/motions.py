@@ -40,11 +40,8 @@ class Motions:
     def __init__(self, core: Core, parameters: np.ndarray, states: Any, steps: StepCoefficients):
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
         self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
-        parts = core.shape if self._kind is Shape else core.motion
-        arrays = core._packed([array for part in parts for array in part])
         #: size of a state, and the arrays of its parts in it
-        self._packed_size, rest = sum(map(core._size_of, arrays)), iter(arrays)
-        self._arrays = [[next(rest) for _ in part] for part in parts]
+        self._packed_size, self._arrays = core.states[self._kind is Shape]
         self._shapes = [np.shape(values)[1:] for values in states]
         self._memory = core._empty_memory()
         options = dataclasses.astuple(steps.settings.newton)

@@ -95,7 +95,7 @@ class RodCode(Memory):
             if array.size:
                 self._put_in(found[None], array, values[None, None])
         whole = found.view(np.int64)
-        whole[: len(layout.counts)] = list(layout.counts.values())
+        whole[: len(layout.whole)] = layout.whole
         whole[self.node_table.offset :][: len(layout.nodes)] = layout.nodes
         whole[self.filled.offset :][: layout.filled.size] = layout.filled.ravel()
         found[self.filled_parts.offset :][: len(layout.filled_parts)] = layout.filled_parts

@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
@@ -156,6 +157,12 @@ def grid_of(system: System, space: SpaceScheme = LOBATTO2) -> Grid:
     return _grid(
         tuple(system.discontinuities.places), system.nodes, tuple(stage.place for stage in space.check.stages)
     )
+
+
+@kept
+def turn_of_segments(system: System) -> float:
+    """Return the angle (rad) through which parts turn in a segment; estimates see it up to `SEEN_TURN`."""
+    return system.winding / (system.nodes - 1)
 
 
 def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]) -> Float[Any, "places x"]:

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import SEEN_TURN, ChosenNodes, System, is_traced
+from knode_cosserat.solvers.grid import turn_of_segments
 from knode_cosserat.solvers.history import COARSE_SHARE, StepRows
 from knode_cosserat.solvers.result import Result, SimulationError, Verdict
 from knode_cosserat.solvers.space import Euler, SpaceScheme
@@ -77,10 +78,12 @@ def refined(
                 raise
             robot = on_grid(robot, ChosenNodes(2 * segments + 1))
             continue
+        if not may:
+            break
         excess, error = _excess(solved, robot, tolerance, 2.0**space.order)
         # errors that do not fall are not those of the grid
         falls = tolerance is not None or before is None or error < before
-        if excess <= 1.0 or not may or segments >= MOST_SEGMENTS or not falls:
+        if excess <= 1.0 or segments >= MOST_SEGMENTS or not falls:
             break
         before = error
         factor = np.clip(1.1 * excess ** (1.0 / space.order), 1.2, LARGEST_FACTOR)
@@ -107,6 +110,9 @@ def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: f
     """
     if is_traced((solved[1:3], robot)) or np.any(np.asarray(solved.result) < 0):
         return 0.0, 0.0
+    coarse = np.asarray(solved.result) == Result.COARSE
+    if tolerance is None and not np.any(coarse) and not solved.undecided:
+        return 0.0, 0.0
     robots = [robot] if isinstance(robot, System) else robot
     lengths = np.concatenate([np.ravel(one.length) for one in robots])
     errors = np.asarray(solved.position_error)
@@ -114,9 +120,7 @@ def _excess(solved: Solved[Any], robot: Any, tolerance: float | None, unknown: f
     if tolerance is not None:
         allowed, counts = tolerance / lengths[0], np.ones(errors.shape, dtype=bool)
     else:
-        allowed, counts = COARSE_SHARE, np.asarray(solved.result) == Result.COARSE
-        if not np.any(counts) and not solved.undecided:
-            return 0.0, 0.0
+        allowed, counts = COARSE_SHARE, coarse
     error = float(np.max(errors, initial=0.0, where=counts | solved.undecided))
     excess = error / allowed
     known = excess < np.inf and (tolerance is not None or excess > 1.0)
@@ -166,7 +170,7 @@ def as_seen(system: System, result: Any, position_error: Any) -> tuple[Any, Any]
 
     The system's own numbers must be known, not traced.
     """
-    if system.winding / (system.nodes - 1) <= SEEN_TURN:
+    if turn_of_segments(system) <= SEEN_TURN:
         return result, position_error
     numeric: Any = jnp if is_traced((result, position_error)) else np
     result = numeric.where(result == int(Result.CONVERGED), int(Result.COARSE), result)

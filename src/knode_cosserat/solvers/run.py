@@ -26,7 +26,7 @@ from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import SEEN_TURN, System, is_traced
-from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.solvers.grid import grid_of, turn_of_segments
 from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, materials, turns_between, turns_within
 from knode_cosserat.solvers.history import (
     COARSE_ANGLE,
@@ -254,7 +254,7 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
         causes.append(f"orientations are off by more than about {COARSE_ANGLE:g} rad")
     causes += [f"{lost} rows have no estimate of the error"] if lost else []
     turn = _turn_of_segments(system, np.asarray(rows.records)[coarse])
-    wound = system.winding / (system.nodes - 1)
+    wound = turn_of_segments(system)
     causes += [f"parts turn by {wound:.2g} rad from node to node"] if wound > SEEN_TURN else []
     causes += [f"frames turn by up to {turn:.2g} rad from node to node"] if turn > LARGEST_TURN else []
     said = ", ".join(causes)
