@@ -793,13 +793,13 @@ class Core(EliminationCode):
         Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at
         the nodes.
         """
-        memory, layout = self._empty_memory() if memory is None else memory, self.layout
+        memory, counts = self._empty_memory() if memory is None else memory, self.counts
         self._put_in(memory[None], self.params, parameters[None, None, None])
 
         def evaluate(c0: float, t: float, control: Any, history: Any, y: Any) -> Evaluated:
             most = 0
-            if len(y) < layout["points of strand"]:
-                y, most = layout.grid.spread(y), layout["most"]
+            if len(y) < counts["points of strand"]:
+                y, most = counts.grid.spread(y), counts["most"]
             for array, values in ((self.H, history), (self.y, y)):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
@@ -807,10 +807,10 @@ class Core(EliminationCode):
             self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), most)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
-            pieces = slice(layout["pieces"])
+            pieces = slice(counts["pieces"])
             error = np.max(np.abs(defects[pieces]) * inverse[pieces])
-            y = self._joined(self.y, y, layout["points of strand"])
-            records = self._joined(self.records[0], records, layout.grid.count)
+            y = self._joined(self.y, y, counts["points of strand"])
+            records = self._joined(self.records[0], records, counts.grid.count)
             return Evaluated(y.copy(), records.copy(), error, tip[0].copy())
 
         return evaluate

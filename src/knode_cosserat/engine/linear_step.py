@@ -24,19 +24,19 @@ class LinearStep:
         self._core, self._control = core, np.array(control, dtype=float)
         self._memory, width = core._empty_memory(), core._width(core.move)
         self._evaluate = core.evaluator(parameters, self._memory)
-        layout = core.layout
-        self._none = np.zeros((layout.grid.count, width))
+        counts = core.counts
+        self._none = np.zeros((counts.grid.count, width))
         self.still = self._evaluate(0.0, 0.0, control, self._none, y)
         inverse, tip = (
             core._numbers(self._memory[None], each)[0, 0] for each in (core.scale_y, core.scale_tip)
         )
-        bases = [layout[f"base {q}"] for q in range(core.strands)]
+        bases = [counts[f"base {q}"] for q in range(core.strands)]
         self.scale_y, self.scale_tip = 1.0 / core.equations.joined(inverse[bases]), 1.0 / tip[0]
         #: where the numbers of a record are in the memory of a change
         [packed] = core._packed([core.move])
         self._size = core._size_of(packed)
         places = np.arange(self._size).reshape(packed.size, packed.component).T
-        used = layout.grid.ends + len(core.space.formula.stages) * layout.grid.tip
+        used = counts.grid.ends + len(core.space.formula.stages) * counts.grid.tip
         self._at = core._joined(core.move, places, used).reshape(-1)
 
     @property

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from knode_cosserat.engine.core import Core
-from knode_cosserat.engine.layout import layout_of
+from knode_cosserat.engine.counts import counts_of
 from knode_cosserat.engine.linear_step import LinearStep
 from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
@@ -47,13 +47,13 @@ def _given(settings: Settings) -> dict[str, Any]:
 
 
 def _on_grid(core: AnyCode, pattern: Pattern) -> AnyCode:
-    """Return code with the layout of a grid; one object for each, which keeps what follows from it."""
-    layout, grids = layout_of(pattern.system, core.space), core.on_grids
-    if layout not in grids:
-        found = grids[layout] = copy.copy(core)
+    """Return code with the counts of a grid; one object for each, which keeps what follows from it."""
+    counts, grids = counts_of(pattern.system, core.space), core.on_grids
+    if counts not in grids:
+        found = grids[counts] = copy.copy(core)
         # no cycle: machine code is freed with the last code that has it
-        found.layout, found.on_grids = layout, {}
-    return grids[layout]
+        found.counts, found.on_grids = counts, {}
+    return grids[counts]
 
 
 def tangents_for(

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from knode_cosserat.engine.codegen import Function, Index, Module, Stores, Value, vector_lanes
-from knode_cosserat.engine.layout import GridLayout, Layout
+from knode_cosserat.engine.counts import Counts, GridCounts
 
 
 @dataclasses.dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Array:
     memory: int = 0
     #: true if tangents are in lanes
     is_tangent: bool = False
-    #: name of the number of places that are used (`Layout`); empty if it is `count`
+    #: name of the number of places that are used (`Counts`); empty if it is `count`
     where: str = ""
 
     def at(self, i: int, j: int) -> int:
@@ -46,10 +46,10 @@ class Memory:
     """Arrays of a run, and the function that is being written."""
 
     #: counts of the grid that runs, and this code with those of other grids
-    layout: GridLayout
-    on_grids: dict[GridLayout, Any]
+    counts: GridCounts
+    on_grids: dict[GridCounts, Any]
 
-    def __init__(self, robots: bool, room: Layout):
+    def __init__(self, robots: bool, room: Counts):
         self.batch, self.L, self.room, self.on_grids = robots, vector_lanes(), room, {}
         #: lanes of a plain value
         self.P = self.L if robots else 1
@@ -58,9 +58,9 @@ class Memory:
         self.stride = (-(-(room["count"] + 1) // self.L) + 1 | 1) * self.L
         self.module = Module()
         #: counts in memory, as whole numbers
-        self._size, self._counts = (
-            -(-len(room.counts) // self.L) * self.L,
-            {name: k for k, name in enumerate(room.counts)},
+        self._size, self._count_places = (
+            -(-len(room.numbers) // self.L) * self.L,
+            {name: k for k, name in enumerate(room.numbers)},
         )
 
     def _room(self, count: int | str) -> tuple[int, str]:
@@ -110,7 +110,7 @@ class Memory:
 
     def _count(self, name: str) -> Value:
         """Return a count in the function that is being written."""
-        return self._now.constant(self._now.arguments[0], self._counts[name])
+        return self._now.constant(self._now.arguments[0], self._count_places[name])
 
     def _place(self, name: str) -> Index:
         """Return a place that has a name."""
@@ -162,7 +162,7 @@ class Memory:
         """Return arrays one after the other outside of the memory, of the places that are used."""
         found, at = list[Array](), 0
         for array in arrays:
-            count = self.layout[array.where] if array.where else array.count
+            count = self.counts[array.where] if array.where else array.count
             component = -(-count // self.L) * self.L if count and not self.batch else array.component
             own = dataclasses.replace(array, offset=at, count=count, component=component)
             found.append(own)

@@ -175,7 +175,7 @@ class Motions:
         """Return the shapes of a vector's results: rows, numbers of stages, steps done and length."""
         core, e = self.core, self.core.equations
         numbers = core.strands * e.numbers
-        shapes = (count, stages, core.layout["nodes"], numbers), (count, stages, 8 + e.k), (2,)
+        shapes = (count, stages, core.counts["nodes"], numbers), (count, stages, 8 + e.k), (2,)
         return tuple((*shape, core.P) for shape in shapes)
 
     def _run(self, first: int, acting: np.ndarray, table: np.ndarray, results: np.ndarray) -> None:

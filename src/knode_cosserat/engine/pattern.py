@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Module, vector_lanes
+from knode_cosserat.engine.counts import in_room
 from knode_cosserat.engine.equations import MOST_OPERATIONS, PLACE, RUN, STEP, constant_zeros, is_moving
-from knode_cosserat.engine.layout import in_room
 from knode_cosserat.engine.program import EngineError, Program
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced

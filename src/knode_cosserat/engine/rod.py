@@ -12,8 +12,8 @@ import numpy as np
 
 from knode_cosserat.engine.arrays import Stored
 from knode_cosserat.engine.codegen import Function, Index, Stores, Sums, Value, Variable
+from knode_cosserat.engine.counts import Counts
 from knode_cosserat.engine.equations import Equations
-from knode_cosserat.engine.layout import Layout
 from knode_cosserat.engine.memory import Array, Memory
 from knode_cosserat.solvers.space import Stage
 
@@ -38,7 +38,7 @@ class RodCode(Memory):
     rates_and_slopes: Function
 
     def __init__(self, equations: Equations, robots: bool):
-        system, room = equations.system, Layout.room_of(equations.system, equations.space)
+        system, room = equations.system, Counts.room_of(equations.system, equations.space)
         super().__init__(robots, room)
         self.equations, self.space, self.strands = equations, equations.space, equations.strands
         e = self.equations
@@ -87,18 +87,18 @@ class RodCode(Memory):
         return [self._place(f"tip {q}") for q in range(self.strands)]
 
     def _empty_memory(self) -> np.ndarray:
-        """Return the memory before a run: zeros, but for the layout of the grid; aligned to 64 bytes."""
-        raw, layout = np.zeros(self._size + 8), self.layout
+        """Return the memory before a run: zeros but for those of the grid; aligned to 64 bytes."""
+        raw, counts = np.zeros(self._size + 8), self.counts
         found = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
-        numbers = (self.s_parts, layout.along[:, None]), (self.h_parts, layout.lengths[:, None])
-        for array, values in (*numbers, (self.acting, layout.acting)):
+        numbers = (self.s_parts, counts.along[:, None]), (self.h_parts, counts.lengths[:, None])
+        for array, values in (*numbers, (self.acting, counts.grid.acting)):
             if array.size:
                 self._put_in(found[None], array, values[None, None])
         whole = found.view(np.int64)
-        whole[: len(layout.whole)] = layout.whole
-        whole[self.node_table.offset :][: len(layout.nodes)] = layout.nodes
-        whole[self.filled.offset :][: layout.filled.size] = layout.filled.ravel()
-        found[self.filled_parts.offset :][: len(layout.filled_parts)] = layout.filled_parts
+        whole[: len(counts.whole)] = counts.whole
+        whole[self.node_table.offset :][: len(counts.grid.nodes)] = counts.grid.nodes
+        whole[self.filled.offset :][: counts.filled.size] = counts.filled.ravel()
+        found[self.filled_parts.offset :][: len(counts.filled_parts)] = counts.filled_parts
         return found
 
     def _width(self, array: Array) -> int:
@@ -109,7 +109,7 @@ class RodCode(Memory):
         """Return an array's numbers from those of all strands at places of the grid (…, places, width)."""
         if self._width(array) == array.size:
             return packed
-        origins = self.layout.origins
+        origins = self.counts.origins
         strand, place = np.transpose([each for each in origins if each[1] < packed.shape[-2]])
         return self.equations.by_strand(packed)[..., place, strand, :]
 
@@ -117,7 +117,7 @@ class RodCode(Memory):
         """Return the numbers of all strands at the first places of the grid (…, count, width)."""
         if self._width(array) == array.size:
             return values[..., :count, :]
-        first = {origin: k for k, origin in reversed(list(enumerate(self.layout.origins)))}
+        first = {origin: k for k, origin in reversed(list(enumerate(self.counts.origins)))}
         places = [[first[q, j] for q in range(self.strands)] for j in range(count)]
         return self.equations.joined(values[..., places, :])
 

@@ -207,7 +207,7 @@ class _TangentCode(StepMap):
         strides = self.state_size, 1, second.offset - first.offset, first.place, first.component
         found = np.lib.stride_tricks.as_strided(
             states[:, first.offset :],
-            (len(states), lanes, len(self.lasting), self.layout["used"], first.size),
+            (len(states), lanes, len(self.lasting), self.counts["used"], first.size),
             [8 * each for each in strides],
         )  # fmt: skip
         memory = self.settings.memory
@@ -382,7 +382,7 @@ class TangentCore(_TangentCode):
         if np.any(d_tip):
             added = filled(np.broadcast_to(d_tip, (k, m))).reshape(k, blocks, L).transpose(1, 0, 2)
             states[:, self.added_tip.offset :][:, : k * L] = added.reshape(blocks, -1)
-        shapes = (self.layout["nodes"], self.packed.size), (k,)
+        shapes = (self.counts["nodes"], self.packed.size), (k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
         arrays = *begun, moved, states, filled(weights), filled(d_controls), d_rows, d_unknowns
         self._functions["run"](*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
@@ -552,7 +552,7 @@ class CotangentCore(_TangentCode):
         lasting = self._lasting(states, 1)
         lasting[:] = self._by_strand(self.rate, columns)
         # idle pieces have no results
-        lasting[..., self.layout.idle, :] = 0.0
+        lasting[..., self.counts.idle, :] = 0.0
         d_controls = np.zeros((count, self.equations.nc, m))
         size = sum(map(self._size_of, self._packed(self._kept)))
         kept = np.empty((count, size))

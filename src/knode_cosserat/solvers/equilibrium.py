@@ -128,6 +128,7 @@ def equilibria(
         ValueError: arguments of a wrong shape or name.
     """
     check_arguments(equilibria, locals())
+    # refuses what is no robot
     stacked(robot)
     solve = functools.partial(
         _solved, controls=controls, settings=Settings.of(None, space, "paper", newton), initial=initial,

@@ -253,7 +253,7 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
     elif lost < len(errors):
         causes.append(f"orientations are off by more than about {COARSE_ANGLE:g} rad")
     causes += [f"{lost} rows have no estimate of the error"] if lost else []
-    turn = _turn_of_segments(system, np.asarray(rows.records)[coarse])
+    turn = _turn_of_frames(system, np.asarray(rows.records)[coarse])
     wound = turn_of_segments(system)
     causes += [f"parts turn by {wound:.2g} rad from node to node"] if wound > SEEN_TURN else []
     causes += [f"frames turn by up to {turn:.2g} rad from node to node"] if turn > LARGEST_TURN else []
@@ -265,7 +265,7 @@ def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> 
     )
 
 
-def _turn_of_segments(system: System, records: Any) -> float:
+def _turn_of_frames(system: System, records: Any) -> float:
     """Return the largest angle (rad) between frames of neighbouring nodes; 0 for several rods."""
     if strand_count(system) > 1 or "h" not in system.y_layout.names:
         return 0.0

@@ -24,7 +24,7 @@ SMALLEST, RATIO = 32, 4
 GROUPS = (3, 4, 5)
 
 
-class Layout:
+class Counts:
     """Counts by name, of all strands together unless it is said."""
 
     def __init__(self, pieces: int, near: int, strands: int, space: SpaceScheme):
@@ -36,7 +36,7 @@ class Layout:
         # a change of the unknowns costs about two pieces
         size = min(GROUPS, key=lambda each: -(-pieces // each) * (each + 2))
         groups = (pieces - 1) // size
-        self.counts = {
+        self.numbers = {
             "points of strand": own, "points": points, "pieces": every, "ends": ends, "used": used,
             "count": count, "used between": used - ends, "between": count - ends,
             "pieces of group": size, "groups of strand": groups, "groups": groups * strands,
@@ -44,7 +44,7 @@ class Layout:
             "nodes": own, "filled": strands * near, "most": 0,
         }  # fmt: skip
         stages, every_strand = range(len(space.check.stages)), range(strands)
-        self.counts |= {
+        self.numbers |= {
             # first place of each stage, among all and among those between ends
             **{f"stage {k}": ends + k * every for k in stages},
             **{f"pieces {k}": k * every for k in stages},
@@ -58,16 +58,16 @@ class Layout:
         }
 
     def __getitem__(self, name: str) -> int:
-        return self.counts[name]
+        return self.numbers[name]
 
     @classmethod
-    def room_of(cls, system: System, space: SpaceScheme) -> Layout:
+    def room_of(cls, system: System, space: SpaceScheme) -> Counts:
         """Return the largest counts of a system whose nodes are the most of a room (`in_room`)."""
         near = len(grid_of(system, space).near)
         return cls(system.nodes - 1 + near, near, strand_count(system), space)
 
 
-class GridLayout(Layout):
+class GridCounts(Counts):
     """Counts and tables of a grid."""
 
     def __init__(self, grid: Grid, strands: int, space: SpaceScheme):
@@ -82,30 +82,29 @@ class GridLayout(Layout):
         stages = [self[f"stage {k}"] for k in range(len(space.formula.stages))]
         #: stages of the idle pieces
         self.idle = [first + base - 1 for first in stages for base in bases[1:]]
-        #: points of the nodes; points between nodes with the nodes around them, and parts of segments
-        self.nodes, at = np.array(grid.nodes), grid.segment[grid.between]
+        #: points between nodes with the nodes around them, and parts of segments there
+        at = grid.segment[grid.between]
         around = np.stack([grid.between, grid.nodes[at], grid.nodes[at + 1]], axis=1)
         self.filled = np.concatenate([around + base for base in bases])
         self.filled_parts = np.tile(grid.bounds[grid.between, 0], strands)
         # the most of these points in a segment
         most = int(np.max(np.diff(grid.nodes))) - 1
-        self.counts |= {"nodes": len(grid.nodes), "filled": len(self.filled), "most": most}
+        self.numbers |= {"nodes": len(grid.nodes), "filled": len(self.filled), "most": most}
         near = [base + int(point) for base in bases for point in grid.near]
-        self.counts |= {f"near {k}": point for k, point in enumerate(near)}
+        self.numbers |= {f"near {k}": point for k, point in enumerate(near)}
         #: counts as they are in memory
-        self.whole = np.array(list(self.counts.values()))
+        self.whole = np.array(list(self.numbers.values()))
         #: places, and lengths of pieces, as parts of a strand's length
         self.along = grid.along[[place for _, place in self.origins]]
         self.lengths = np.tile(np.append(grid.lengths, 0.0), strands)[:-1]
-        self.acting = grid.acting
 
 
-_layout = functools.lru_cache(maxsize=256)(GridLayout)
+_counts = functools.lru_cache(maxsize=256)(GridCounts)
 
 
-def layout_of(system: System, space: SpaceScheme) -> GridLayout:
-    """Return the layout of a system's grid."""
-    return _layout(grid_of(system, space), strand_count(system), space)
+def counts_of(system: System, space: SpaceScheme) -> GridCounts:
+    """Return the counts of a system's grid."""
+    return _counts(grid_of(system, space), strand_count(system), space)
 
 
 def in_room(system: System) -> Any:
