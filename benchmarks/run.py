@@ -17,14 +17,15 @@ from typing import Any
 
 ROUNDS = 3
 #: cases that are run with compiled programs
+AS_USER = {"KNODE_COSSERAT_CODE": ""}
 WARM = ("steps", "cantilever", "batch", "gradient", "tangents", "schemes", "memory", "workspace")
 
 
-def case(name: str | None, cache: str, of: str = "cases", code: str = "final") -> dict[str, Any]:
-    """One case in a process of its own, with the given folder of compiled programs and level of code."""
+def case(name: str | None, cache: str, of: str = "cases", **environment: str) -> dict[str, Any]:
+    """One case in a process of its own, with the given folder of compiled programs."""
     ran = subprocess.run(
         [sys.executable, "-m", f"benchmarks.{of}", *([name] if name else [])],
-        env={**os.environ, "KNODE_COSSERAT_CACHE": cache, "KNODE_COSSERAT_CODE": code},
+        env={**os.environ, "KNODE_COSSERAT_CACHE": cache, **environment},
         stdout=subprocess.PIPE,
         check=True,
         text=True,
@@ -41,7 +42,7 @@ def command_seconds(cache: str) -> float:
                 *(sys.executable, "-m", "knode_cosserat.cli", "simulate", "delrin-tendon-robot"),
                 *("--controls", "sine:1.5", "--steps", "100", "--out", f"{folder}/truth.nc"),
             ],
-            env={**os.environ, "KNODE_COSSERAT_CACHE": cache},
+            env={**os.environ, "KNODE_COSSERAT_CACHE": cache, **AS_USER},
             stdout=subprocess.DEVNULL,
             check=True,
         )
@@ -64,14 +65,14 @@ def measure() -> dict[str, Any]:
         cold = []
         for _ in range(ROUNDS):
             with tempfile.TemporaryDirectory() as empty:
-                cold.append(case("first_call", empty, code=""))
+                cold.append(case("first_call", empty, **AS_USER))
         command_seconds(cache)
         second = [command_seconds(cache) for _ in range(ROUNDS)]
         found = {name: case(name, cache) for name in WARM}
         found["family"] = case(None, cache, "family")
         found |= {name: case(name, cache, "learning") for name in ("fits", "learned_steps")}
     with tempfile.TemporaryDirectory() as empty:
-        found["study"] = case("study", empty, "learning", code="")
+        found["study"] = case("study", empty, "learning", **AS_USER)
     found["first_call"] = {key: statistics.median(one[key] for one in cold) for key in cold[0]}
     found["second_process"] = {"seconds": statistics.median(second)}
     return {"machine": machine(), **found}
