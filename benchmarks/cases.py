@@ -19,7 +19,7 @@ from typing import Any
 DT = 0.05
 STEPS = 100
 #: the paper's scheme in time, which the transcription has: speeds are compared at the same method
-PAPER: dict[str, Any] = {"time": "bdf2", "start": "paper"}
+PAPER: dict[str, Any] = {"time": "bdf2", "start": "paper", "initial": "unstressed"}
 
 
 def one_core() -> None:

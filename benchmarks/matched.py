@@ -43,7 +43,9 @@ def ours(nodes: int, dt: float, scheme: str) -> Tips:
     robot, controls = _our_rod(nodes), np.zeros((round(SECONDS / dt), 0))
 
     def run() -> np.ndarray:
-        tips = kc.simulate(robot, controls, dt, time=scheme, space="lobatto4").tip_position
+        tips = kc.simulate(
+            robot, controls, dt, time=scheme, space="lobatto4", initial="unstressed"
+        ).tip_position
         return np.asarray(tips)[:: round(ROW / dt)]
 
     return run
@@ -57,7 +59,9 @@ def ours_batch(nodes: int, dt: float, scheme: str) -> Tips:
     controls = np.zeros((round(SECONDS / dt), 0))
 
     def run() -> np.ndarray:
-        tips = kc.simulate(robots, controls, dt, time=scheme, space="lobatto4").tip_position
+        tips = kc.simulate(
+            robots, controls, dt, time=scheme, space="lobatto4", initial="unstressed"
+        ).tip_position
         return np.asarray(tips)[:, :: round(ROW / dt)]
 
     return run

@@ -47,7 +47,7 @@ def _pulled(kind: str) -> tuple[Any, np.ndarray, float]:
 def path(motion: Callable[[], tuple[Any, np.ndarray, float]], nodes: int, space: str) -> np.ndarray:
     """Of the tip (steps + 1, 3) in lengths of the rod."""
     robot, controls, dt = motion()
-    moved = kc.simulate(robot.replace(nodes=nodes), controls, dt, space=space)
+    moved = kc.simulate(robot.replace(nodes=nodes), controls, dt, space=space, initial="unstressed")
     return np.asarray(moved.tip_position) / float(np.asarray(robot.length))
 
 

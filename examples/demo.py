@@ -123,7 +123,9 @@ def moved(system: kc.System, control: str, rows: int) -> kc.Trajectory:
     """Return the rows that the paper's study keeps: rest, and the states after all controls but the last."""
     # the paper's schemes, to compare with its figures
     tensions = kc.controls.parse(control, rows, DT, sampled="end")
-    return kc.simulate(system, tensions, DT, time="bdf2", start="paper", space="euler")[:rows]
+    return kc.simulate(system, tensions, DT, time="bdf2", start="paper", space="euler", initial="unstressed")[
+        :rows
+    ]
 
 
 def main() -> None:

@@ -215,7 +215,16 @@ def with_noise(trajectory: Trajectory, level: float, seed: int) -> Trajectory:
 def _moved(system: System, asked: Sequence[str], steps: int, dt: float, space: str) -> list[Trajectory | str]:
     """Return trajectories of as many rows as steps, or the reasons of failure."""
     tensions = np.stack([controls.parse(control, steps, dt, sampled="end") for control in asked])
-    batch = simulate(system, tensions, dt, time="bdf2", start="paper", space=space, on_failure="return")
+    batch = simulate(
+        system,
+        tensions,
+        dt,
+        time="bdf2",
+        start="paper",
+        space=space,
+        initial="unstressed",
+        on_failure="return",
+    )
     return [
         batch[k][:steps] if batch[k].all_valid else Result(int(np.min(batch.result[k]))).message
         for k in range(len(asked))

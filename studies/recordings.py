@@ -406,7 +406,8 @@ def _paper_motion(
     rest = None if before is None else equilibrium(resting, before, space=PAPER_SPACE)
     acting = undelayed(system, measured.tension[:-1], measured.dt, before)
     return simulate(
-        system, acting, measured.dt, time="bdf2", space=PAPER_SPACE, start="paper", initial=rest,
+        system, acting, measured.dt, time="bdf2", space=PAPER_SPACE, start="paper",
+        initial="unstressed" if rest is None else rest,
         recovery_budget=recovery,
     )  # fmt: skip
 

@@ -207,7 +207,7 @@ def predicted(
 def moved(system: System, control: str, rows: int, dt: float, space: str = "euler") -> Trajectory:
     """Return the first rows of a simulation from rest: as many as controls, as in the paper."""
     values = controls.parse(control, rows, dt, system, sampled="end")
-    return simulate(system, values, dt, time="bdf2", start="paper", space=space)[:rows]
+    return simulate(system, values, dt, time="bdf2", start="paper", space=space, initial="unstressed")[:rows]
 
 
 Facts = Mapping[str, Mapping[str, Any]]

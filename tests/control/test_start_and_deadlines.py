@@ -117,25 +117,26 @@ def test_a_plant_and_its_observer_start_at_rest():
     for tip in (plant.tip(), Drawing.of(SAGGING).positions(observer.estimate.y[-1])):
         np.testing.assert_allclose(tip, still.tip_position[0], atol=1e-7)
     # the paper's start is there too, and moves
-    fallen = SimulatedPlant(SAGGING, DT, sensor, initial=None)
+    fallen = SimulatedPlant(SAGGING, DT, sensor, initial="unstressed")
     np.testing.assert_allclose(fallen.tip(), [0.0, 0.0, 0.3], atol=1e-12)
     fallen.apply(np.zeros(1))
     assert fallen.tip()[0] > 1e-4
 
 
 @pytest.mark.slow
-def test_simulations_start_in_equilibrium_on_request():
+def test_simulations_start_in_equilibrium():
     none = np.zeros((5, 1))
     still = kc.equilibrium(SAGGING, [0.0]).tip_position[0]
-    stays = kc.simulate(SAGGING, none, DT, initial="equilibrium")
+    stays = kc.simulate(SAGGING, none, DT)
     np.testing.assert_allclose(stays.tip_position, np.tile(still, (6, 1)), atol=1e-8)
-    both = kc.simulate([SAGGING, SAGGING.replace(density=600.0)], none, DT, initial="equilibrium")
+    both = kc.simulate([SAGGING, SAGGING.replace(density=600.0)], none, DT)
     np.testing.assert_allclose(both[0].tip_position, stays.tip_position, atol=1e-8)
     assert np.ptp(np.asarray(both[1].tip_position)[:, 0]) < 1e-8
-    falls = kc.simulate(SAGGING, none, DT)
+    falls = kc.simulate(SAGGING, none, DT, initial="unstressed")
     np.testing.assert_allclose(falls.tip_position[0], [0.0, 0.0, 0.3], atol=1e-12)
     with pytest.raises(
-        ValueError, match=r"initial is a str 'rest'; allowed is a Trajectory or \"equilibrium\" or None"
+        ValueError,
+        match=r"initial is a str 'rest'; allowed is a Trajectory or \"equilibrium\" or \"unstressed\"",
     ):
         kc.simulate(SAGGING, none, DT, initial="rest")
 

@@ -14,7 +14,7 @@ from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, trained_range, without_range
 from tests.learning.bar import BAR, WRONG, pulled
 
-PAPER = {"time": "bdf2", "start": "paper"}
+PAPER = {"time": "bdf2", "start": "paper", "initial": "unstressed"}
 SMALL = FitConfig.network(hidden=5, epochs=300)
 
 

@@ -29,8 +29,8 @@ module = importlib.import_module("knode_cosserat.learning.states")
 SMALL = FitConfig.network(hidden=5, epochs=500)
 
 
-def tip_rmse(model, truth):
-    found = kc.simulate(model, truth.control[1:], truth.dt).tip_position
+def tip_rmse(model, truth, **options):
+    found = kc.simulate(model, truth.control[1:], truth.dt, **options).tip_position
     return float(np.sqrt(np.mean(np.sum((found - truth.tip_position) ** 2, axis=-1))))
 
 
@@ -44,7 +44,8 @@ def with_training(config=SMALL, **changes):
 def test_a_model_and_what_is_known_of_it(bars, unseen):
     model = fit_states(WRONG, bars, SMALL, held_out=[unseen])
     assert isinstance(model, KNODE) and model.knowledge is WRONG
-    assert tip_rmse(model, unseen) < 0.1 * tip_rmse(WRONG, unseen)
+    # the bar is at rest where nothing pulls; what is learned is at rest near there
+    assert tip_rmse(model, unseen, initial="unstressed") < 0.1 * tip_rmse(WRONG, unseen)
     facts = model.about.facts
     assert facts["seed"] == 0 and FitConfig.from_dict(json.loads(json.dumps(facts["config"]))) == SMALL
     assert [each["sha256"] for each in facts["trajectories"]] == [data_hash(each) for each in bars]

@@ -39,7 +39,7 @@ MASS = float(LOOSE.mass_per_length) * L
 SIMPSON = np.array([1, 4, 2, 4, 2, 4, 2, 4, 2, 4, 1]) / 30.0
 
 
-def loose(steps, dt, initial=None, **changes):
+def loose(steps, dt, initial="unstressed", **changes):
     robot = LOOSE.replace(**{key.replace("__", "."): value for key, value in changes.items()})
     return kc.simulate(robot, np.zeros((steps, 0)), dt, initial=initial, start="consistent", space="lobatto4")
 

@@ -248,7 +248,7 @@ STEPS, DT = 20, 0.02
 
 
 def tip(robot):
-    return kc.simulate(robot, np.zeros((STEPS, 0)), DT).tip_position[-1, 0]
+    return kc.simulate(robot, np.zeros((STEPS, 0)), DT, initial="unstressed").tip_position[-1, 0]
 
 
 def test_it_is_differentiable_and_runs_in_batches(arm):
@@ -262,14 +262,14 @@ def test_it_is_differentiable_and_runs_in_batches(arm):
     # denser water and more drag keep it up
     assert slopes[0] > 0.0 and slopes[1] > 0.0
     robots = [arm.replace(**{"loads.0.drag": drag}) for drag in (0.0, 2.0)]
-    both = kc.simulate(robots, np.zeros((2, STEPS, 0)), DT)
+    both = kc.simulate(robots, np.zeros((2, STEPS, 0)), DT, initial="unstressed")
     for k, robot in enumerate(robots):
         assert both.tip_position[k, -1, 0] == pytest.approx(float(tip(robot)), abs=1e-10)
 
 
 @pytest.mark.slow
 def test_its_numbers_are_identified(arm):
-    truth = kc.simulate(arm, np.zeros((STEPS, 0)), DT)
+    truth = kc.simulate(arm, np.zeros((STEPS, 0)), DT, initial="unstressed")
     names = ["loads.0.drag", "loads.0.added_mass"]
     guess = arm.replace(**{names[0]: 0.8, names[1]: 1.3})
     found = kc.identify(guess, [truth], parameters=names)

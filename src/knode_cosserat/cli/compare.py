@@ -36,9 +36,6 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
-#: largest distance (natural units of y) from the unstressed state of a motion that starts there
-UNSTRESSED = 1e-9
-
 
 class _Kind(enum.StrEnum):
     """Kinds of figures that `plot` draws."""
@@ -293,14 +290,13 @@ def _simulated(system: System | Ensemble, reference: Trajectory, rows: int | Non
     """
     import knode_cosserat as kc
     from knode_cosserat.learning.ensemble import Ensemble, Prediction
-    from knode_cosserat.solvers.history import rest_record
+    from knode_cosserat.solvers.initial import named_start
 
     if np.ndim(reference.y) != 3 or len(reference.time) < 2:
         raise ValueError("allowed is a trajectory of one robot, with two rows or more")
-    it, rest = reference.settings or kc.solvers.Settings(), rest_record(reference.system)
-    unstressed = np.allclose(reference.y[0], rest[:, : reference.y.shape[-1]], rtol=0.0, atol=UNSTRESSED)
+    it = reference.settings or kc.solvers.Settings()
     options: Any = {
-        "initial": None if unstressed else "equilibrium",
+        "initial": named_start(reference),
         "time": it.time, "space": it.space, "start": it.start, "newton": it.newton, "between": it.between,
         "progress": progress,
     }  # fmt: skip

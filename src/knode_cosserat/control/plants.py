@@ -107,7 +107,7 @@ class SimulatedPlant(Plant):
         *,
         substeps: int = 1,
         control_noise: float = 0.0,
-        initial: Trajectory | Literal["equilibrium"] | None = "equilibrium",
+        initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium",
     ):
         """Set up the robot at rest, under zero control, or at the last row of a trajectory.
 
@@ -118,8 +118,7 @@ class SimulatedPlant(Plant):
             substeps: steps of the simulation in each period.
             control_noise: standard deviation by which acting controls differ from commanded ones, in their
                 unit, independent in each period.
-            initial: a motion or equilibrium from which it moves on, or None for the unstressed robot, as in
-                `simulate`.
+            initial: where it starts, as in `simulate`.
         """
         self.robot, self.dt, self.sensor = robot, float(dt), sensor
         if control_noise < 0.0:

@@ -24,7 +24,7 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
-from knode_cosserat.solvers.history import StateHistory, rest_record, resting_history
+from knode_cosserat.solvers.history import StateHistory
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
@@ -114,8 +114,9 @@ class Arrays(NamedTuple):
     #: standard deviation of measured positions (m)
     noise: Any
     survey: Survey
-    #: history and record at the start; None: the robot's state at rest
-    rest: tuple[StateHistory, Any] | None
+    #: the nominal robot's equilibrium, in which episodes start
+    history: StateHistory
+    record: Any
 
 
 def scaled(arrays: Arrays, control: Float[Any, "... c"]) -> Float[Any, "... c"]:
@@ -256,13 +257,9 @@ def reset(spec: Spec, arrays: Arrays, key: Any) -> tuple[EpisodeState, Float[Any
     model = jax.random.randint(one, (), 0, max(spec.models, 1))
     delay = jax.random.randint(two, (), spec.delay[0], spec.delay[1] + 1)
     system = _assembled(spec, arrays, drawn[0], model, goal)
-    if arrays.rest is None:
-        history, record = resting_history(system, spec.settings), rest_record(system)
-    else:
-        history, record = arrays.rest
-    measured = _noisy(arrays, noise_key, spec.output.value(system, *split_record(system, record)))
+    measured = _noisy(arrays, noise_key, spec.output.value(system, *split_record(system, arrays.record)))
     state = EpisodeState(
-        history, goal, drawn, changes_at, model, jnp.tile(arrays.start, (spec.delay[1] + 1, 1)), delay,
+        arrays.history, goal, drawn, changes_at, model, jnp.tile(arrays.start, (spec.delay[1] + 1, 1)), delay,
         jnp.tile(measured, (MEASURED, 1)), jnp.array(0), key,
     )  # fmt: skip
     return state, observed(spec, arrays, state)

@@ -20,11 +20,10 @@ from knode_cosserat.envs import dynamics
 from knode_cosserat.envs.dynamics import TENSIONS, Actions, Arrays, EpisodeState, Spec, Transition
 from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError
 from knode_cosserat.estimation.outputs import BodyPositions
-from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.guess import LARGEST_JUMP, largest_turns
-from knode_cosserat.solvers.initial import initial_state
+from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import checked_dt
@@ -114,10 +113,8 @@ class Environment:
         if models:
             stacked = jax.tree.map(lambda *leaves: jnp.stack(list(map(jnp.asarray, leaves))), *models)
         # the errors by the time scheme are not read
-        settings, rest = Settings(errors="grid"), None
-        if Ends.of(equipped).rest_is_guess:
-            at_start = initial_state(equipped, settings)
-            rest = (at_start.state.history, at_start.record)
+        settings = Settings(errors="grid")
+        at_start = start_of(equipped, "equilibrium", settings, dt)
         self.task, self.robot, self.randomisation = task, robot, randomisation
         self.spec = Spec(
             task, dt, steps, actions, settings, BodyPositions(bodies), tuple(randomisation.parameters),
@@ -125,7 +122,8 @@ class Environment:
         )  # fmt: skip
         self.arrays = Arrays(
             equipped, stacked, *randomisation.ends(equipped), within.low, within.high, within.rate,
-            within.safe, float(randomisation.noise), task.survey(robot, within, seed), rest,
+            within.safe, float(randomisation.noise), task.survey(robot, within, seed),
+            at_start.state.history, at_start.record,
         )  # fmt: skip
 
     @property

@@ -24,7 +24,7 @@ class BoundaryObserver:
 
     def __init__(
         self, robot: System, dt: float, *, stiffness: float | None = None, damping: float | None = None,
-        initial: Trajectory | Literal["equilibrium"] | None = "equilibrium",
+        initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium",
     ):  # fmt: skip
         """Start at rest under zero control, or at the last row of a trajectory.
 
@@ -33,7 +33,7 @@ class BoundaryObserver:
             dt: period (s).
             stiffness: of the virtual spring (N/m); by default ten times that of the rod's tip, 30 EI/L³.
             damping: of the virtual damper (N s/m); by default √(k m) with the rod's mass m.
-            initial: a motion or equilibrium from which it moves on; None: the unstressed robot.
+            initial: where it starts, as in `simulate`.
         """
         base: Any = robot
         if not hasattr(nominal_model(base), "loads"):

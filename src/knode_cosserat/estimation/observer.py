@@ -18,8 +18,8 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import used_places
-from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.simulate import check_initial, checked_dt, split_initial
+from knode_cosserat.solvers.initial import start_of
+from knode_cosserat.solvers.simulate import check_initial, checked_dt
 from knode_cosserat.trajectory import Trajectory
 
 #: a measurement farther from its prediction than this quantile of its distribution is weighted less
@@ -74,7 +74,7 @@ class KalmanObserver:
 
     def __init__(
         self, robot: System, dt: float, output: Output, *, adapt: Sequence[Adapted | str] = (),
-        initial: Trajectory | Literal["equilibrium"] | None = "equilibrium", columns: int = 14,
+        initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium", columns: int = 14,
         control_deviation: float | Sequence[float] | None = None, start_deviation: float = 0.0,
     ):  # fmt: skip
         """Start at rest under zero control, or at the last row of a trajectory.
@@ -84,7 +84,7 @@ class KalmanObserver:
             dt: time step of measurements and controls (s).
             output: the measured output, with its noise.
             adapt: parameters that are estimated with the state.
-            initial: a motion or an equilibrium from which the robot moves on; None: the unstressed robot.
+            initial: where it starts, as in `simulate`.
             columns: rank of the covariance.
             control_deviation: standard deviation of each control; by default 0.05 N for tensions, and 0.01 in
                 its own unit for any other control.
@@ -111,19 +111,13 @@ class KalmanObserver:
         """The model, with the parameters that it had at first."""
         return self.model.robot
 
-    def restart(self, initial: Trajectory | Literal["equilibrium"] | None = "equilibrium") -> None:
+    def restart(self, initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium") -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
         #: number of times that earlier parameters came back
         self.rollbacks = 0
         robot, settings = self.robot, self.model.settings
-        initial, settled = split_initial(initial)
-        if initial is None:
-            at_start = initial_state(
-                robot, settings, held=np.zeros(robot.control_layout.size) if settled else None
-            )
-        else:
-            check_initial(robot, initial, None)
-            at_start = continued_state(robot, initial, settings, self.dt)
+        check_initial(robot, initial, None)
+        at_start = start_of(robot, initial, settings, self.dt)
         past = at_start.state.history
         self.control = np.asarray(at_start.control, dtype=float)
         self.record = np.asarray(at_start.record)

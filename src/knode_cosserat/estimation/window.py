@@ -54,7 +54,7 @@ class MovingHorizonObserver(KalmanObserver):
         nothing = np.full((window, output.size), np.nan)
         self.model.predicted(self.belief, controls, nothing, self._deviations(), output)
 
-    def restart(self, initial: Trajectory | Literal["equilibrium"] | None = "equilibrium") -> None:
+    def restart(self, initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium") -> None:
         """Start again at rest, or at the last row of a trajectory, with the initial uncertainty."""
         self._controls: deque[Any] = deque()
         self._measured: deque[Any] = deque()

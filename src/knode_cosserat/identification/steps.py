@@ -77,7 +77,7 @@ def simulated_rows(
         robot: any robot or model.
         tension: from each row to the next.
         dt: time from row to row (s).
-        start: equilibrium from which it moves; None: rest.
+        start: equilibrium from which it moves; None: that under zero control.
         initial: tension before the first row; None: the first tension.
         continuous: tensions vary continuously; `Measurements.continuous`.
         space: the scheme along the rod.
@@ -91,6 +91,6 @@ def simulated_rows(
     acting = undelayed(robot, tension, dt / count, initial)
     motion = simulate(
         fixed(robot), acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
-        initial=start, recovery_budget=recovery,
+        initial="equilibrium" if start is None else start, recovery_budget=recovery,
     )  # fmt: skip
     return motion[::count] if count > 1 else motion

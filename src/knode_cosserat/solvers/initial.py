@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,9 +13,11 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
+    SOLVED,
     SolverState,
     StateHistory,
     map_robots,
@@ -27,10 +29,52 @@ from knode_cosserat.solvers.problem import no_history, row_of
 from knode_cosserat.solvers.replay import at_one_state, carried, history_settings, replay, state_of_rows
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.rollout import static_rollout
-from knode_cosserat.solvers.run import InitialState, TimeIntegration, warn_of_results
+from knode_cosserat.solvers.run import InitialState, TimeIntegration, failure, warn_of_results
 from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.static_run import static_run
+from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
+
+#: starts that have a name
+STARTS = ("equilibrium", "unstressed")
+
+
+def start_of(
+    system: System,
+    initial: Any,
+    settings: Settings,
+    dt: float,
+    batch: int | None = None,
+    recovery_budget: float | None = None,
+) -> InitialState:
+    """Return where a run starts: a named state at rest, or the last row of a trajectory.
+
+    A system that nothing holds has no equilibrium, and starts unstressed.
+    """
+    if isinstance(initial, Trajectory):
+        return continued_state(system, initial, settings, dt)
+    settles = initial == "equilibrium" and Ends.of(system).held
+    held = np.zeros(system.control_layout.size) if settles else None
+    return initial_state(system, settings, batch, recovery_budget, held)
+
+
+def named_start(
+    trajectory: Trajectory, names: tuple[str, ...] | None = None
+) -> Literal["equilibrium", "unstressed"]:
+    """Return the state at rest under zero control that is nearer to row 0 of a motion, in fields of y."""
+    system, settings = without_range(trajectory.system), trajectory.settings or Settings()
+    columns = system.y_layout.indices(system.y_layout.names if names is None else names)
+    seen, scale = np.asarray(trajectory.y[0])[:, columns], np.asarray(system.scales().y)[..., columns]
+
+    def distance(held: Any) -> float:
+        record = np.asarray(initial_state(system, settings, held=held).record)
+        return float(np.nansum(((record[:, columns] - seen) / scale) ** 2))
+
+    try:
+        settled = distance(np.zeros(system.control_layout.size))
+    except SimulationError:
+        return "unstressed"
+    # where both are one state, runs start as they do by default
+    return "unstressed" if settled > SOLVED**2 and distance(None) < settled else "equilibrium"
 
 
 def initial_state(
@@ -82,23 +126,16 @@ def _settled(system: System, settings: Settings, budget: float | None, control: 
         find, y = static_rollout(task, Pattern.of(system)), unloaded_shape(system, settings.space)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, held, y) if many else find(system, held, y)
         found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
-    elif many:
-        each = range(np.shape(system.length)[0])
-        both = [_settled_one(task, jax.tree.map(lambda x, i=i: x[i], system), i, held) for i in each]
-        found, result = map(np.stack, zip(*both, strict=True))
     else:
-        found, result = _settled_one(task, system, None, held)
+        robots = np.shape(system.length)[:1]
+        rows, _, causes = (static_batch if many else static_run)(
+            task, system, np.broadcast_to(held, (*robots, *held.shape))
+        )
+        if causes:
+            raise failure(rows, causes, None)
+        warn_of_results(rows)
+        found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
     return found[..., : system.y_layout.size + system.z_layout.size], result
-
-
-def _settled_one(
-    task: TimeIntegration, system: System, robot: int | None, held: np.ndarray
-) -> tuple[Any, Any]:
-    rows, _, cause = static_run(task, system, held)
-    if rows.result[0] < 0:
-        raise SimulationError(0, 0.0, float(rows.error[0]), Result(int(rows.result[0])), cause, robot)
-    warn_of_results(rows)
-    return rows.records[0], _coarse_only(rows.result[0])
 
 
 # continuation of another trajectory

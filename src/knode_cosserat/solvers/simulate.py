@@ -20,7 +20,7 @@ from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages, no_rows
-from knode_cosserat.solvers.initial import continued_state, initial_state
+from knode_cosserat.solvers.initial import STARTS, start_of
 from knode_cosserat.solvers.refinement import (
     Solved,
     as_seen,
@@ -65,7 +65,7 @@ def simulate(
     space: str | SpaceScheme = "lobatto2",
     start: Literal["paper", "consistent"] = "consistent",
     between: Literal["held", "linear"] = "held",
-    initial: Trajectory | Literal["equilibrium"] | None = None,
+    initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium",
     newton: NewtonOptions = NewtonOptions(),
     position_tolerance: float | None = None,
     errors: Errors = True,
@@ -89,11 +89,10 @@ def simulate(
             displacements and rotations (controls in m or rad) cannot jump, and are linear from row to row.
             "linear": so are all others. Linear controls reach control i at row i + 1. A motion from rest or
             from an equilibrium begins suddenly: the first control of the others is held.
-        initial: start from this trajectory's last row; or "equilibrium": at rest under zero control, as the
-            command line, plants and viewers do. By default the simulation starts unstressed, as in the
-            paper's studies: the rod has the shape that it was made in, and then moves by its weight. (If that
-            state is only a guess, such as for a platform on bent legs, the default is the equilibrium too.)
-            A simulated motion continues exactly, by its `final_state`, with the same time step. A part of it,
+        initial: "equilibrium": start at rest under zero control; "unstressed": in the shape that the rod was
+            made in, from which it falls by its weight, as in the paper's studies (the equilibrium too if that
+            shape is only a guess, such as for a platform on bent legs); or from this trajectory's last row. A
+            simulated motion continues exactly, by its `final_state`, with the same time step. A part of it,
             `motion[:k]`, has its rows evaluated again first. For a part from the middle, and for measured
             rows, states between nodes are interpolated, and a scheme that needs rates (BDF-α, the trapezoidal
             rule) makes its first step by BDF1.
@@ -118,7 +117,6 @@ def simulate(
         ValueError: arguments of a wrong shape or name.
     """
     check_arguments(simulate, locals())
-    initial, settled = split_initial(initial)
     if time in (None, "static"):
         raise ValueError(f"time is {time!r}; equilibria have no time steps: use solvers.equilibria")
     settings = Settings.of(time, space, start, newton, between, errors)
@@ -126,33 +124,36 @@ def simulate(
     if position_tolerance is not None and not errors:
         raise ValueError("position_tolerance needs estimates of errors: leave out errors=False")
     check_tolerance(robot, initial, position_tolerance)
-    robot = robot if initial is None else on_grid_of(robot, initial)
+    robot = on_grid_of(robot, initial) if isinstance(initial, Trajectory) else robot
     system, batch = stacked(robot)
     controls, batch = checked_controls(system, controls, batch)
-    if initial is not None:
-        check_initial(system, initial, batch)
+    check_initial(system, initial, batch)
     warn_if_undamped(robot, dt)
     warn_of_long_steps(robot, dt)
 
     def solve(robot: Any) -> Solved[Trajectory]:
         system = stacked(robot)[0]
-        before = initial if initial is None else _again_at_rest(initial, system, settings)
+        before = initial
         # ranges are not part of the equations: programs are compiled for systems without them
         bare = without_range(system)
-        if before is not None:
+        if isinstance(before, Trajectory):
+            before = _again_at_rest(before, system, settings)
             before = without_range(dataclasses.replace(before, extrapolated=None))
         task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
         if is_traced((system, controls, before)):
-            found = _traced(bare, controls, before, settled, Solves(task, Pattern.of(bare)))
+            named, rows = (None, before) if isinstance(before, Trajectory) else (before, None)
+            found = _traced(bare, controls, rows, named, Solves(task, Pattern.of(bare)))
             result, error = as_seen(system, found.result, found.position_error)
             found = dataclasses.replace(found, system=system, result=result, position_error=error)
             return Solved.of(marked(found, initial))
-        run = _initial(bare, controls, before, settled, task)
+        run = _initial(bare, controls, before, task)
         every, last, said = _plain(bare, run, on_failure, progress)
         return Solved.of(marked(_trajectory(system, run, every, last), initial), said)
 
     # the state of a motion is known on its own grid only
-    moving = initial is not None and (initial.settings is None or initial.settings.time is not None)
+    moving = isinstance(initial, Trajectory) and (
+        initial.settings is None or initial.settings.time is not None
+    )
     return refined(solve, robot, settings.space, position_tolerance, stays=moving)
 
 
@@ -169,22 +170,11 @@ def _again_at_rest(initial: Trajectory, system: System, settings: Settings) -> T
     return dataclasses.replace(guess, system=system, settings=task.settings, **rows_of(bare, rows))
 
 
-def split_initial(initial: Any) -> tuple[Trajectory | None, bool]:
-    """Return the argument `initial` of a run as a trajectory or None, and True for an equilibrium."""
-    if isinstance(initial, str) and initial == "equilibrium":
-        return None, True
-    if initial is not None and not isinstance(initial, Trajectory):
-        given = f" {initial!r}" if isinstance(initial, str) else ""
-        raise ValueError(
-            f'initial is a {type(initial).__name__}{given}; allowed is a Trajectory, "equilibrium", or None'
-        )
-    return initial, False
-
-
-def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
+def marked(trajectory: Trajectory, initial: Any) -> Trajectory:
     """Return a trajectory with `extrapolated` marked where its system extrapolates.
 
-    The first row takes the mark of the last row of the trajectory that it continues.
+    The first row takes the mark of the last row of the trajectory that it continues (`initial`, if it is
+    one).
     """
     system = trajectory.system
     trained = trained_range(system)
@@ -195,7 +185,7 @@ def marked(trajectory: Trajectory, initial: Trajectory | None) -> Trajectory:
         # equilibria are motions of one row
         time, control, z = time[:1], control[..., None, :], z[..., None, :, :]
     outside = trained.outside(system, time, control, z).reshape(trajectory.result.shape)
-    if initial is not None and initial.extrapolated is not None:
+    if isinstance(initial, Trajectory) and initial.extrapolated is not None:
         numeric: Any = jnp if is_traced(outside) else np
         first = numeric.arange(outside.shape[-1]) == 0
         outside = numeric.where(first, initial.extrapolated[-1], outside)
@@ -304,8 +294,20 @@ def check_limits(system: System, controls: Any) -> None:
             )
 
 
-def check_initial(system: System, initial: Trajectory, batch: int | None) -> None:
-    """Check that a trajectory is of one robot, fits the system and is solved. Raises `ValueError`."""
+def check_initial(system: System, initial: Any, batch: int | None) -> None:
+    """Check where a run starts; a trajectory is of one robot, fits the system and is solved.
+
+    Raises:
+        ValueError: it does not.
+    """
+    if isinstance(initial, str) and initial in STARTS:
+        return
+    if not isinstance(initial, Trajectory):
+        given = f" {initial!r}" if isinstance(initial, str) else ""
+        raise ValueError(
+            f"initial is a {type(initial).__name__}{given}; allowed is {', '.join(map(repr, STARTS))}, or a "
+            "Trajectory"
+        )
     if batch or initial.y.ndim == 4:
         raise ValueError("initial is for one robot, not for a batch")
     if not len(initial.time):
@@ -332,15 +334,11 @@ def check_initial(system: System, initial: Trajectory, batch: int | None) -> Non
 # runs
 
 
-def _initial(system: Any, controls: Any, initial: Any, settled: bool, task: TimeIntegration) -> Any:
+def _initial(system: Any, controls: Any, initial: Any, task: TimeIntegration) -> Any:
     """Return the initial state of a run, its time steps, and the controls of their stages."""
     settings = task.settings
-    if initial is None:
-        batch = len(controls) if np.ndim(controls) == 3 else None
-        held = np.zeros(system.control_layout.size) if settled else None
-        at_start = initial_state(system, settings, batch, task.recovery_budget, held)
-    else:
-        at_start = continued_state(system, initial, settings, task.dt)
+    batch = len(controls) if np.ndim(controls) == 3 else None
+    at_start = start_of(system, initial, settings, task.dt, batch, task.recovery_budget)
     task = dataclasses.replace(task, known=at_start.state.known(settings))
     acting = at_stages(system, settings, controls, at_start.control[..., None, :], at_start.state.dt is None)
     return at_start, task, acting
@@ -380,13 +378,13 @@ def _initial_rows(system: System, task: TimeIntegration, shape: tuple[int, ...])
     return every
 
 
-@functools.partial(jax.jit, static_argnames=("settled", "spec"))
-def _traced(system, controls, initial, settled, spec):  # type: ignore[no-untyped-def]
+@functools.partial(jax.jit, static_argnames=("named", "spec"))
+def _traced(system, controls, rows, named, spec):  # type: ignore[no-untyped-def]
     """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
     A single jitted function, so that a transformation traces it once and not at every call.
     """
-    at_start, task, acting = run = _initial(system, controls, initial, settled, spec.task)
+    at_start, task, acting = run = _initial(system, controls, rows if named is None else named, spec.task)
     solve: Any = rollout(task, spec.pattern)
     if np.ndim(controls) == 3:
         solve = jax.vmap(solve, in_axes=(0 if np.ndim(system.length) else None, 0, 0))

@@ -14,12 +14,12 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, turns_between, turns_within
 from knode_cosserat.solvers.history import SolverState, StateHistory, StepRows, at_stages
-from knode_cosserat.solvers.initial import continued_state, initial_state
+from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, carried_results, rows_of
 from knode_cosserat.solvers.settings import Errors, NewtonOptions, Settings
-from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked, split_initial
+from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
 from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
@@ -53,12 +53,12 @@ class Stepper:
         time: str | TimeScheme = "sdirk2",
         space: str | SpaceScheme = "lobatto2",
         start: Literal["paper", "consistent"] = "consistent",
-        initial: Trajectory | Literal["equilibrium"] | None = None,
+        initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium",
         newton: NewtonOptions = NewtonOptions(),
         errors: Errors = True,
         recovery_budget: float | None = None,
     ):
-        """Start unstressed, in equilibrium, or at the last row of `initial`: arguments as in `simulate`.
+        """Start in equilibrium, unstressed, or at the last row of `initial`: arguments as in `simulate`.
 
         Raises:
             SimulationError: the initial equilibrium was not found.
@@ -81,13 +81,8 @@ class Stepper:
             for field in self._layout.fields
             for _ in range(field.size)
         ]
-        initial, settled = split_initial(initial)
-        if initial is None:
-            held = np.zeros(robot.control_layout.size) if settled else None
-            at_start = initial_state(robot, settings, recovery_budget=recovery_budget, held=held)
-        else:
-            check_initial(robot, initial, None)
-            at_start = continued_state(robot, initial, settings, self.dt)
+        check_initial(robot, initial, None)
+        at_start = start_of(robot, initial, settings, self.dt, recovery_budget=recovery_budget)
         known = at_start.state.known(settings)
         self._task = TimeIntegration(settings, self.dt, 1, known, recovery_budget)
         self._t0, self._steps, self._result = float(at_start.state.history.t0), 0, int(at_start.result)

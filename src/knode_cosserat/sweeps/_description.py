@@ -14,6 +14,7 @@ from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, mapping
 from knode_cosserat._reprs import quantity
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.initial import STARTS
 
 #: stored quantities by name: meaning and unit
 STORED = {
@@ -107,6 +108,7 @@ class Sweep:
         precision: "double", or "single" for half the size of the stored quantities.
         time: time scheme, as for `simulate`.
         space: space scheme, as for `simulate`.
+        initial: "equilibrium" or "unstressed", as for `simulate`.
         recovery: try to recover failed steps, without a limit of time. It can take minutes a case.
         shard: cases in a file; by default up to 4096 and 16 MB.
 
@@ -127,6 +129,7 @@ class Sweep:
     precision: Literal["double", "single"] = "double"
     time: str = "sdirk2"
     space: str = "lobatto2"
+    initial: Literal["equilibrium", "unstressed"] = "equilibrium"
     recovery: bool = False
     shard: int | None = None
 
@@ -159,6 +162,7 @@ class Sweep:
         if len(set(self.store)) < len(self.store):
             raise SweepError(f"store is {', '.join(self.store)}; allowed is each name once")
         _require(self.precision in ("double", "single"), "precision", self.precision, "double or single")
+        _require(self.initial in STARTS, "initial", self.initial, " or ".join(STARTS))
         _require(self.recovery in (False, True), "recovery", self.recovery, "false or true")
         _require_known(f"sampler is {shown(self.sampler)}", self.sampler, SAMPLERS)
         if self.sampler == "grid":

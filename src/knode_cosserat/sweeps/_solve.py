@@ -22,7 +22,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.history import SolverState, rest_record
-from knode_cosserat.solvers.initial import initial_state
+from knode_cosserat.solvers.initial import initial_state, start_of
 from knode_cosserat.solvers.recovery import likely_cause
 from knode_cosserat.solvers.replay import at_one_state, history_settings
 from knode_cosserat.solvers.result import Result, SimulationError
@@ -146,10 +146,9 @@ def _solved_system(plan: Plan, robot: int) -> System:
 def _equilibria(plan: Plan, system: System, values: dict[str, Any]) -> tuple[Any, Any, dict[int, str]]:
     """Return records and histories at the start of a chunk, result codes, and by case reasons of failures.
 
-    A robot such as a platform on bent legs starts from its equilibrium under zero control. All others start
-    from rest (None), which the chunk's program evaluates.
+    The unstressed state (None) is evaluated by the chunk's program.
     """
-    if not Ends.of(system).rest_is_guess:
+    if plan.sweep.initial == "unstressed" and not Ends.of(system).rest_is_guess:
         return None, np.full(CHUNK, int(Result.CONVERGED)), {}
     states: list[InitialState | None] = []
     reasons: dict[int, str] = {}
@@ -157,7 +156,7 @@ def _equilibria(plan: Plan, system: System, values: dict[str, Any]) -> tuple[Any
         case = system.replace(**{name: array[k] for name, array in values.items()}) if values else system
         try:
             budget = np.inf if plan.sweep.recovery else 0.0
-            states.append(initial_state(case, plan.settings, None, budget))
+            states.append(start_of(case, plan.sweep.initial, plan.settings, plan.sweep.dt, None, budget))
         except SimulationError as error:
             states.append(None)
             reasons[k] = str(error)
@@ -184,7 +183,7 @@ def _failed(
     """
     cause = ""
     if plan.sweep.recovery:
-        at = initial_state(system, task.settings, None, np.inf)
+        at = start_of(system, plan.sweep.initial, task.settings, task.dt, None, np.inf)
         task = dataclasses.replace(task, recovery_budget=np.inf)
         rows, _, cause = run_one(task, system, controls, (at.state.history, at.control), watch=None)
         record, rows = jax.tree.map(lambda leaf: np.asarray(leaf)[None], (at.record, rows))

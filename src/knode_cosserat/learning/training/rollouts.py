@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training import runs
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.initial import named_start
 from knode_cosserat.solvers.segments import DataError, samples, settings_of
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
@@ -32,16 +33,18 @@ from knode_cosserat.trajectory import Trajectory
 POSE = ("p", "h")
 
 
-class _TrajectoryBatch(NamedTuple):
+class _TrajectoryBatch(eqx.Module):
     """Trajectories (B) of one length: controls and target states."""
 
     control: Float[Any, "B T c"]
     #: row 0 is the initial state of the simulations
     y: Float[Any, "B T+1 nodes y"]
+    #: where they start, as in `simulate`
+    initial: Literal["equilibrium", "unstressed"] = eqx.field(static=True)
 
 
 class TrajectoryBatches(eqx.Module):
-    """All trajectories, grouped by length, with the settings of their simulation."""
+    """All trajectories, grouped by length and start, with the settings of their simulation."""
 
     parts: tuple[_TrajectoryBatch, ...]
     #: scale of each compared field's errors: the rms of its motion
@@ -65,7 +68,7 @@ def trajectory_batches(
         samples(knowledge, [_relevant(knowledge, one, compared) for one in trajectories])
     except DataError as error:
         raise DataError(f"{what}{error}") from None
-    by_length: dict[int, list[_TrajectoryBatch]] = {}
+    alike: dict[tuple[int, str], list[_TrajectoryBatch]] = {}
     for k, trajectory in enumerate(trajectories):
         if float(trajectory.time[0]) != 0.0:
             raise DataError(
@@ -74,8 +77,9 @@ def trajectory_batches(
             )
         rows = min(len(trajectory.time), 1 + (options.horizon or len(trajectory.time)))
         y, control = (np.asarray(part, dtype=float)[:rows] for part in (trajectory.y, trajectory.control))
-        by_length.setdefault(rows, []).append(_TrajectoryBatch(control[1:], y))
-    parts = [jax.tree.map(lambda *leaves: np.stack(leaves), *several) for several in by_length.values()]
+        initial = named_start(trajectory, compared)
+        alike.setdefault((rows, initial), []).append(_TrajectoryBatch(control[1:], y, initial))
+    parts = [jax.tree.map(lambda *leaves: np.stack(leaves), *several) for several in alike.values()]
     scales = []
     for name in compared:
         values = [knowledge.y_layout.get(part.y, name) for part in parts]
@@ -122,7 +126,8 @@ def simulated_batch(
     def one(control: Any) -> Any:
         return simulate(
             model, control, batches.dt, space=settings.space, start=settings.start, newton=settings.newton,
-            between=settings.between, time=settings.time,  # type: ignore[arg-type]  # None is refused there
+            between=settings.between, initial=batch.initial,
+            time=settings.time,  # type: ignore[arg-type]  # None is refused there
         ).y  # fmt: skip
 
     return jax.lax.map(one, batch.control)
