@@ -204,7 +204,7 @@ def test_derivatives_with_respect_to_width_and_height():
 
     def tip(sides):
         change = {"cross_section.width": sides[0], "cross_section.height": sides[1]}
-        moved = kc.simulate(base.replace(**change), np.zeros((3, 0)), 0.05)
+        moved = kc.simulate(base.replace(**change), np.zeros((3, 0)), 0.05, initial="unstressed")
         return jnp.sum(moved.tip_position[-1] * np.array([1.0, 2.0, 3.0]))
 
     value = jax.jit(jax.value_and_grad(tip))
@@ -271,7 +271,8 @@ def test_a_table_moves_as_stretches_with_the_same_values():
     falling = {"gravity": [20.0, 0.0, -9.81]}
     tabulated, stretched = rod(table, **falling), rod(radius=radius, sections=stretches, **falling)
     found, expected = (
-        kc.simulate(robot, np.zeros((10, 0)), 0.05).position for robot in (tabulated, stretched)
+        kc.simulate(robot, np.zeros((10, 0)), 0.05, initial="unstressed").position
+        for robot in (tabulated, stretched)
     )
     # the inertia of a homogeneous section differs, by the radius over the length squared
     np.testing.assert_allclose(found, expected, atol=1e-4 * L)
@@ -382,7 +383,7 @@ def test_identified_axes_keep_the_stiffness_positive():
 def test_a_knode_and_parameters_of_a_strip(tmp_path):
     """Identified from its own motion, and a learned model comes back from its file."""
     robot = rod(STRIP, loads=(DistributedWrench(force=[0.02, 0.05, 0.0]),), nodes=6, bending_damping=1e-4)
-    motion = kc.simulate(robot, np.zeros((20, 0)), 0.02)
+    motion = kc.simulate(robot, np.zeros((20, 0)), 0.02, initial="unstressed")
     wrong = robot.replace(**{"cross_section.width": 0.9 * W, "cross_section.height": 1.05 * H})
     found = kc.identify(wrong, [motion], parameters=["cross_section.width", "cross_section.height"])
     section = found.robot.cross_section
@@ -390,7 +391,7 @@ def test_a_knode_and_parameters_of_a_strip(tmp_path):
     model = kc.KNODE(robot, network(robot, NetworkOptions(hidden=3), jax.random.PRNGKey(0)))
     model.save(tmp_path / "model.knode")
     again = kc.load_model(tmp_path / "model.knode")
-    assert kc.simulate(again, np.zeros((2, 0)), 0.02).all_valid
+    assert kc.simulate(again, np.zeros((2, 0)), 0.02, initial="unstressed").all_valid
     assert again.knowledge.cross_section == robot.cross_section
 
 

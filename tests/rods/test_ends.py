@@ -162,15 +162,14 @@ HELD = kc.robots.SlenderRod(
 def test_where_the_base_is_moves_and_turns_everything():
     g = np.array([3.0, -4.0, -6.0])
     turn, shift = Rotation.from_rotvec([0.4, -1.1, 0.7]), np.array([0.3, -0.2, 0.5])
-    here = kc.simulate(HELD.replace(gravity=g), np.zeros((30, 0)), 0.02)
+    here = kc.simulate(HELD.replace(gravity=g), np.zeros((30, 0)), 0.02, initial="unstressed")
     there = kc.simulate(
         HELD.replace(**{
             "gravity": turn.apply(g), "base_end.position": shift,
             # of any length
             "base_end.orientation": 2.0 * turn.as_quat(scalar_first=True),
         }),
-        np.zeros((30, 0)), 0.02,
-    )  # fmt: skip
+        np.zeros((30, 0)), 0.02, initial="unstressed")  # fmt: skip
     for name in "pnm":
         moved = turn.apply(np.asarray(here.part(name)).reshape(-1, 3)) + (shift if name == "p" else 0.0)
         size = np.abs(moved).max()
@@ -190,7 +189,7 @@ def quarter_period(amplitude, steps):
     )  # fmt: skip
     small = np.pi / 2 * np.sqrt(2 * L / (3 * G))
     t_end = 1.3 * small * ellipk(np.sin(amplitude / 2) ** 2) / (np.pi / 2)
-    found = kc.simulate(bar, np.zeros((steps, 0)), t_end / steps, space="lobatto4")
+    found = kc.simulate(bar, np.zeros((steps, 0)), t_end / steps, space="lobatto4", initial="unstressed")
     p, t = np.asarray(found.part("p"))[:, -1], np.asarray(found.time)
     np.testing.assert_allclose(np.asarray(found.part("p"))[:, 0], 0.0, atol=1e-12)
     np.testing.assert_allclose(np.linalg.norm(p, axis=1), L, atol=1e-6)

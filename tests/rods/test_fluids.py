@@ -200,7 +200,7 @@ def test_a_free_rod_sinks_at_its_terminal_velocity(direction, coefficient):
     force = (MASS - ADDED) * g
     speed = np.sqrt(force / (WATER * RADIUS * coefficient))
     dt = 0.1 * (MASS + across * ADDED) * speed / force
-    found = kc.simulate(rod, np.zeros((80, 0)), dt)
+    found = kc.simulate(rod, np.zeros((80, 0)), dt, initial="unstressed")
     q = np.asarray(found.part("q")) @ direction
     assert found.all_valid
     np.testing.assert_allclose(q[-1], speed, rtol=1e-5)

@@ -216,7 +216,7 @@ STEPS, TIME = 480, 0.3
 def carried(robot):
     """The straight robot at rest in the frame, as it moves over the ground."""
     still = robot.replace(gravity=np.zeros(3), loads=(), surroundings=())
-    first = kc.simulate(still, np.zeros((1, 3)), 1e-6, space="lobatto4")[:1]
+    first = kc.simulate(still, np.zeros((1, 3)), 1e-6, space="lobatto4", initial="unstressed")[:1]
     y, layout = np.array(first.y), first.system.y_layout
     turn = Rotation.from_quat(y[0, :, layout.slice("h")], scalar_first=True)
     spin = np.array([0.0, 0.0, RATE])
@@ -240,7 +240,7 @@ def test_a_rod_in_the_frame_moves_as_one_with_a_turning_base():
         driven = rod(
             **LADEN, nodes=nodes, base_end=Driven(axes=("x", "y", "rz"), position=PLACE, orientation=TILT)
         )
-        one = kc.simulate(seen, np.zeros((STEPS, 0)), TIME / STEPS, space="lobatto4")
+        one = kc.simulate(seen, np.zeros((STEPS, 0)), TIME / STEPS, space="lobatto4", initial="unstressed")
         other = kc.simulate(driven, control, TIME / STEPS, space="lobatto4", initial=carried(driven))
         tip = POINT + turn.apply(one.tip_position[1:] - POINT)
         distances.append(np.max(np.abs(tip - other.tip_position[1:])))
@@ -283,11 +283,10 @@ def test_it_runs_in_batches_has_gradients_and_carries_a_model():
     def moved(rate):
         return kc.simulate(
             rod(SpinningFrame(rate), bending_damping=1e-4, gravity=[1.0, 0.0, 0.0], nodes=6),
-            np.zeros((20, 0)), 0.01,
-        )  # fmt: skip
+            np.zeros((20, 0)), 0.01, initial="unstressed")  # fmt: skip
 
     robots = [moved(rate).system for rate in (3.0, 9.0)]
-    both = kc.simulate(robots, np.zeros((2, 20, 0)), 0.01)
+    both = kc.simulate(robots, np.zeros((2, 20, 0)), 0.01, initial="unstressed")
     np.testing.assert_allclose(both[1].tip_position, moved(9.0).tip_position, rtol=0.0, atol=1e-12)
     step = 1e-4
     slope = jax.grad(lambda rate: moved(rate).tip_position[-1, 0])(9.0)
@@ -297,13 +296,18 @@ def test_it_runs_in_batches_has_gradients_and_carries_a_model():
         lambda leaf: 0.0 * leaf if eqx.is_inexact_array(leaf) else leaf,
         network(robots[1], NetworkOptions(hidden=3), jax.random.PRNGKey(0)),
     )
-    found = kc.simulate(kc.KNODE(robots[0], none).replace(**{"effects.0.rate": 9.0}), np.zeros((20, 0)), 0.01)
+    found = kc.simulate(
+        kc.KNODE(robots[0], none).replace(**{"effects.0.rate": 9.0}),
+        np.zeros((20, 0)),
+        0.01,
+        initial="unstressed",
+    )
     np.testing.assert_allclose(found.tip_position, moved(9.0).tip_position, atol=1e-9)
 
 
 @pytest.mark.slow
 def test_its_rate_is_identified():
     truth = rod(SpinningFrame(7.0), bending_damping=1e-4, gravity=[1.0, 0.0, 0.0], nodes=6)
-    motion = kc.simulate(truth, np.zeros((30, 0)), 0.01)
+    motion = kc.simulate(truth, np.zeros((30, 0)), 0.01, initial="unstressed")
     found = kc.identify(truth.replace(**{"effects.0.rate": 5.0}), [motion], parameters=["effects.0.rate"])
     assert found.robot.effects[0].rate == pytest.approx(7.0, rel=1e-5)

@@ -31,7 +31,7 @@ def rod():
 
 @pytest.fixture(scope="module")
 def whole(rod):
-    return kc.simulate(rod, NONE, DT, space="lobatto4")
+    return kc.simulate(rod, NONE, DT, space="lobatto4", initial="unstressed")
 
 
 @pytest.mark.slow
@@ -63,11 +63,11 @@ def gone_on(rod, before, count, **how):
 @pytest.mark.parametrize("time", ["bdf2", "trapezoidal"])
 def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
     """From rows, from what itself went on, from part of that, from a file, and from a stepper's state."""
-    one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time)
-    first = kc.simulate(rod, NONE[:4], DT, space="lobatto4", time=time)
+    one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time, initial="unstressed")
+    first = kc.simulate(rod, NONE[:4], DT, space="lobatto4", time=time, initial="unstressed")
     second = gone_on(rod, first, 4, time=time)
     second.save(tmp_path / "second.nc")
-    stepper = kc.solvers.Stepper(rod, DT, space="lobatto4", time=time)
+    stepper = kc.solvers.Stepper(rod, DT, space="lobatto4", time=time, initial="unstressed")
     for _ in range(8):
         row = stepper.step(np.zeros(0))
     for before, count in (
@@ -94,10 +94,11 @@ def test_parts_keep_the_states_of_their_own_rows(rod, whole):
 def test_a_whole_motion_goes_on_by_the_state_of_the_solver(rod, time, traced, monkeypatch):
     """Without a replay, with the error estimate of one run, and in one program too."""
     monkeypatch.setattr("knode_cosserat.solvers.initial.replay", None)
-    one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time)
+    one = kc.simulate(rod, NONE, DT, space="lobatto4", time=time, initial="unstressed")
 
     def parted(controls):
-        return gone_on(rod, kc.simulate(rod, controls, DT, space="lobatto4", time=time), 8, time=time)
+        first = kc.simulate(rod, controls, DT, space="lobatto4", time=time, initial="unstressed")
+        return gone_on(rod, first, 8, time=time)
 
     found = (jax.jit(parted) if traced else parted)(NONE[:4])
     np.testing.assert_allclose(found.y, one.y[4:], atol=1e-9)
@@ -152,7 +153,7 @@ def test_derivatives_go_through_rows_without_a_state(rod, whole):
 @pytest.mark.campaign
 def test_what_is_at_the_nodes_beside_a_solution_is_carried_over(rod):
     """States that were changed since are taken as they are."""
-    whole = kc.simulate(rod, NONE, DT, space="lobatto4", time="bdf2")
+    whole = kc.simulate(rod, NONE, DT, space="lobatto4", time="bdf2", initial="unstressed")
     changed = dataclasses.replace(whole, z=whole.z + 1e-3)
     plain, moved = (replay(each, rod).terms for each in (whole, changed))
     # c1 + c2 of BDF2 is -3/2 of 1/dt, whatever the past
@@ -210,7 +211,12 @@ def test_rest_is_rest_at_all_places(space):
 def tips(rod, steps, nodes, until=0.4):
     """Of the second half of a fall, at ten times: what lets go at its beginning has died out."""
     found = kc.simulate(
-        rod.replace(nodes=nodes), np.zeros((steps, 0)), until / steps, space="lobatto4", start="consistent"
+        rod.replace(nodes=nodes),
+        np.zeros((steps, 0)),
+        until / steps,
+        space="lobatto4",
+        start="consistent",
+        initial="unstressed",
     )
     assert np.all(found.result == kc.Result.CONVERGED)
     return found.tip_position[steps // 2 :: steps // 20]
@@ -328,6 +334,8 @@ def test_waves_grow_in_no_time_step(space, time):
 def test_schemes_with_a_memory_of_rates_stay_smooth_along_the_rod(alpha):
     """Where history was interpolated, waves between two nodes grew by up to a half a step."""
     rod = soft_rod().replace(nodes=11)
-    found = kc.simulate(rod, np.zeros((80, 0)), 5e-3, time=kc.solvers.BDFAlpha(alpha), space="lobatto4")
+    found = kc.simulate(
+        rod, np.zeros((80, 0)), 5e-3, time=kc.solvers.BDFAlpha(alpha), space="lobatto4", initial="unstressed"
+    )
     rough = np.abs(np.diff(found.part("q"), n=4, axis=1)).max(axis=(1, 2))
     assert rough[-1] < 0.1 * np.abs(found.part("q")).max()

@@ -105,7 +105,9 @@ def solved(case, space, segments):
         if case == "at rest":
             found = kc.equilibrium(rod, np.zeros(0), space=space)
         else:
-            found = kc.simulate(rod, np.zeros((STEPS, 0)), DT, space=space, start="consistent")
+            found = kc.simulate(
+                rod, np.zeros((STEPS, 0)), DT, space=space, start="consistent", initial="unstressed"
+            )
     assert found.all_valid
     rows = slice(0 if len(found.time) == 1 else 1, None)
     return np.asarray(found.position)[rows], np.asarray(found.position_error)[rows]

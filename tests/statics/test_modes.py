@@ -27,7 +27,12 @@ def beam(end, nodes=40, **changes):
         base_end=Pinned() if end is Universal else Clamped(), **changes,
     )  # fmt: skip
     if end is None:
-        return kc.simulate(rod.replace(base_end=Free(), bending_damping=1e-15), np.zeros((2, 0)), 0.01 * TIME)
+        return kc.simulate(
+            rod.replace(base_end=Free(), bending_damping=1e-15),
+            np.zeros((2, 0)),
+            0.01 * TIME,
+            initial="unstressed",
+        )
     return kc.equilibrium(rod, np.zeros(0))
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, TypeVar
 
 import jax
@@ -14,7 +14,7 @@ from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.counts import counts_of
 from knode_cosserat.engine.linear_step import LinearStep
 from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
-from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, parameters_of
+from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, packed
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StepCoefficients, StepRows
@@ -96,22 +96,22 @@ def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions:
     return Motions(core, packed(system), states, steps)
 
 
-def packed(system: System) -> np.ndarray:
-    """Return the parameters of a system (n,), or of a batch of robots (robots, n)."""
-    if not np.ndim(system.length):
-        return parameters_of(system)
-    leaves = [np.asarray(leaf, float) for leaf in jax.tree.leaves(system)]
-    return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
+def evaluators(system: System, settings: Settings) -> Iterator[Callable[..., Evaluated]]:
+    """Yield a function that evaluates states, for each robot of a batch or for one (see `Core.evaluator`)."""
+    core, memory = core_of(Pattern.of(system), settings, robots=False), None
+    for parameters in np.atleast_2d(packed(system)):
+        memory = core._empty_memory() if memory is None else memory
+        yield core.evaluator(parameters, memory)
 
 
 def evaluator(system: System, settings: Settings) -> Callable[..., Evaluated]:
     """Return a function that evaluates states of a system (see `Core.evaluator`)."""
-    return core_of(Pattern.of(system), settings, robots=False).evaluator(parameters_of(system))
+    return next(evaluators(system, settings))
 
 
 def linear_step(system: System, space: SpaceScheme, control: Any, y: Any) -> LinearStep:
     """Return the linearised step of a system from an equilibrium y at all points, or at the nodes."""
-    return LinearStep(_still_core(system, space), parameters_of(system), control, y)
+    return LinearStep(_still_core(system, space), packed(system), control, y)
 
 
 def has_friction(system: System, space: SpaceScheme) -> bool:

@@ -135,9 +135,11 @@ def _kept_on_disk(
 
 
 @kept
-def parameters_of(system: System) -> np.ndarray:
-    """Return all numeric parameters of a system in one vector."""
-    return np.concatenate([np.asarray(leaf, float).reshape(-1) for leaf in jax.tree.leaves(system)])
+def packed(system: System) -> np.ndarray:
+    """Return the numeric parameters of a system (n,), or of a batch of robots (robots, n)."""
+    axes = np.shape(system.length)
+    leaves = [np.asarray(leaf, float).reshape(*axes, -1) for leaf in jax.tree.leaves(system)]
+    return np.concatenate(leaves, axis=-1)
 
 
 class _PlaceCode:
@@ -187,6 +189,8 @@ class _PlaceCode:
 def values_along(function: Callable[[Any, Any, Any], Any], system: System, s: Any, control: Any = ()) -> Any:
     """Return a function (system, s, control) at places s (n,), in m: its results with one more axis in front.
 
+    A batch of robots has places (robots, n), and results with two more axes.
+
     Raises:
         EngineError: the engine does not cover the function.
     """
@@ -195,4 +199,10 @@ def values_along(function: Callable[[Any, Any, Any], Any], system: System, s: An
         (pattern, function, len(control)), _PlaceCode,
         lambda: _PlaceCode(function, pattern.system, len(control)),
     )  # fmt: skip
-    return code.evaluate(np.concatenate([parameters_of(system), control]), np.asarray(s, dtype=float))
+    s = np.asarray(s, dtype=float)
+    if s.ndim == 1:
+        return code.evaluate(np.concatenate([packed(system), control]), s)
+    found = [
+        code.evaluate(np.append(own, control), places) for own, places in zip(packed(system), s, strict=True)
+    ]
+    return jax.tree.map(lambda *parts: np.stack(parts), *found)

@@ -13,9 +13,9 @@ from jaxtyping import Float
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.control import ControlLimits, Reference
-from knode_cosserat.engine.loops import motions_of, packed
+from knode_cosserat.engine.loops import motions_of
 from knode_cosserat.engine.motions import Motions
-from knode_cosserat.engine.pattern import Pattern
+from knode_cosserat.engine.pattern import Pattern, packed
 from knode_cosserat.envs import dynamics
 from knode_cosserat.envs.dynamics import TENSIONS, Actions, Arrays, EpisodeState, Spec, Transition
 from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError

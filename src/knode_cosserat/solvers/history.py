@@ -21,7 +21,7 @@ from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, places_of, row_of
+from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, row_of
 from knode_cosserat.solvers.result import Result
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
@@ -140,22 +140,24 @@ def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) 
 # histories of one state
 
 
-def unloaded(system: System, space: SpaceScheme) -> tuple[Float[Any, "nodes x"], Float[Any, "places x"]]:
-    """Return y and z of the unloaded system, at the nodes and at all places."""
-    nodes, places = np.linspace(0.0, 1.0, system.nodes) * system.length, places_of(system, space)
-    traced = is_traced(system)
-    numeric: Any = jnp if traced else np
-    s = numeric.concatenate([nodes, places])
-    rest = jax.vmap(system.rest)(s) if traced else values_along(_rest, system, s)
-    found = numeric.concatenate(rest, axis=1)
-    return found[: system.nodes], found[system.nodes :]
+def unloaded(
+    system: System, space: SpaceScheme
+) -> tuple[Float[Any, "... nodes x"], Float[Any, "... places x"]]:
+    """Return y and z of the unloaded system, or of a batch of robots, at the nodes and at all places."""
+    along = np.concatenate([np.linspace(0.0, 1.0, system.nodes), grid_of(system, space).along])
+    if is_traced(system):
+        if np.ndim(system.length):
+            return map_robots(lambda one: unloaded(one, space), system)
+        found: Any = jnp.concatenate(jax.vmap(system.rest)(along * system.length), axis=1)
+    else:
+        rest = values_along(_rest, system, np.multiply.outer(system.length, along))
+        found = np.concatenate(rest, axis=-1)
+    return found[..., : system.nodes, :], found[..., system.nodes :, :]
 
 
 def unloaded_shape(system: System, space: SpaceScheme) -> Any:
     """Return y at all points (points, y) of the unloaded robot, or of a batch of robots."""
-    if np.ndim(system.length):
-        return map_robots(lambda one: unloaded_shape(one, space), system)
-    return unloaded(system, space)[1][: grid_of(system).tip + 1, : system.y_layout.size]
+    return unloaded(system, space)[1][..., : grid_of(system).tip + 1, : system.y_layout.size]
 
 
 def map_robots(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
@@ -173,18 +175,23 @@ def _rest(system: System, s: Any, _: Any) -> Any:
 
 
 @kept
-def rest_record(system: System) -> Float[Any, "nodes x"]:
-    """Return y and z (nodes, y + z) of the system at rest."""
+def rest_record(system: System) -> Float[Any, "... nodes x"]:
+    """Return y and z (nodes, y + z) of the system at rest, or of a batch of robots."""
     return unloaded(system, LOBATTO2)[0]
 
 
 @kept
 def resting_history(system: System, settings: Settings) -> StateHistory:
-    """Return the history of the robot at rest under zero control, at time 0."""
+    """Return the history of the robot at rest under zero control, at time 0, or of a batch of robots."""
     if system.mixed:
-        return constant_history(system, settings, rest_record(system), np.zeros(system.control_layout.size))
+        control = np.zeros(system.control_layout.size)
+
+        def begun(one: System) -> StateHistory:
+            return constant_history(one, settings, rest_record(one), control)
+
+        return map_robots(begun, system) if np.ndim(system.length) else begun(system)
     _, records = unloaded(system, settings.space)
-    y = records[: grid_of(system).tip + 1, : system.y_layout.size]
+    y = records[..., : grid_of(system).tip + 1, : system.y_layout.size]
     return repeated_record_history(system, settings, records, y, 0.0)
 
 
@@ -204,19 +211,25 @@ def constant_history(
 
 
 def repeated_record_history(
-    system: System, settings: Settings, records: Float[Any, "places x"], y: Float[Any, "points y"], t0: Any
+    system: System,
+    settings: Settings,
+    records: Float[Any, "... places x"],
+    y: Float[Any, "... points y"],
+    t0: Any,
 ) -> StateHistory:
-    """Return a history in which all earlier states equal one state."""
+    """Return a history in which all earlier states equal one state, or of a batch of robots."""
     used, memory = used_places(system, settings.space), settings.memory
     numeric: Any = jnp if is_traced((records, y, t0)) else np
+    robots, size = records.shape[:-2], records.shape[-1]
+    weights, t0 = numeric.asarray(EXTRAPOLATIONS[0]), numeric.asarray(t0, dtype=float)
     return StateHistory(
-        numeric.stack([records] * memory),
+        numeric.stack([records] * memory, axis=-3),
         numeric.zeros_like(records),
-        numeric.stack([y] * GUESS_STATES),
-        numeric.asarray(EXTRAPOLATIONS[0]),
-        numeric.asarray(t0, dtype=float),
-        numeric.zeros((memory + 1, used, records.shape[-1])),
-        numeric.zeros((memory, used, records.shape[-1])),
+        numeric.stack([y] * GUESS_STATES, axis=-3),
+        numeric.broadcast_to(weights, (*robots, *weights.shape)),
+        numeric.broadcast_to(t0, robots),
+        numeric.zeros((*robots, memory + 1, used, size)),
+        numeric.zeros((*robots, memory, used, size)),
     )
 
 

@@ -19,8 +19,6 @@ from knode_cosserat.solvers.history import (
     EXTRAPOLATIONS,
     SOLVED,
     SolverState,
-    StateHistory,
-    map_robots,
     rest_record,
     resting_history,
     unloaded_shape,
@@ -99,17 +97,9 @@ def initial_state(
     control = np.zeros(system.control_layout.size) if held is None else np.asarray(held, dtype=float)
     if held is not None or Ends.of(system).rest_is_guess:
         record, result = _settled(system, settings, recovery_budget, control)
-
-        def at_record(system: System, record: Any) -> StateHistory:
-            return at_one_state(system, made, record, control)
-
-        history = map_robots(at_record, system, record) if many else at_record(system, record)
+        history = at_one_state(system, made, record, control)
     else:
-
-        def at_rest(system: System) -> Any:
-            return rest_record(system), resting_history(system, made)
-
-        record, history = map_robots(at_rest, system) if many else at_rest(system)
+        record, history = rest_record(system), resting_history(system, made)
     found = record, SolverState(history), result
     if batch and not many:
         numeric: Any = jnp if is_traced(found) else np

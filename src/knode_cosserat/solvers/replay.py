@@ -27,6 +27,7 @@ from knode_cosserat.solvers.history import (
     at_stages,
     constant_history,
     history_of,
+    map_robots,
     repeated_record_history,
     rest_record,
     resting_history,
@@ -65,12 +66,24 @@ def still_state(system: System, space: SpaceScheme, control: Any, y: Any, t: Any
 
 
 def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> StateHistory:
-    """Return the history of one state (see `constant_history`), in the engine outside of transformations."""
+    """Return the history of one state, or of a batch of robots (see `constant_history`).
+
+    It is found in the engine outside of transformations.
+    """
+    many, space = np.ndim(system.length) > 0, settings.space
     if is_traced((system, row, control, t0)):
-        return constant_history(system, settings, row, control, t0)
-    still = still_state(system, settings.space, control, np.asarray(row)[:, : system.y_layout.size], t0)
-    records = still_records(system, settings.space, np.asarray(row), still)
-    return repeated_record_history(system, settings, records, still.y, t0)
+
+        def constant(one: System, row: Any) -> StateHistory:
+            return constant_history(one, settings, row, control, t0)
+
+        return map_robots(constant, system, row) if many else constant(system, row)
+    nothing, found = no_history(system, space), []
+    evaluate = engine.evaluators(system, Settings(None, space))
+    for own, each in zip(np.asarray(row) if many else [np.asarray(row)], evaluate, strict=True):
+        still = each(0.0, t0, control, nothing, own[:, : system.y_layout.size])
+        found.append((still_records(system, space, own, still), still.y))
+    records, y = map(np.stack, zip(*found, strict=True)) if many else found[0]
+    return repeated_record_history(system, settings, records, y, t0)
 
 
 class _Replay(NamedTuple):

@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 
 from knode_cosserat.engine.equations import is_moving
 from knode_cosserat.engine.loops import at_all_stages, table_of, tangents_for
-from knode_cosserat.engine.pattern import Pattern, parameters_of
+from knode_cosserat.engine.pattern import Pattern, packed
 from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.history import StateHistory, StepCoefficients, used_places
@@ -84,7 +84,7 @@ def tangent_time_loop(
     core = tangents_for(TangentCore, pattern, settings, moving)
     own, d_own = (at_all_stages(system, settings, each) for each in (controls, d_controls))
     table = table_of(steps, len(controls), float(state.t0))
-    parameters, found = parameters_of(system), list[tuple[np.ndarray, np.ndarray]]()
+    parameters, found = packed(system), list[tuple[np.ndarray, np.ndarray]]()
     part = max(len(own) if kept is None else PART // (kept.size * weights.shape[1]), 1)
     for first in range(0, max(len(own), 1), part):
         on = slice(first, first + part)

@@ -15,8 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.rods.ends import Free
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
 from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import (
@@ -66,18 +68,22 @@ def static_batch(
     def walk(i: int) -> _Walk:
         return _Walk(task, jax.tree.map(lambda leaf: leaf[i], system) if many else system)
 
-    alone = {i for i in range(size) if len(walk(i).path(controls[i], last[i])[0]) > task.steps}
+    angles = largest_turns(system, np.diff(np.concatenate([last[:, None], controls], axis=1), axis=1))
+    alone = set(np.flatnonzero(np.max(angles, axis=-1) > LARGEST_TURN * (1.0 + 1e-9)).tolist())
     plain = np.array([i for i in range(size) if i not in alone], dtype=int)
     runs: dict[int, tuple[StepRows, Any, str]] = {}
     if len(plain):
         own = jax.tree.map(lambda leaf: leaf[plain], system) if many else system
         rows, states, causes = run_batch(task, own, controls[plain], (guess[plain], last[plain]))
+        tested = is_tested(system)
         for k, i in enumerate(plain):
             one, state = jax.tree.map(lambda leaf, k=k: leaf[k], (rows, states))
             runs[i] = one, state, causes.get(k, "")
-            solved = np.flatnonzero(walk(i)._testable(one.result))
-            if y is None and any(walk(i).is_unstable(one.records[j], controls[i, j]) for j in solved):
-                alone.add(i)
+            if y is None and tested:
+                walking = walk(i)
+                solved = np.flatnonzero(walking._testable(one.result))
+                if any(walking.is_unstable(one.records[j], controls[i, j]) for j in solved):
+                    alone.add(i)
     for i in alone:
         runs[i] = static_run(task, walk(i).system, controls[i], y, before)
     parts = [runs[i] for i in range(size)]
@@ -98,7 +104,9 @@ class _Walk:
     def from_rest(self, controls: np.ndarray) -> tuple[StepRows, Any, str]:
         """Start from the unloaded shape, or from a curve between ends nearer than the length; test all."""
         y, before = unloaded_shape(self.system, self.task.settings.space), np.zeros_like(controls[0])
-        if "p" in self.system.y_layout.names and strand_count(self.system) == 1:
+        # a rod with a free tip is not compressed
+        free = isinstance(getattr(nominal_model(self.system), "tip_end", None), Free)
+        if not free and "p" in self.system.y_layout.names and strand_count(self.system) == 1:
             p = np.asarray(y)[:, self.system.y_layout.slice("p")]
             self.chord = float(np.linalg.norm(p[-1] - p[0]))
         guess = None
