@@ -95,7 +95,7 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     assert trained_range(loaded.system) is not None
     half = len(controls) // 2
     first = kc.simulate(model, controls[:half], beyond.dt, **PAPER)
-    second = kc.simulate(model, controls[half:], beyond.dt, **PAPER, initial=first)
+    second = kc.simulate(model, controls[half:], beyond.dt, **PAPER | {"initial": first})
     np.testing.assert_array_equal(np.concatenate([first.extrapolated, second.extrapolated[1:]]), marks)
     assert second.extrapolated[0] == first.extrapolated[-1]
     both = kc.simulate(model, np.stack([controls, 0.2 * controls]), beyond.dt, **PAPER)

@@ -62,7 +62,9 @@ def test_what_is_written_is_complete(baseline):
     truth = kc.load_trajectory(baseline / "trajectories/reference-sine.nc")
     robot = kc.load_robot(simulation.ROBOT)
     tensions = kc.controls.sine(1.5, 100, 0.05, sampled="end")
-    again = kc.simulate(robot, tensions, 0.05, time="bdf2", space="euler", start="paper")
+    again = kc.simulate(
+        robot, tensions, 0.05, time="bdf2", space="euler", start="paper", initial="unstressed"
+    )
     np.testing.assert_array_equal(truth.y, again.y[:100])
 
 

@@ -128,8 +128,9 @@ def predict(
     """
     check_arguments(predict, locals())
     robot, measured = fixed(robot), Measurements.of(measured)
-    initial, first = None, measured.tension[0] if measured.static else measured.initial_tension
-    if first is not None:
+    initial: Any = "unstressed" if measured.unstressed else None
+    first = measured.tension[0] if measured.static else measured.initial_tension
+    if first is not None and not measured.unstressed:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     if measured.static:
         return equilibria(

@@ -5,10 +5,8 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -17,12 +15,9 @@ from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
-from knode_cosserat.rods.aspects import Drawing, Ends
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import rest_record
-from knode_cosserat.solvers.initial import initial_state
-from knode_cosserat.solvers.places import Places, places_at, positions_at
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.solvers.initial import begins_unstressed
 from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
@@ -30,9 +25,6 @@ from knode_cosserat.trajectory import Trajectory
 
 #: a rotation counts as the displacement at this part of the length
 ARM = 0.2
-#: a trajectory starts unstressed if its row 0 is nearer to that shape than so many times to the equilibrium,
-#: measurements if it is so many times nearer: a real robot is never unstressed
-UNSTRESSED = 2.0
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,9 +36,8 @@ class Experiment:
         control: from each row to the next (T, c).
         output: kind of the data, with the noise of its errors.
         data: values of the output (T + 1, p); NaN where nothing was measured.
-        held: control of the equilibrium from which it starts (c,); None: it starts unstressed, or from
-            `initial`.
-        initial: rows from which it continues; they must be states without noise.
+        held: control of the equilibrium from which it starts (c,); by default it is zero.
+        initial: "equilibrium"; "unstressed"; or rows from which it continues, states without noise.
         settings: of the simulation.
         name: for messages.
         moves: the first row in motion.
@@ -63,7 +54,7 @@ class Experiment:
     output: Output
     data: Float[np.ndarray, "T+1 p"]
     held: Float[np.ndarray, " c"] | None = None
-    initial: Trajectory | None = None
+    initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium"
     settings: Settings = Settings()
     name: str = "experiment"
     moves: int = 0
@@ -72,6 +63,10 @@ class Experiment:
     steps: int = 1
     readings: bool = False
     accurate: Experiment | None = None
+
+    def __post_init__(self) -> None:
+        if self.held is None and isinstance(self.initial, str) and self.initial == "equilibrium":
+            object.__setattr__(self, "held", np.zeros(np.shape(self.control)[-1]))
 
     @functools.cached_property
     def fields(self) -> tuple[str, ...]:
@@ -118,13 +113,6 @@ class Experiment:
             control=np.concatenate([self.control, np.repeat(self.control[-1:], more, axis=0)]),
             data=np.pad(self.data, ((0, more), (0, 0)), constant_values=np.nan),
         )
-
-
-class _Shapes(NamedTuple):
-    """Positions (m) in row 0 at some places, NaN where nothing was seen; without places, y of all nodes."""
-
-    places: Places | None
-    position: Float[np.ndarray, "M d"]
 
 
 def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto4") -> list[Experiment]:
@@ -197,7 +185,7 @@ def of_measurements(
 ) -> Experiment:
     """Return the experiment of measurements, which start in the equilibrium before row 0.
 
-    Without library effects, a simulation that started unstressed is recognised by its row 0.
+    Those of simulations may have started unstressed (`Measurements.unstressed`).
 
     Raises:
         DataError: too short, unknown controls, nothing seen, or controls of another robot.
@@ -227,14 +215,11 @@ def of_measurements(
     scheme = time_scheme(measured.dt, measured.continuous)
     settings = dataclasses.replace(Settings.of(None, space, "paper", NewtonOptions()), time=scheme)
     output, data = _measured(measured, robot)
-    at_rest = True
-    if not measured.static and np.all(model.prior == 0.0):
-        shapes = _Shapes(places_at(measured.fractions, robot.nodes), measured.position[0])
-        at_rest = not is_unstressed(robot, settings, held, shapes, 1.0 / UNSTRESSED)
-    if not at_rest:
+    if measured.unstressed:
         data[0] = np.nan
     return Experiment(
-        measured.dt, control, output, data, held if at_rest else None, None, settings, name,
+        measured.dt, control, output, data, None if measured.unstressed else held,
+        "unstressed" if measured.unstressed else "equilibrium", settings, name,
         int(moving[0]) if len(moving) and not measured.static else 0, measured.static, measured.continuous,
         steps_per_row(measured.dt, measured.continuous), True,
     )  # fmt: skip
@@ -321,10 +306,10 @@ def of_trajectory(trajectory: Trajectory, robot: System, name: str) -> Experimen
     data = np.concatenate([y.reshape(len(y), -1), z.reshape(len(z), -1)], axis=1)
     if trajectory.time[0] == 0.0:
         held = control[0]
-        shapes = _Shapes(None, y[0])
-        if not np.any(held) and is_unstressed(robot, settings, held, shapes, UNSTRESSED):
-            data[0], held = np.nan, None
-        return Experiment(trajectory.dt, control[1:], output, data, held, None, settings, name)
+        if begins_unstressed(trajectory):
+            data[0] = np.nan
+            return Experiment(trajectory.dt, control[1:], output, data, None, "unstressed", settings, name)
+        return Experiment(trajectory.dt, control[1:], output, data, held, "equilibrium", settings, name)
     first = 3  # the first row with the whole history of its scheme
     if len(y) <= first:
         raise DataError(f"{name} has {len(y)} rows and does not start at rest; at least 4 are needed")
@@ -332,30 +317,6 @@ def of_trajectory(trajectory: Trajectory, robot: System, name: str) -> Experimen
     data[0] = np.nan
     initial = trajectory[:first]
     return Experiment(trajectory.dt, control[first:], output, data, None, initial, settings, name)
-
-
-def is_unstressed(
-    robot: System, settings: Settings, control: Float[np.ndarray, " c"], seen: _Shapes, ratio: float
-) -> bool:
-    """Return True if row 0 shows the unstressed robot rather than its equilibrium under a control.
-
-    The robot is unstressed if the distance to that
-    shape is below `ratio` times the distance to the equilibrium.
-    """
-    if Ends.of(robot).rest_is_guess:
-        return False
-    try:
-        settled = np.asarray(initial_state(robot, settings, held=control).record)
-    except SimulationError:
-        return False
-    size = robot.y_layout.size
-    shapes: Any = jnp.stack([rest_record(robot)[:, :size], settled[:, :size]])
-    if seen.places is None:
-        shapes, target = (np.asarray(Drawing.of(robot).positions(y)) for y in (shapes, seen.position))
-    else:
-        shapes, target = np.asarray(jax.jit(positions_at)(robot, shapes, seen.places)), seen.position
-    apart = np.nansum((shapes - target) ** 2, axis=(1, 2))
-    return bool(np.any(np.isfinite(target)) and apart[0] <= ratio**2 * apart[1])
 
 
 def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
@@ -374,5 +335,5 @@ def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
     return Measurements(
         time=np.asarray(trajectory.time), tension=held, fractions=np.arange(1, nodes) / (nodes - 1),
         position=position[:, 1:], quaternion=quaternion[:, 1:], measured=seen,
-        simulated=True, source=name, initial_tension=control[0],
+        simulated=True, source=name, initial_tension=control[0], unstressed=begins_unstressed(trajectory),
     )  # fmt: skip

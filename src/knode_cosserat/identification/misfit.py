@@ -40,6 +40,7 @@ from knode_cosserat.solvers.run import TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tangents, tangent_time_loop
 from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
+from knode_cosserat.trajectory import Trajectory
 
 #: number of points whose accurate differences are kept, and of those whose derivatives are
 KEPT, DIFFERENTIATED = 8, 2
@@ -284,7 +285,8 @@ class Misfit:
     def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
         """Return the start of an experiment; None if there is no equilibrium."""
         settings, size = data.settings, system.y_layout.size + system.z_layout.size
-        if data.held is None and not (data.initial is None and Ends.of(system).rest_is_guess):
+        named = not isinstance(data.initial, Trajectory)
+        if data.held is None and not (named and Ends.of(system).rest_is_guess):
             return self._moving_start(system, x, data)
         control = (
             np.zeros(system.control_layout.size) if data.held is None else np.asarray(data.held, dtype=float)
@@ -307,7 +309,7 @@ class Misfit:
     def _moving_start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start:
         """Return the start in the unstressed state, or from given rows."""
         settings = data.settings
-        if data.initial is None:
+        if not isinstance(data.initial, Trajectory):
             at_start, rows = initial_state(system, settings), None
         else:
             at_start = continued_state(system, data.initial, settings, data.dt)

@@ -67,7 +67,7 @@ def stepped(
 
 
 def simulated_rows(
-    robot: System, tension: Float[np.ndarray, "T c"], dt: float, start: Trajectory | None,
+    robot: System, tension: Float[np.ndarray, "T c"], dt: float, start: Trajectory | str | None,
     initial: Float[np.ndarray, " c"] | None, continuous: bool, space: str | SpaceScheme,
     recovery: float | None,
 ) -> Trajectory:  # fmt: skip
@@ -77,7 +77,7 @@ def simulated_rows(
         robot: any robot or model.
         tension: from each row to the next.
         dt: time from row to row (s).
-        start: equilibrium from which it moves; None: that under zero control.
+        start: equilibrium from which it moves, or "unstressed"; None: that under zero control.
         initial: tension before the first row; None: the first tension.
         continuous: tensions vary continuously; `Measurements.continuous`.
         space: the scheme along the rod.
@@ -91,6 +91,7 @@ def simulated_rows(
     acting = undelayed(robot, tension, dt / count, initial)
     motion = simulate(
         fixed(robot), acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
-        initial="equilibrium" if start is None else start, recovery_budget=recovery,
+        initial="equilibrium" if start is None else start,  # type: ignore[arg-type]
+        recovery_budget=recovery,
     )  # fmt: skip
     return motion[::count] if count > 1 else motion

@@ -19,6 +19,7 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.streams import Body, Sensor, Tensions
 from knode_cosserat.recordings.table import HELD
 from knode_cosserat.recordings.write import write_recording, writer_of
+from knode_cosserat.solvers.initial import begins_unstressed
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from knode_cosserat.trajectory import Trajectory
 
@@ -57,6 +58,8 @@ class Measurements:
     source: str
     #: tensions before the first row (N): the mean over the preceding rest, if there is one; None: unknown
     initial_tension: Float[np.ndarray, " tendons"] | None = None
+    #: True for a simulation that begins with the unstressed robot; all other motions begin in equilibrium
+    unstressed: bool = False
     #: True if each row is a separate equilibrium under its tensions, not part of a motion
     static: bool = False
     #: True if the tensions are samples of a continuous signal: row i's is then that at the time of row i + 1
@@ -133,6 +136,7 @@ class Measurements:
             simulated=True,
             source=f"simulated {type(system).__name__}",
             initial_tension=initial,
+            unstressed=begins_unstressed(trajectory),
         )
 
     def save(self, path: str | Path) -> None:
@@ -230,7 +234,7 @@ class Measurements:
             for it in self.sensors
         )
         if first:
-            changes["initial_tension"] = None
+            changes |= {"initial_tension": None, "unstressed": False}
         return dataclasses.replace(self, **changes)
 
     def parts(self, shortest: float = 0.0) -> list[Self]:

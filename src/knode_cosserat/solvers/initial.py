@@ -75,6 +75,12 @@ def named_start(
     return "unstressed" if settled > SOLVED**2 and distance(None) < settled else "equilibrium"
 
 
+def begins_unstressed(trajectory: Trajectory) -> bool:
+    """Return True if the rows of a trajectory begin, under zero control, with the unstressed state."""
+    begins = trajectory.time[0] == 0.0 and not np.any(trajectory.control[0])
+    return bool(begins) and named_start(trajectory) == "unstressed"
+
+
 def initial_state(
     system: System,
     settings: Settings,
