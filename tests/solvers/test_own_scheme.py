@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.history import StepCoefficients, TimeStep
+from knode_cosserat.schemes.history import StepCoefficients, TimeStep
+from knode_cosserat.schemes.time import TimeScheme
 from knode_cosserat.solvers.recovery import Budget, StepRecovery
-from knode_cosserat.solvers.time import TimeScheme
 
 
 @dataclasses.dataclass(frozen=True)

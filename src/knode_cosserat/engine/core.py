@@ -23,17 +23,17 @@ from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import StateArrays
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import (
+from knode_cosserat.schemes.history import (
     ESTIMATE_TOLERANCE,
     ESTIMATE_TURNS,
     EXTRAPOLATIONS,
     ROUNDING,
     stage_extrapolations,
 )
-from knode_cosserat.solvers.problem import Evaluated
-from knode_cosserat.solvers.semi_discrete import has_friction
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.time import SDIRK2
+from knode_cosserat.schemes.problem import Evaluated
+from knode_cosserat.schemes.semi_discrete import has_friction
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.time import SDIRK2
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)

@@ -17,11 +17,11 @@ from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, packed
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StepCoefficients, StepRows
-from knode_cosserat.solvers.problem import Evaluated
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import TWO_STAGES
+from knode_cosserat.schemes.history import StepCoefficients, StepRows
+from knode_cosserat.schemes.problem import Evaluated
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.schemes.time import TWO_STAGES
 
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 AnyCode = TypeVar("AnyCode", Core, TangentCore, CotangentCore)

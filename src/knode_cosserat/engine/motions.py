@@ -12,13 +12,8 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.engine.core import ANGLE, CORRECTIONS, ERROR, POSITION, TIME, Core
 from knode_cosserat.engine.memory import Array
-from knode_cosserat.solvers.history import (
-    COARSE_ANGLE,
-    COARSE_SHARE,
-    StepCoefficients,
-    StepRows,
-)
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.history import COARSE_ANGLE, COARSE_SHARE, StepCoefficients, StepRows
+from knode_cosserat.schemes.result import Result
 
 #: largest number of results that are copied to rows at once
 BLOCK = 1 << 17

@@ -21,8 +21,11 @@ from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers import history
-from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.schemes import history
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.time import BDF1, BDF2, padded
 from knode_cosserat.solvers.guess import (
     LARGEST_JUMP,
     LARGEST_TURN,
@@ -31,9 +34,6 @@ from knode_cosserat.solvers.guess import (
     turns_between,
 )
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time import BDF1, BDF2, padded
 
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0

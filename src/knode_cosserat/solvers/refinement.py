@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import SEEN_TURN, ChosenNodes, System, is_traced
-from knode_cosserat.solvers.grid import turn_of_segments
-from knode_cosserat.solvers.history import COARSE_SHARE, StepRows
-from knode_cosserat.solvers.result import Result, SimulationError, Verdict
-from knode_cosserat.solvers.space import Euler, SpaceScheme
+from knode_cosserat.schemes.grid import turn_of_segments
+from knode_cosserat.schemes.history import COARSE_SHARE, StepRows
+from knode_cosserat.schemes.result import Result, SimulationError, Verdict
+from knode_cosserat.schemes.space import Euler, SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: first segments for a position tolerance, and largest number of segments of any grid that is chosen
