@@ -390,7 +390,7 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
         )  # fmt: skip
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
-    one = history.TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
+    one = history.TimeStep(step.past, padded(BDF1().coefficients(dt), settings.memory), step.t[-1])
     # without direct methods: a whole step of one stage would be another scheme's
     divided = StepRecovery(system, settings, one, dt, budget)
     solved = divided.recover((before[-1], now[-1]), has_direct=False)
