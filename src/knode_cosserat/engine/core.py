@@ -55,9 +55,8 @@ class Core(EliminationCode):
     """
 
     def __init__(self, system: System, settings: Settings, robots: bool):
-        self.settings = settings
-        #: weights of the states in the error that a step adds (`TimeScheme.defect`); empty: no estimate
-        self.time_defect = settings.time.defect if settings.time else ()
+        #: settings, and the weights of the time scheme's error (`TimeScheme.defect`); empty: no estimate
+        self.settings, self.time_defect = settings, settings.time.defect if settings.time else ()
         super().__init__(Equations(system, space=settings.space), robots)
         #: true if the code linearises steps of one robot from an equilibrium, too
         self.is_linear_step = bool(self.time_defect) and not robots
@@ -414,7 +413,6 @@ class Core(EliminationCode):
         The last stage adds the scheme's error (`TimeScheme.defect`): only this one reaches back to the last
         row. The equations of the step multiply by J / c0, and damp the vibrations that it does not resolve.
         """
-        e = self.equations
         self.time_history = f = self._function("time_history", "coefficients")
         memory, coefficients = f.arguments
         c0, *earlier = (f.load(coefficients, i) for i in range(self.settings.memory + 1))
@@ -423,7 +421,7 @@ class Core(EliminationCode):
             pairs = zip(earlier, self.time_errors, strict=True)
             return _sum(c * self._wide(error, i, j) for c, error in pairs)
 
-        for i, j in self._components(e.numbers, self._count("used")):
+        for i, j in self._components(self.equations.numbers, self._count("used")):
             self._write_wide(carried(i, j), self.time_dH, i, j)
         with f.if_(f.compare("ne", earlier[self.settings.stages - 1], 0.0)):
             f.call(self.moved, memory)
