@@ -19,9 +19,9 @@ import scipy.linalg
 
 import knode_cosserat as kc
 from knode_cosserat.rods.system import unknowns_of
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.settings import schemes
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.settings import schemes
+from knode_cosserat.schemes.space import SpaceScheme
 
 #: part of the load by which its derivative is taken
 STEP = 1e-4

@@ -152,10 +152,10 @@ def tangents(steps: int = 20, columns: int = 32) -> dict[str, Any]:
     import numpy as np
 
     import knode_cosserat as kc
-    from knode_cosserat.solvers.history import resting_history
+    from knode_cosserat.schemes.settings import Settings
+    from knode_cosserat.solvers.rest import resting_history
     from knode_cosserat.solvers.run import TimeIntegration
     from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
-    from knode_cosserat.solvers.settings import Settings
 
     robot, tensions = kc.load_robot("delrin-tendon-robot"), kc.controls.sine(1.5, steps, DT, sampled="end")
     block = np.eye(columns // 4)[np.arange(steps) * (columns // 4) // steps]

@@ -14,9 +14,10 @@ import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.equations import Equations
-from knode_cosserat.solvers.history import StepCoefficients, resting_history
+from knode_cosserat.schemes.history import StepCoefficients
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.solvers.rest import resting_history
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
 
 DT, STEPS, BATCH, ROUNDS = 0.05, 100, 64, 7
 COLUMNS, TANGENT_STEPS = 32, 20

@@ -14,7 +14,7 @@ import numpy as np
 
 import knode_cosserat as kc
 from benchmarks.cases import DT, PAPER, STEPS, medians
-from knode_cosserat.solvers.space import Euler, Formula, Lobatto2, Lobatto4, SpaceScheme, Stage
+from knode_cosserat.schemes.space import Euler, Formula, Lobatto2, Lobatto4, SpaceScheme, Stage
 
 #: nodes of each scheme, and of the reference
 NODES, FINEST = (10, 20, 40), 97

@@ -21,7 +21,7 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import TendonRobot
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.result import Result
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 from studies import runner, truths

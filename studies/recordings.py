@@ -33,8 +33,8 @@ from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import undelayed
+from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory

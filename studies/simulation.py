@@ -20,7 +20,7 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.loading import load_trajectory
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 from studies import figures, runner

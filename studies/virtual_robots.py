@@ -21,7 +21,7 @@ from knode_cosserat.identification.result import Identified
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.virtual import record_virtual
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.schemes.result import SimulationError
 from studies.report import Report, as_json, markdown_table, write_texts
 from studies.runner import Job, Product, run
 

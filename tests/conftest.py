@@ -18,9 +18,9 @@ from jaxtyping import install_import_hook
 from tests import progress
 
 EQUATIONS = ("rotation", "rods.loads", "rods.section")
-SOLVER = tuple(f"solvers.{name}" for name in ("boundary", "problem", "space", "time", "steps"))
+SCHEMES = ("schemes.problem", "schemes.space", "schemes.time")
 
-install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SOLVER], "beartype.beartype")
+install_import_hook([f"knode_cosserat.{name}" for name in EQUATIONS + SCHEMES], "beartype.beartype")
 
 #: quick to compile: no effort for fast machine code, and for one core each, for the tests keep all of them
 #: busy; set before JAX is imported, and inherited by the programs that tests start

@@ -12,37 +12,15 @@ import knode_cosserat
 
 ROOT = Path(knode_cosserat.__file__).parent
 
-#: packages and modules, each line depends on lines above it and on itself only. The longest prefix counts
-LAYERS = (
-    (
-        "errors",
-        "_arguments",
-        "_blas",
-        "_files",
-        "_jax",
-        "_lazy",
-        "_numbers",
-        "_processes",
-        "_program_cache",
-        "_reprs",
-        "rotation",
-    ),
-    ("io",),
-    ("rods", "robots"),
-    ("controls",),
-    ("solvers", "engine", "trajectory"),
-    ("metrics",),
-    ("recordings", "statics", "estimation"),
-    ("control",),
-    ("learning",),
-    ("loading",),
-    ("identification",),
-    ("evaluation", "figures"),
-    ("viewer", "diagnosis", "sweeps", "envs"),
-    # the public names: `import knode_cosserat`
-    ("",),
-    ("cli",),
+#: small modules that depend on each other only; the longest prefix of a name counts
+BASE = "_arguments _blas _files _jax _lazy _numbers _processes _program_cache _reprs errors rotation"
+#: packages and modules, each depends on those before it only; the empty name is `import knode_cosserat`
+ORDER = (
+    *("io", "rods", "robots", "controls", "schemes", "engine", "trajectory", "solvers", "metrics"),
+    *("estimation", "recordings", "statics", "control", "learning", "loading", "evaluation", "figures"),
+    *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli"),
 )
+LAYERS = (BASE.split(), *([name] for name in ORDER))
 #: folders of the repository beside the package
 REPOSITORY = ("knode_cosserat_hardware", "studies", "benchmarks", "examples", "tools", "tests")
 
@@ -103,6 +81,7 @@ def layer_of(name: str) -> int:
 def test_the_graph_is_that_of_the_package() -> None:
     assert len(GRAPH) > 200
     assert {"rods.system", "solvers.initial", "trajectory"} <= GRAPH["solvers.simulate"]
+    assert "schemes.history" in GRAPH["engine.core"]
     assert "recordings.health" in GRAPH["recordings.recording"]  # within a function
     assert "_jax" in GRAPH[""]
 

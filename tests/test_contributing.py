@@ -36,7 +36,7 @@ def tilt(monkeypatch):
 
 
 def test_each_way_to_extend_the_package_has_an_example():
-    assert len(EXAMPLES) == 6
+    assert len(EXAMPLES) == 8
 
 
 @pytest.mark.parametrize(("code", "file"), EXAMPLES, ids=[file for _, file in EXAMPLES])

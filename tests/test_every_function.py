@@ -19,8 +19,8 @@ from knode_cosserat.learning.structured.residual import CURVED, LINEAR, Structur
 from knode_cosserat.rods.parameters import value_at
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.semi_discrete import History, Point
 from knode_cosserat.viewer import scene as drawing
 
 DT, STEPS = 0.05, 12

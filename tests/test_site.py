@@ -11,7 +11,7 @@ import yaml
 from knode_cosserat.rods import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
-from knode_cosserat.solvers.time import BDFAlpha
+from knode_cosserat.schemes.time import BDFAlpha
 from tools.site import api, changelog, examples, robot_file, source
 
 ROOT = Path(__file__).parents[1]
@@ -19,7 +19,7 @@ DOCS = ROOT / "docs"
 
 
 def test_a_source_is_that_of_the_object():
-    file, line, code = source.found("knode_cosserat.solvers.time.BDFAlpha.coefficients")
+    file, line, code = source.found("knode_cosserat.schemes.time.BDFAlpha.coefficients")
     lines, first = inspect.getsourcelines(BDFAlpha.coefficients)
     assert (file.name, line) == ("time.py", first)
     assert code == textwrap.dedent("".join(lines)).rstrip()
@@ -30,9 +30,9 @@ def test_a_source_is_that_of_the_object():
 @pytest.mark.parametrize(
     "path",
     [
-        "knode_cosserat.solvers.time",
-        "knode_cosserat.solvers.time.BDF7",
-        "knode_cosserat.solvers.time.BDFAlpha.cofficients",
+        "knode_cosserat.schemes.time",
+        "knode_cosserat.schemes.time.BDF7",
+        "knode_cosserat.schemes.time.BDFAlpha.cofficients",
         "knode_cosserat.nowhere.at_all",
     ],
 )

@@ -14,8 +14,8 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.io.container import _LAST_LINE
 from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.solvers.history import SolverState, StateHistory
-from knode_cosserat.solvers.time import TimeScheme
+from knode_cosserat.schemes.history import SolverState, StateHistory
+from knode_cosserat.schemes.time import TimeScheme
 from knode_cosserat.trajectory import TrajectoryFileError
 
 ROBOT = kc.load_robot("delrin-tendon-robot")

@@ -113,14 +113,14 @@ def system_members() -> int:
 def budgets() -> list[Budget]:
     """Return all figures."""
     return [
-        Budget("lines of code of the library", lines_of(LIBRARY), 28_000, 40_230),
+        Budget("lines of code of the library", lines_of(LIBRARY), 28_000, 40_260),
         Budget("lines of code of hardware", lines_of(ROOT / "hardware"), 5_000, 6_190),
-        Budget("lines of code of studies", lines_of(ROOT / "studies"), 4_500, 6_020),
-        Budget("lines of code of tests", lines_of(ROOT / "tests"), 24_000, 34_640),
-        Budget("public classes of the library", public_classes(LIBRARY), 300, 438),
+        Budget("lines of code of studies", lines_of(ROOT / "studies"), 4_500, 6_030),
+        Budget("lines of code of tests", lines_of(ROOT / "tests"), 24_000, 34_680),
+        Budget("public classes of the library", public_classes(LIBRARY), 300, 439),
         Budget("names in namespaces", namespace_names(), 150, 196),
         Budget("members of System", system_members(), 14, 16),
-        Budget("functions with more than 5 parameters", long_signatures(LIBRARY), 60, 61),
+        Budget("functions with more than 5 parameters", long_signatures(LIBRARY), 60, 62),
     ]
 
 

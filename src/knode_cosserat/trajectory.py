@@ -29,9 +29,9 @@ from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, parameters_of, slots_of
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import ChosenNodes, System, is_traced, nodes_text
-from knode_cosserat.solvers.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
-from knode_cosserat.solvers.result import Result, ResultCodes, Verdict, VerdictCodes
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.schemes.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
+from knode_cosserat.schemes.result import Result, ResultCodes, Verdict, VerdictCodes
+from knode_cosserat.schemes.settings import Settings
 
 
 @jax.tree_util.register_dataclass

@@ -23,20 +23,19 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.system import unknown_count
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import (
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import (
     EXTRAPOLATIONS,
     StepCoefficients,
     TimeStep,
     history_of,
     repeated_record_history,
-    resting_history,
-    unloaded_shape,
 )
-from knode_cosserat.solvers.problem import StepProblem, no_history, row_of
+from knode_cosserat.schemes.problem import StepProblem, no_history, row_of
+from knode_cosserat.schemes.settings import NewtonOptions, Settings, schemes
+from knode_cosserat.schemes.space import Formula, SpaceScheme, Stage
 from knode_cosserat.solvers.recovery import Budget, StaticRecovery, StepRecovery
-from knode_cosserat.solvers.settings import NewtonOptions, Settings, schemes
-from knode_cosserat.solvers.space import Formula, SpaceScheme, Stage
+from knode_cosserat.solvers.rest import resting_history, unloaded_shape
 from tests.engine.networks import with_committee, with_network
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}

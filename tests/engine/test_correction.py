@@ -11,9 +11,10 @@ import knode_cosserat as kc
 from knode_cosserat.engine import loops
 from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.rods.tendons import TendonFriction
-from knode_cosserat.solvers.history import StepCoefficients, history_of, resting_history
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.history import StepCoefficients, history_of
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.solvers.rest import resting_history
 from tests.engine.test_core import Stretching, standing_history
 
 DT = 0.05

@@ -8,10 +8,10 @@ from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import unknowns_of
 from knode_cosserat.rods.tendons import TendonFriction
-from knode_cosserat.solvers.history import StepCoefficients, used_places
+from knode_cosserat.schemes.history import StepCoefficients, used_places
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from tests.engine.test_core import Stretching
 from tests.engine.test_tangents import cut_legs
 

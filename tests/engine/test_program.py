@@ -21,8 +21,8 @@ from knode_cosserat.learning.structured.residual import CURVED, Structured, expa
 from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import unknown_count
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import LOBATTO2
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.space import LOBATTO2
 from tests.engine.networks import PAPER, with_committee, with_network
 
 #: operations on arrays that are not those of `FOLDED`

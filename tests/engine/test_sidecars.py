@@ -13,7 +13,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.engine import loops, pattern, sidecars
 from knode_cosserat.engine.tangents import TangentCore
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
 
 CONTROLS = np.random.default_rng(0).uniform(4.0, 8.0, (3, 4))
 SETTINGS = Settings.of("bdf2", "lobatto2", "paper", NewtonOptions())

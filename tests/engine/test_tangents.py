@@ -16,13 +16,14 @@ from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import Discontinuities
+from knode_cosserat.schemes.history import StepCoefficients, history_of
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import LOBATTO2
 from knode_cosserat.solvers import rollout, sensitivity
-from knode_cosserat.solvers.history import StepCoefficients, history_of, resting_history, unloaded_shape
-from knode_cosserat.solvers.problem import StepProblem
+from knode_cosserat.solvers.rest import resting_history, unloaded_shape
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, tangent_time_loop
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import LOBATTO2
 from tests.engine.networks import with_committee, with_network
 from tests.engine.test_core import LEGS, Stretching, displacements, standing_history
 from tests.engine.test_program import with_curved_law

@@ -16,7 +16,7 @@ from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.aspects import Ends
-from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.solvers.segments import DataError
 from tests.identification.motions import DT, FOUR, ROBOT, noisy, sines
 from tests.learning.bar import BAR, WRONG, Bar, pulled

@@ -20,7 +20,7 @@ from knode_cosserat.identification.steps import (
     steps_per_row,
     time_scheme,
 )
-from knode_cosserat.solvers.time import BDF2, SDIRK2
+from knode_cosserat.schemes.time import BDF2, SDIRK2
 from tests.identification.recorded import measured, tensions
 
 ROBOT = kc.load_robot("delrin-tendon-robot")

@@ -16,8 +16,8 @@ from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import network
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.aspects import Observed
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.semi_discrete import History, Point
 from studies.recordings import _paper_motion
 
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(nodes=5)

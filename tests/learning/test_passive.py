@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.learning.passive import passive
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.semi_discrete import History, Point
 
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(bending_damping=1e-3, nodes=5)
 TENSION = np.array([7.0, 5.0, 3.0, 5.0])

@@ -10,7 +10,7 @@ from hypothesis.extra.numpy import arrays
 from jax.scipy.linalg import block_diag
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.semi_discrete import History, Point, derivatives
+from knode_cosserat.schemes.semi_discrete import History, Point, derivatives
 
 NUMBERS = st.floats(-1, 1, allow_subnormal=False)
 

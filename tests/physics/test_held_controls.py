@@ -11,9 +11,9 @@ import pytest
 from scipy.linalg import expm
 
 import knode_cosserat as kc
+from knode_cosserat.schemes.history import StepCoefficients, history_of
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.damping import LongStepWarning
-from knode_cosserat.solvers.history import StepCoefficients, history_of
-from knode_cosserat.solvers.settings import Settings
 
 # an oscillator, whose motion under held and under linear controls is known
 

@@ -10,10 +10,10 @@ from scipy.special import ellipk
 import knode_cosserat as kc
 from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding, Universal
 from knode_cosserat.rods.surroundings import Plane
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.time import BDF2
 from knode_cosserat.solvers.recovery import likely_cause
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time import BDF2
 
 G = 9.81
 

@@ -5,8 +5,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rods.relaxation import Relaxation
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.semi_discrete import History, Point
 
 BODY = {
     "length": 0.1, "radius": 0.015, "density": 1070.0, "youngs_modulus": 2.6e5, "nodes": 6,

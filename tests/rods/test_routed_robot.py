@@ -12,7 +12,7 @@ from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.robot_file import format_robot, parse_robot
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import TendonFriction, Vibration
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.result import Result
 
 KNOWLEDGE = kc.load_robot("delrin-tendon-robot")
 NO_LOADS = {"gravity": [0.0, 0.0, 0.0], "drag": 0.0}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knode_cosserat.rods.tendons import STRAIGHT, TendonFriction, Vibration
-from knode_cosserat.solvers.discrete_law import evolved
+from knode_cosserat.schemes.discrete_law import evolved
 
 REACH = 0.1
 FRICTION = TendonFriction(wobble=0.6, curvature=0.1, reach=REACH)

@@ -9,11 +9,11 @@ from hypothesis import given
 from hypothesis import settings as given_settings
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.grid import Grid, at_places, grid_of, taken
-from knode_cosserat.solvers.history import constant_history, rest_record
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.settings import Settings, schemes
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.grid import Grid, at_places, grid_of, taken
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.settings import Settings, schemes
+from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.solvers.rest import constant_history, rest_record
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 CUTS = st.lists(st.floats(1e-3, 1.0 - 1e-3), min_size=1, max_size=8, unique=True)

@@ -10,13 +10,13 @@ import pytest
 import knode_cosserat as kc
 from benchmarks.motions import soft_rod
 from examples.hanging_string import HangingString
-from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.history import resting_history, still_records
+from knode_cosserat.schemes.grid import at_places, grid_of
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.settings import Settings, schemes
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.initial import continued_state
-from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.replay import replay
-from knode_cosserat.solvers.settings import Settings, schemes
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.solvers.rest import resting_history, still_records
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 DT = 0.02

@@ -1,15 +1,17 @@
-"""A scheme in time of three steps, defined by its coefficients alone: the example of CONTRIBUTING.md."""
+"""Schemes in time of three steps and of three stages, a class each: the examples of CONTRIBUTING.md."""
 
 import dataclasses
 
 import jax
 import numpy as np
 import pytest
+from scipy.linalg import expm
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.history import StepCoefficients, TimeStep
+from knode_cosserat.schemes.history import StepCoefficients, TimeStep
+from knode_cosserat.schemes.time import SDIRK, TimeScheme
 from knode_cosserat.solvers.recovery import Budget, StepRecovery
-from knode_cosserat.solvers.time import TimeScheme
+from tests.physics.test_closed_forms import Bar
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,6 +33,19 @@ class BDF3(TimeScheme):
         return *c, 0.0
 
 
+#: root of γ³ - 3γ² + 3γ/2 - 1/6, for which the scheme is L-stable (Alexander 1977)
+G = 0.43586652150845967
+
+
+@dataclasses.dataclass(frozen=True)
+class SDIRK3(SDIRK):
+    """The scheme of three stages and order 3, with an estimate of its error."""
+
+    name = "sdirk3"
+    order = 3
+    tableau = ((G,), ((1.0 - G) / 2.0, G), (-1.5 * G**2 + 4.0 * G - 0.25, 1.5 * G**2 - 5.0 * G + 1.25, G))
+
+
 SECONDS = 0.8
 ROBOT = kc.load_robot("delrin-tendon-robot").replace(bending_damping=0.05)
 
@@ -41,6 +56,11 @@ def pulled(count):
     controls = np.zeros((count, 4))
     controls[:, 0] = 5.0 * np.sin(np.pi * t / SECONDS) ** 4
     return controls, SECONDS / count
+
+
+@pytest.fixture(params=["bdf3", "sdirk3"])
+def time(request):
+    return request.param
 
 
 def moved(count, time="bdf3", **options):
@@ -66,33 +86,54 @@ def test_its_order_is_three():
     assert np.all(orders > 2.8), orders
 
 
+@pytest.mark.parametrize(("time", "order"), [("sdirk2", 2), ("sdirk3", 3)])
+def test_a_tableau_has_its_order_and_the_estimate_of_its_error(time, order):
+    """Against the closed form of a bar's standing wave under a load that is held."""
+    bar, s, largest = Bar(damping=0.1, nodes=41), np.linspace(0.0, 1.0, 41), []
+    square = bar.wave_number**2
+    matrix = np.array([[0.0, 1.0, 0.0], [-square, -bar.damping * square, 1.0], [0.0, 0.0, 0.0]])
+    for count in (20, 40):
+        found = kc.simulate(bar, np.ones((count, 1)), 1.0 / count, time=time, space="lobatto4")
+        exact = np.array([expm(matrix * t)[0, 2] for t in found.time])
+        errors = found.part("p")[..., 0] - s - exact[:, None] * np.sin(bar.wave_number * s)
+        largest.append(np.abs(errors).max())
+        assert found.time_error[1:].max() == pytest.approx(largest[-1], rel=0.1)
+    assert np.log2(largest[0] / largest[1]) == pytest.approx(order, abs=0.1)
+
+
+@pytest.mark.parametrize("tableau", [((0.5,), (0.5, 0.5)), ((G,), (1.0 - G, 0.5)), ((1.0,),)])
+def test_a_tableau_of_another_order_is_refused(tableau):
+    with pytest.raises(ValueError, match="Wrong: the tableau has not order 2; allowed are two or more rows"):
+        type("Wrong", (SDIRK,), {"order": 2, "tableau": tableau})
+
+
 @pytest.mark.parametrize("cut", [1, 2, 5])
-def test_a_motion_continues_exactly(cut, tmp_path):
+def test_a_motion_continues_exactly(cut, time, tmp_path):
     controls, dt = pulled(8)
-    whole = moved(8)
-    kc.simulate(ROBOT, controls[:cut], dt, time="bdf3", initial="equilibrium").save(tmp_path / "part.nc")
+    whole = moved(8, time)
+    kc.simulate(ROBOT, controls[:cut], dt, time=time, initial="equilibrium").save(tmp_path / "part.nc")
     part = kc.load_trajectory(tmp_path / "part.nc")
-    rest = kc.simulate(ROBOT, controls[cut:], dt, time="bdf3", initial=part)
+    rest = kc.simulate(ROBOT, controls[cut:], dt, time=time, initial=part)
     np.testing.assert_allclose(rest.y[1:], whole.y[cut + 1 :], rtol=0.0, atol=1e-7)
-    cut_later = kc.simulate(ROBOT, controls[cut:], dt, time="bdf3", initial=whole[: cut + 1])
+    cut_later = kc.simulate(ROBOT, controls[cut:], dt, time=time, initial=whole[: cut + 1])
     np.testing.assert_allclose(cut_later.y[1:], whole.y[cut + 1 :], rtol=0.0, atol=1e-7)
 
 
-def test_steps_one_at_a_time_and_a_batch_are_the_same():
+def test_steps_one_at_a_time_and_a_batch_are_the_same(time):
     controls, dt = pulled(6)
-    stepper = kc.solvers.Stepper(ROBOT, dt, time="bdf3", initial="equilibrium")
+    stepper = kc.solvers.Stepper(ROBOT, dt, time=time, initial="equilibrium")
     rows = np.stack([stepper.step(control).y[0] for control in controls])
-    both = kc.simulate(ROBOT, np.stack([controls] * 2), dt, time="bdf3", initial="equilibrium")
-    for y in (rows, both.y[1, 1:]):
-        np.testing.assert_allclose(y, moved(6).y[1:], rtol=0.0, atol=1e-7)
+    batch = kc.simulate(ROBOT, np.stack([controls] * 2), dt, time=time, initial="equilibrium")
+    for y in (rows, batch.y[1, 1:]):
+        np.testing.assert_allclose(y, moved(6, time).y[1:], rtol=0.0, atol=1e-7)
 
 
-def test_gradients_are_those_of_differences():
+def test_gradients_are_those_of_differences(time):
     controls, dt = pulled(6)
 
     def tip(modulus):
         robot = ROBOT.replace(youngs_modulus=modulus)
-        return kc.simulate(robot, controls, dt, time="bdf3", initial="equilibrium").tip_position[-1, 0]
+        return kc.simulate(robot, controls, dt, time=time, initial="equilibrium").tip_position[-1, 0]
 
     modulus, step = float(ROBOT.youngs_modulus), 1e4
     differences = (tip(modulus + step) - tip(modulus - step)) / (2.0 * step)
@@ -102,16 +143,13 @@ def test_gradients_are_those_of_differences():
 
 def test_a_step_may_be_divided():
     (controls, dt), whole = pulled(80), moved(80)
-    before = whole[:41]
-    state, settings = (
-        kc.simulate(ROBOT, controls[:40], dt, time="bdf3", initial="equilibrium").final_state,
-        whole.settings,
-    )
+    settings, begun = whole.settings, controls[:40]
+    state = kc.simulate(ROBOT, begun, dt, time="bdf3", initial="equilibrium").final_state
     step = TimeStep.of(StepCoefficients.of(settings, dt, 3), state.history, 0)
     recovery = StepRecovery(ROBOT, settings, step, dt, Budget(None))
     result, found = recovery.last_method((controls[39], controls[40]))
     assert result == kc.Result.RECOVERED_STEP_HALVING
     # the substeps' errors are of another size, and the first is made by BDF1
     np.testing.assert_allclose(found.row.records[:, :3], whole.y[41, :, :3], atol=2e-4)
-    assert np.max(np.abs(whole.y[41, :, :3] - before.y[-1, :, :3])) > 1e-3
+    assert np.max(np.abs(whole.y[41, :, :3] - whole.y[40, :, :3])) > 1e-3
     np.testing.assert_array_equal(found.state.records[1:], state.history.records[:2])

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.solvers.history import TimeStep, resting_history
+from knode_cosserat.schemes.history import TimeStep
+from knode_cosserat.schemes.settings import MEASURED
 from knode_cosserat.solvers.recovery import Budget, StepRecovery
-from knode_cosserat.solvers.settings import MEASURED
+from knode_cosserat.solvers.rest import resting_history
 from tests.trajectories import HOPELESS
 
 DT = 0.05

@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.rods.system import ChosenNodes
+from knode_cosserat.schemes.result import Verdict
+from knode_cosserat.schemes.space import LOBATTO2
 from knode_cosserat.solvers import refinement
-from knode_cosserat.solvers.result import Verdict
-from knode_cosserat.solvers.space import LOBATTO2
 
 ROBOTS = kc.robots
 LENGTH, MODULUS, RADIUS, ARM = 0.3, 5e10, 1e-3, 0.01

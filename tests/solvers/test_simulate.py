@@ -12,10 +12,11 @@ import knode_cosserat as kc
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendons import TendonFriction, Vibration
-from knode_cosserat.solvers.grid import at_places
-from knode_cosserat.solvers.history import advanced, history_of, resting_history
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.schemes.grid import at_places
+from knode_cosserat.schemes.history import advanced, history_of
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.solvers.rest import resting_history
 from tests.trajectories import HOPELESS, synthetic
 
 DT = 0.05

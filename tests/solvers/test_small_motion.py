@@ -10,7 +10,7 @@ from scipy.special import ellipe, ellipk
 
 import knode_cosserat as kc
 from knode_cosserat.rods.tendons import TendonFriction
-from knode_cosserat.solvers.result import Verdict
+from knode_cosserat.schemes.result import Verdict
 
 r = kc.robots
 L, A, E, RHO = 1.0, 0.004, 1e8, 1000.0

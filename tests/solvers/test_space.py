@@ -8,8 +8,8 @@ import pytest
 
 import knode_cosserat as kc
 from benchmarks.motions import soft_rod
-from knode_cosserat.solvers.settings import schemes
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.settings import schemes
+from knode_cosserat.schemes.space import SpaceScheme
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 LOBATTO = ("lobatto2", "lobatto4")

@@ -10,7 +10,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.aspects import Observed
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.schemes.settings import Settings
 from studies import comparisons, data_efficiency, simulation
 from studies.comparisons import NodePoses, NoKnowledge, compared, linear_predictor
 from studies.data_efficiency import as_markdown, figure, rerun

@@ -208,7 +208,7 @@ def test_a_sensor_that_the_stand_in_has_not_is_refused(rubbing):
 @pytest.mark.parametrize("damping", [0.03, 0.003])
 def test_a_sine_is_that_of_our_equations(damping):
     """A sine of 1 s, 2 N: the tip within 0.3 % of the length at all times."""
-    from knode_cosserat.solvers.time import LIGHTLY_DAMPED
+    from knode_cosserat.schemes.time import LIGHTLY_DAMPED
 
     robot, dt = ROBOT.replace(bending_damping=damping), 0.0025
     time = np.arange(0.0, 3.0, dt)[:, None]

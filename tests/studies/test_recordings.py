@@ -14,7 +14,7 @@ from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.write import write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import TendonFriction
-from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.schemes.result import Result, SimulationError
 from studies import recordings as study
 from studies.__main__ import app
 from studies.recordings import repetitions, table_of

@@ -7,7 +7,7 @@ from typing import Any
 
 import griffe
 
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.result import Result
 
 
 class Fields(griffe.Extension):

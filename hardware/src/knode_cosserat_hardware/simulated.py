@@ -14,7 +14,7 @@ from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.control.commands import mean_part, remaining_part
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions, final_output
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat_hardware.driver import (

@@ -21,7 +21,7 @@ from typer.core import TyperCommand, TyperGroup
 
 from knode_cosserat.cli.output import printable
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.schemes.result import SimulationError
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

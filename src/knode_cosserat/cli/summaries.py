@@ -8,7 +8,7 @@ import numpy as np
 
 from knode_cosserat.rods.system import ChosenNodes, nodes_text
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.result import Result, Verdict
+from knode_cosserat.schemes.result import Result, Verdict
 
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System

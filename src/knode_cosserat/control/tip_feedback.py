@@ -11,7 +11,7 @@ from knode_cosserat.control.commands import Command, Controller, ControlLimits, 
 from knode_cosserat.control.lqr import PRELOAD
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import NewtonOptions
+from knode_cosserat.schemes.settings import NewtonOptions
 from knode_cosserat.statics.arguments import static_settings
 from knode_cosserat.statics.response import first_solved, respond, tip_pose
 

@@ -1,6 +1,6 @@
 """The time loop of a rod as machine code: history, Newton's method, estimates of errors.
 
-The mathematics is that of `solvers`: a mono-implicit Runge-Kutta scheme along the rod, corrections damped by
+The mathematics is that of `schemes`: a mono-implicit Runge-Kutta scheme along the rod, corrections damped by
 the natural monotonicity test with factors that are kept, and corrected motions whose distances are the
 estimated errors of the grid and of the time scheme.
 """
@@ -23,17 +23,16 @@ from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.rod import StateArrays
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import (
+from knode_cosserat.schemes.history import (
     ESTIMATE_TOLERANCE,
     ESTIMATE_TURNS,
     EXTRAPOLATIONS,
     ROUNDING,
     stage_extrapolations,
 )
-from knode_cosserat.solvers.problem import Evaluated
-from knode_cosserat.solvers.semi_discrete import has_friction
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.time import SDIRK2
+from knode_cosserat.schemes.problem import Evaluated
+from knode_cosserat.schemes.semi_discrete import has_friction
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
 
 #: numbers of a solved stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
@@ -56,10 +55,11 @@ class Core(EliminationCode):
     """
 
     def __init__(self, system: System, settings: Settings, robots: bool):
-        self.settings, self.scheme = settings, settings.time
+        #: settings, and the weights of the time scheme's error (`TimeScheme.defect`); empty: no estimate
+        self.settings, self.time_defect = settings, settings.time.defect if settings.time else ()
         super().__init__(Equations(system, space=settings.space), robots)
         #: true if the code linearises steps of one robot from an equilibrium, too
-        self.is_linear_step = isinstance(settings.time, SDIRK2) and not robots
+        self.is_linear_step = bool(self.time_defect) and not robots
         #: true if there is no linearisation at rest
         self.has_friction = self.is_linear_step and has_friction(system)
         e = self.equations
@@ -90,7 +90,7 @@ class Core(EliminationCode):
         self.defect, self.own_defect, self.rest = (a(ny, "pieces") for _ in range(3))
         self.tip_rest = a(k)
         # products of derivatives, for the error of the time scheme
-        self.difference, self.move, self.time_dH = (a(numbers, "used") for _ in range(3))
+        self.move, self.time_dH = (a(numbers, "used") for _ in range(2))
         self.tangents = StateArrays(a(ny, "ends"), a(ny, "used between"), a(nz, "used"), a(ny, "used"))
         self.dfe = a(ny, "pieces") if self.near else self.tangents.f
         self._write()
@@ -410,31 +410,25 @@ class Core(EliminationCode):
     def _write_time_history(self) -> None:
         """History terms of the time scheme's errors, of a checked stage.
 
-        A step of y' = J y + … adds a multiple of dt³ J² y'. The difference of the rates at both stages is one
-        of dt J y'. The equations of the step multiply it once more by J, and damp the vibrations that a step
-        does not resolve.
+        The last stage adds the scheme's error (`TimeScheme.defect`): only this one reaches back to the last
+        row. The equations of the step multiply by J / c0, and damp the vibrations that it does not resolve.
         """
-        e, scheme = self.equations, self.scheme
-        assert isinstance(scheme, SDIRK2)
         self.time_history = f = self._function("time_history", "coefficients")
         memory, coefficients = f.arguments
         c0, *earlier = (f.load(coefficients, i) for i in range(self.settings.memory + 1))
 
         def carried(i: int, j: Index) -> Value:
-            return _sum(
-                c * self._wide(error, i, j) for c, error in zip(earlier, self.time_errors, strict=True)
-            )
+            pairs = zip(earlier, self.time_errors, strict=True)
+            return _sum(c * self._wide(error, i, j) for c, error in pairs)
 
-        for i, j in self._components(e.numbers, self._count("used")):
+        for i, j in self._components(self.equations.numbers, self._count("used")):
             self._write_wide(carried(i, j), self.time_dH, i, j)
-        with f.if_(f.compare("ne", earlier[1], 0.0)):
-            # the difference of the rates at both stages, and its product with the equations' derivatives
-            for i, j in self._components(e.numbers, self._count("used")):
-                self._write_wide(-c0 * self._wide(self.difference, i, j), self.move, i, j)
+        with f.if_(f.compare("ne", earlier[self.settings.stages - 1], 0.0)):
             f.call(self.moved, memory)
+            # J / c0 times the defect: its product with the derivatives of the step, less the defect itself
             for i, j, product in self._numbers_of(self.tangents, "used between"):
-                once = product - self._wide(self.difference, i, j)
-                self._write_wide(carried(i, j) - c0 * scheme.defect * once, self.time_dH, i, j)
+                added = -c0 * product - self._wide(self.move, i, j)
+                self._write_wide(carried(i, j) + added, self.time_dH, i, j)
 
     def _write_moved(self) -> None:
         """Changes of a linearised step by `move` of the history: of the solution, and of its record."""
@@ -531,18 +525,17 @@ class Core(EliminationCode):
         return state | {int(node): self._wide(self.move, i, place) for i, node in enumerate(e.dhistory[0])}
 
     def _write_records(self) -> None:
-        """Shift the records by one step; the rate and the stages' difference of rates need the old ones."""
+        """Shift the records by one step; the rate and the scheme's defect need the old ones."""
         e, f = self.equations, self._now
         coefficients = f.arguments[-1]
         c0 = f.load(coefficients, 0)
         newest = self._evaluated_at(self.y)
-        if isinstance(self.scheme, SDIRK2):
+        if self.time_defect:
             with f.if_(f.arguments[1] > 1):
-                of_rate = 1.0 / c0
                 for i, j, value in self._numbers_of(newest, "used between"):
-                    rate = value + self._wide(self.H, i, j) * of_rate
-                    step = self._wide(self.records[0], i, j) - self._wide(self.records[1], i, j)
-                    self._write_wide(rate - step, self.difference, i, j)
+                    states = [value, *(self._wide(record, i, j) for record in self.records)]
+                    found = _sum(w * state for w, state in zip(self.time_defect, states, strict=True) if w)
+                    self._write_wide(-c0 * found, self.move, i, j)
         self._write_shift(self.records, self._count("count"))
         for i, j, value in self._numbers_of(newest, "between"):
             self._write_wide(value, self.records[0], i, j)
@@ -639,7 +632,7 @@ class Core(EliminationCode):
         self._write_base(self.unknowns, self.y, self.H)
         f.call(self.solve, memory, numbers)
         f.call(self.check, memory, estimates, numbers, coefficients)
-        if isinstance(self.scheme, SDIRK2):
+        if self.time_defect:
             with f.if_(estimates > 1):
                 f.call(self.time_history, memory, coefficients)
         with f.if_(estimates > 0), f.if_(~self._is_moving(coefficients)):
@@ -651,9 +644,9 @@ class Core(EliminationCode):
                 for i, j in self._components(e.numbers, self._count("used")):
                     value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
                     self._write_wide(value, self.error_rate, i, j)
-        if isinstance(self.scheme, SDIRK2):
+        if self.time_defect:
             with f.if_(estimates > 1):
-                f.call(self.corrected_in_time, memory, numbers)
+                f.call(self.in_time, memory, numbers)
         solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
         alive = f.load(numbers, ALIVE * P, P)
         f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
@@ -768,13 +761,10 @@ class Core(EliminationCode):
         self._write_check()
         self.corrected = self._write_corrected("corrected", self.errors, self.dH, True, POSITION)
         self._write_static_errors()
-        if isinstance(self.scheme, SDIRK2):
+        if self.time_defect:
             self._write_products()
             self._write_moved()
-        if isinstance(self.scheme, SDIRK2):
-            self.corrected_in_time = self._write_corrected(
-                "in_time", self.time_errors, self.time_dH, False, TIME
-            )
+            self.in_time = self._write_corrected("in_time", self.time_errors, self.time_dH, False, TIME)
             self._write_time_history()
         self._write_stage()
         self._write_guesses()

@@ -15,8 +15,8 @@ import numpy as np
 from knode_cosserat.engine.codegen import vector_lanes
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.grid import Grid, grid_of
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.grid import Grid, grid_of
+from knode_cosserat.schemes.space import SpaceScheme
 
 #: segments of a strand in the smallest room, and the ratio of one room to the next
 SMALLEST, RATIO = 32, 4

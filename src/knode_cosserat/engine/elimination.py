@@ -24,7 +24,7 @@ from knode_cosserat.engine.codegen import Function, Index, Value, Variable
 from knode_cosserat.engine.equations import Elimination, Equations
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
-from knode_cosserat.solvers.problem import FILLING
+from knode_cosserat.schemes.problem import FILLING
 
 #: columns that are solved side by side: each operation of a column waits for the one before
 COLUMNS = 2

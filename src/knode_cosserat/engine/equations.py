@@ -18,9 +18,9 @@ import numpy as np
 from knode_cosserat.engine.program import LARGEST_PRODUCT, PRODUCTS, Program
 from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.problem import StepProblem
-from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
 
 RUN, STEP, PLACE, STATE = 1, 2, 3, 4
 #: largest number of operations: LLVM's time grows faster than their number, to minutes for a large network

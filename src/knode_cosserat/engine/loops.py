@@ -17,11 +17,10 @@ from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, packed
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StepCoefficients, StepRows
-from knode_cosserat.solvers.problem import Evaluated
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import TWO_STAGES
+from knode_cosserat.schemes.history import StepCoefficients, StepRows
+from knode_cosserat.schemes.problem import Evaluated
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.space import SpaceScheme
 
 AnyTangents = TypeVar("AnyTangents", TangentCore, CotangentCore)
 AnyCode = TypeVar("AnyCode", Core, TangentCore, CotangentCore)
@@ -35,7 +34,7 @@ def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
     Raises:
         EngineError: the engine does not cover the system or the settings.
     """
-    schemes = Settings(settings.time or TWO_STAGES, settings.space)
+    schemes = Settings(settings.time or Settings.time, settings.space)
     build = functools.partial(Core, pattern.in_room.system, schemes, robots)
     core = compiled((pattern.in_room, schemes, robots), Core, build, _given(schemes))
     return _on_grid(core, pattern)
@@ -43,7 +42,7 @@ def core_of(pattern: Pattern, settings: Settings, robots: bool) -> Core:
 
 def _given(settings: Settings) -> dict[str, Any]:
     """Return the attributes of a core that are no data of its own."""
-    return {"settings": settings, "scheme": settings.time, "space": settings.space, "on_grids": {}}
+    return {"settings": settings, "space": settings.space, "on_grids": {}}
 
 
 def _on_grid(core: AnyCode, pattern: Pattern) -> AnyCode:

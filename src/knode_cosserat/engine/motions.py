@@ -12,13 +12,8 @@ from jaxtyping import Float, Int
 
 from knode_cosserat.engine.core import ANGLE, CORRECTIONS, ERROR, POSITION, TIME, Core
 from knode_cosserat.engine.memory import Array
-from knode_cosserat.solvers.history import (
-    COARSE_ANGLE,
-    COARSE_SHARE,
-    StepCoefficients,
-    StepRows,
-)
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.history import COARSE_ANGLE, COARSE_SHARE, StepCoefficients, StepRows
+from knode_cosserat.schemes.result import Result
 
 #: largest number of results that are copied to rows at once
 BLOCK = 1 << 17
@@ -260,7 +255,8 @@ class Motions:
         result = np.where(self._is_fine(off, angle, ends[:, 1:]), CONVERGED, COARSE)
         result = np.where(error <= self.steps.settings.newton.acceptable, result, NOT_SOLVED)
         result[np.arange(result.shape[1]) > done[:, None]] = int(Result.NOT_REACHED)
-        time_error = numbers[..., -1, TIME] if numbers.shape[2] > 1 else np.full(off.shape, np.nan)
+        is_whole = core.time_defect and numbers.shape[2] == core.settings.stages
+        time_error = numbers[..., -1, TIME] if is_whole else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
         found = StepRows(
             rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,

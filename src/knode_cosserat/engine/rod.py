@@ -15,7 +15,7 @@ from knode_cosserat.engine.codegen import Function, Index, Stores, Sums, Value, 
 from knode_cosserat.engine.counts import Counts
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory
-from knode_cosserat.solvers.space import Stage
+from knode_cosserat.schemes.space import Stage
 
 
 class StateArrays(NamedTuple):

@@ -22,7 +22,7 @@ from knode_cosserat.engine.equations import Nonzeros, TangentEquations
 from knode_cosserat.engine.linear import Add, Columns, Loop, Number, Operation, Scale, Show, write
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.schemes.settings import Settings
 
 #: number of the argument of a step's function that is the memory of a state; records follow
 STATE = 1

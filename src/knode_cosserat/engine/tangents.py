@@ -20,7 +20,7 @@ from knode_cosserat.engine.linear import Add, Columns, Number, write
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.step_map import COLUMNS, STATE, StepMap
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.schemes.settings import Settings
 
 
 class SolvedSteps(NamedTuple):

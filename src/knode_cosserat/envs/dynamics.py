@@ -24,11 +24,11 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot, rotation_matrix
-from knode_cosserat.solvers.history import StateHistory
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.history import StateHistory
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.settings import Settings
 
 Actions = Literal["tension", "increment"]
 

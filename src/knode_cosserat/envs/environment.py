@@ -22,10 +22,10 @@ from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.guess import LARGEST_JUMP, largest_turns
 from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.run import usable_cores
-from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import checked_dt
 
 #: robot of an environment by default

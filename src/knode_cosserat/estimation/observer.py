@@ -16,8 +16,8 @@ from knode_cosserat.estimation.parameters import Adapted, adapted_model
 from knode_cosserat.estimation.rollback import Rollback
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import used_places
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import used_places
 from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.simulate import check_initial, checked_dt
 from knode_cosserat.trajectory import Trajectory

@@ -23,11 +23,11 @@ from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParametrisedRobot
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import EXTRAPOLATIONS, StateHistory, StepCoefficients, StepRows
-from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import EXTRAPOLATIONS, StateHistory, StepCoefficients, StepRows
+from knode_cosserat.schemes.problem import no_history
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.settings import Settings
 
 #: schemes of a simulated plant; nobody reads the errors of an observer's steps
 STEPS = Settings(errors=False)

@@ -12,7 +12,7 @@ from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers import semi_discrete
+from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.solvers.segments import Samples, samples, start_point
 from knode_cosserat.trajectory import Trajectory
 

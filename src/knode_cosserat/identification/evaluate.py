@@ -20,11 +20,11 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first
+from knode_cosserat.schemes.result import SimulationError
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
 from knode_cosserat.solvers.refinement import fixed
-from knode_cosserat.solvers.result import SimulationError
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: seconds that recovery may take before a prediction has failed

@@ -17,10 +17,10 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
 from knode_cosserat.solvers.initial import begins_unstressed
 from knode_cosserat.solvers.segments import DataError
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: a rotation counts as the displacement at this part of the length

@@ -33,8 +33,8 @@ from knode_cosserat.learning.states import BEST, fit_states, require_allowed
 from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.segments import DataError
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)

@@ -40,8 +40,8 @@ from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import TendonRod
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.segments import DataError
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)

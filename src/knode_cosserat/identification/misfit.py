@@ -27,18 +27,13 @@ from knode_cosserat.identification.steps import stepped
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.tendons import LoadCells
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.history import (
-    StateHistory,
-    at_stages,
-    constant_history,
-    rest_record,
-    resting_history,
-)
+from knode_cosserat.schemes.history import StateHistory, at_stages
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.initial import continued_state, initial_state
 from knode_cosserat.solvers.replay import at_one_state
+from knode_cosserat.solvers.rest import constant_history, rest_record, resting_history
 from knode_cosserat.solvers.run import TimeIntegration, run_one, usable_cores
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tangents, tangent_time_loop
-from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_run
 from knode_cosserat.trajectory import Trajectory
 

@@ -16,7 +16,7 @@ from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.search import Search
 from knode_cosserat.identification.trials import moved
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.schemes.result import SimulationError
 
 #: longest experiment (s), periods of sines (s), and for how long each random control is held (s)
 LONGEST, PERIODS, HELD = 8.0, (1.0, 3.0), 0.4

@@ -24,7 +24,7 @@ from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import PARTS, POSITIVE, Passive
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.space import SpaceScheme
 
 #: standard deviation of a number's prior, by the part of the residual
 WIDTHS = {"stiffness": 0.2, "levers": 0.3, "energy": 0.2, "damping": 1.0, "dissipation": 1.0}

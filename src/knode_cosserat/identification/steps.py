@@ -16,10 +16,10 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import undelayed
+from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.schemes.time import BDF2, LIGHTLY_DAMPED, TWO_STAGES, TimeScheme
 from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import BDF2, LIGHTLY_DAMPED, TWO_STAGES, TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: longest time step between rows with continuous tensions (s), and most steps from row to row

@@ -15,10 +15,10 @@ from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import undelayed
 from knode_cosserat.rods.trained_range import TrainedRange
+from knode_cosserat.schemes.result import Result, SimulationError
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.refinement import fixed
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: amplitudes of the recordings' tensions about their initial ones

@@ -34,9 +34,9 @@ from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import Wrapped
-from knode_cosserat.solvers import semi_discrete, space, time
-from knode_cosserat.solvers.semi_discrete import History, Point
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
+from knode_cosserat.schemes import semi_discrete, space, time
+from knode_cosserat.schemes.semi_discrete import History, Point
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
 
 
 class About:

@@ -30,8 +30,8 @@ from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import nominal_model
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.segments import Dataset, samples, strand_samples
-from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 

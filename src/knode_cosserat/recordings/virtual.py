@@ -20,9 +20,9 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.rods.tendon_robots import TendonRod, VirtualRobot
+from knode_cosserat.schemes.time import LIGHTLY_DAMPED
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
-from knode_cosserat.solvers.time import LIGHTLY_DAMPED
 from knode_cosserat.trajectory import Trajectory
 
 #: one gram-force (N)

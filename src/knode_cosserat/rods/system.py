@@ -4,7 +4,7 @@
 
 A system defines the layouts of y and z, these terms (or y_s and z directly), the boundary conditions at base
 and tip, and the unknowns at the base. It does not depend on the nodes in between, time steps or solvers: its
-equations receive rates in time, which a solver forms (`solvers.semi_discrete`).
+equations receive rates in time, which a solver forms (`schemes.semi_discrete`).
 """
 
 from __future__ import annotations

@@ -14,12 +14,15 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import StepRows
+from knode_cosserat.schemes.result import Result, Verdict
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.energy import is_tested
-from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import state_from_positions
-from knode_cosserat.solvers.history import StepRows, unloaded_shape
 from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refined, resampled
-from knode_cosserat.solvers.result import Result, Verdict
+from knode_cosserat.solvers.rest import unloaded_shape
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
     TimeIntegration,
@@ -29,7 +32,6 @@ from knode_cosserat.solvers.run import (
     warn_of_results,
     warn_outside_rod_theory,
 )
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import (
     check_initial,
     check_tolerance,
@@ -38,7 +40,6 @@ from knode_cosserat.solvers.simulate import (
     stacked,
 )
 from knode_cosserat.solvers.small_motion import stable_near, verdicts
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
 

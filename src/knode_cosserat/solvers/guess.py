@@ -18,8 +18,8 @@ from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import rest_record
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.solvers.rest import rest_record
 
 #: fewest positions that define a curve, and number of positions along a curve between held ends
 FEWEST, POINTS = 2, 65

@@ -14,21 +14,15 @@ from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, is_traced
 from knode_cosserat.rods.trained_range import without_range
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import (
-    EXTRAPOLATIONS,
-    SOLVED,
-    SolverState,
-    rest_record,
-    resting_history,
-    unloaded_shape,
-)
-from knode_cosserat.solvers.problem import no_history, row_of
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import EXTRAPOLATIONS, SolverState
+from knode_cosserat.schemes.problem import no_history, row_of
+from knode_cosserat.schemes.result import Result, SimulationError
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.replay import at_one_state, carried, history_settings, replay, state_of_rows
-from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.rest import SOLVED, rest_record, resting_history, unloaded_shape
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import InitialState, TimeIntegration, failure, warn_of_results
-from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.static_run import static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
 

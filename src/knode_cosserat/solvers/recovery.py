@@ -21,8 +21,11 @@ from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.parts import eased
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers import history
-from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.schemes import history
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.time import BDF1, BDF2, padded
 from knode_cosserat.solvers.guess import (
     LARGEST_JUMP,
     LARGEST_TURN,
@@ -31,9 +34,6 @@ from knode_cosserat.solvers.guess import (
     turns_between,
 )
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.time import BDF1, BDF2, padded
 
 #: smallest load step of continuation, as a part of the change of control
 LEAST_PART = 1.0 / 512.0
@@ -390,7 +390,7 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
         )  # fmt: skip
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
-    one = history.TimeStep(step.past, BDF1().coefficients(dt), step.t[-1])
+    one = history.TimeStep(step.past, padded(BDF1().coefficients(dt), settings.memory), step.t[-1])
     # without direct methods: a whole step of one stage would be another scheme's
     divided = StepRecovery(system, settings, one, dt, budget)
     solved = divided.recover((before[-1], now[-1]), has_direct=False)

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.rods.system import SEEN_TURN, ChosenNodes, System, is_traced
-from knode_cosserat.solvers.grid import turn_of_segments
-from knode_cosserat.solvers.history import COARSE_SHARE, StepRows
-from knode_cosserat.solvers.result import Result, SimulationError, Verdict
-from knode_cosserat.solvers.space import Euler, SpaceScheme
+from knode_cosserat.schemes.grid import turn_of_segments
+from knode_cosserat.schemes.history import COARSE_SHARE, StepRows
+from knode_cosserat.schemes.result import Result, SimulationError, Verdict
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: first segments for a position tolerance, and largest number of segments of any grid that is chosen
@@ -66,7 +66,7 @@ def refined(
     """
     if tolerance is not None:
         robot = on_grid(robot, ChosenNodes(FIRST_SEGMENTS + 1))
-    may = tolerance is not None or (has_chosen(robot) and not isinstance(space, Euler) and not stays)
+    may = tolerance is not None or (has_chosen(robot) and not space.is_reproduction and not stays)
     first, before = nodes_of(robot) - 1, None
     while True:
         segments = nodes_of(robot) - 1
@@ -187,5 +187,5 @@ def mark_unseen(system: System, rows: StepRows) -> StepRows:
 
 
 def is_too_coarse(space: SpaceScheme, results: Any) -> Any:
-    """True for results on a grid that is too coarse for verdicts; Euler's only reproduce the paper."""
-    return (np.asarray(results) == int(Result.COARSE)) & (not isinstance(space, Euler))
+    """True for results on a grid that is too coarse for verdicts; not of schemes that only reproduce."""
+    return (np.asarray(results) == int(Result.COARSE)) & (not space.is_reproduction)

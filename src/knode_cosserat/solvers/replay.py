@@ -17,25 +17,27 @@ from jaxtyping import Float
 
 from knode_cosserat.engine import loops as engine
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.history import (
+from knode_cosserat.schemes.grid import at_places, grid_of
+from knode_cosserat.schemes.history import (
     EXTRAPOLATIONS,
     SolverState,
     StateHistory,
     StepCoefficients,
     advanced,
     at_stages,
-    constant_history,
     history_of,
-    map_robots,
     repeated_record_history,
+)
+from knode_cosserat.schemes.problem import Evaluated, StepProblem, no_history, row_of
+from knode_cosserat.schemes.settings import MEASURED, Settings
+from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.solvers.rest import (
+    constant_history,
+    map_robots,
     rest_record,
     resting_history,
     still_records,
 )
-from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, row_of
-from knode_cosserat.solvers.settings import MEASURED, Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: row 0 is the state at rest if it differs by less than this (natural units)

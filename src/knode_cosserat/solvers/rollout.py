@@ -27,8 +27,8 @@ from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, SolvedSteps, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory, StepRows, no_rows, used_places
-from knode_cosserat.solvers.problem import no_history
+from knode_cosserat.schemes.history import StateHistory, StepRows, no_rows, used_places
+from knode_cosserat.schemes.problem import no_history
 from knode_cosserat.solvers.run import TimeIntegration
 
 Arrays = Sequence[Any]

@@ -26,23 +26,22 @@ from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import SEEN_TURN, System, is_traced
-from knode_cosserat.solvers.grid import grid_of, turn_of_segments
-from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, materials, turns_between, turns_within
-from knode_cosserat.solvers.history import (
+from knode_cosserat.schemes.grid import grid_of, turn_of_segments
+from knode_cosserat.schemes.history import (
     COARSE_ANGLE,
     COARSE_SHARE,
     SolverState,
     StepCoefficients,
     StepRows,
     TimeStep,
-    map_robots,
     no_rows,
 )
+from knode_cosserat.schemes.result import Result, SimulationError
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, materials, turns_between, turns_within
 from knode_cosserat.solvers.recovery import Budget, SolvedStep, StaticRecovery, StepRecovery, recovered_stages
 from knode_cosserat.solvers.refinement import mark_unseen
-from knode_cosserat.solvers.result import Result, SimulationError
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Euler
+from knode_cosserat.solvers.rest import map_robots
 
 log = logging.getLogger(__name__)
 
@@ -238,9 +237,9 @@ def carried_results(result: Any, before: Any) -> Any:
 
 
 def warn_of_coarse_grids(system: System, settings: Settings, rows: StepRows) -> None:
-    """Warn of rows with a large discretisation error; not for Euler, which only reproduces the paper."""
+    """Warn of rows with a large discretisation error; not for schemes that only reproduce results."""
     coarse = np.asarray(rows.result) == Result.COARSE
-    if not np.any(coarse) or isinstance(settings.space, Euler):
+    if not np.any(coarse) or settings.space.is_reproduction:
         return
     errors, length = np.asarray(rows.position_error)[coarse], float(np.max(system.length))
     lost, worst = (

@@ -23,13 +23,13 @@ from jaxtyping import Float
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.strands import in_strands, strand_count
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import ON_NODE, at_places, grid_of, inside
-from knode_cosserat.solvers.history import coefficient_table, history_of
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.grid import ON_NODE, at_places, grid_of, inside
+from knode_cosserat.schemes.history import coefficient_table, history_of
+from knode_cosserat.schemes.semi_discrete import History, Point, records_in_strands, unpacked_history
+from knode_cosserat.schemes.settings import MEASURED, Settings
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.replay import replay, replayed_settings
-from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
-from knode_cosserat.solvers.settings import MEASURED, Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 

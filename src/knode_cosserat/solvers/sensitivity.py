@@ -20,10 +20,10 @@ from knode_cosserat.engine.loops import at_all_stages, table_of, tangents_for
 from knode_cosserat.engine.pattern import Pattern, packed
 from knode_cosserat.engine.tangents import SolvedSteps, TangentCore
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.history import StateHistory, StepCoefficients, used_places
-from knode_cosserat.solvers.problem import no_history
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.history import StateHistory, StepCoefficients, used_places
+from knode_cosserat.schemes.problem import no_history
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.space import SpaceScheme
 
 #: most numbers of tangents that are kept at once if few are needed: as many as a cache holds
 PART = 500_000

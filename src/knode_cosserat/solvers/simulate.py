@@ -17,9 +17,12 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.system import ChosenNodes, System, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import StateHistory, StepRows, at_stages, no_rows
+from knode_cosserat.schemes.settings import Errors, NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.schemes.time import TimeScheme
 from knode_cosserat.solvers.damping import warn_if_undamped, warn_of_long_steps
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import StateHistory, StepRows, at_stages, no_rows
 from knode_cosserat.solvers.initial import STARTS, start_of
 from knode_cosserat.solvers.refinement import (
     Solved,
@@ -42,10 +45,7 @@ from knode_cosserat.solvers.run import (
     warn_of_coarse_grids,
     warn_outside_rod_theory,
 )
-from knode_cosserat.solvers.settings import Errors, NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.solvers.static_run import static_run
-from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: shortest and longest time steps (s): shorter ones are lost in rounding errors of the times

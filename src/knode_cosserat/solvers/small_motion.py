@@ -15,13 +15,13 @@ from knode_cosserat.engine.linear_step import LinearStep
 from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.strands import of_rods, strand_of
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.history import StepRows, repeated_record_history, used_places
+from knode_cosserat.schemes.result import Result, Verdict
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
-from knode_cosserat.solvers.history import StepRows, repeated_record_history, used_places
 from knode_cosserat.solvers.refinement import is_too_coarse
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.solvers.result import Result, Verdict
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.settings import Settings
 
 #: vectors side by side; most vectors for each factor that is wanted
 BLOCK, MOST = 16, 16

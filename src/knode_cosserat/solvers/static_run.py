@@ -19,8 +19,10 @@ from knode_cosserat.rods.ends import Free
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import StepRows
+from knode_cosserat.schemes.result import Result
 from knode_cosserat.solvers.energy import RodEnergy, is_tested
-from knode_cosserat.solvers.grid import grid_of
 from knode_cosserat.solvers.guess import (
     LARGEST_TURN,
     curve_guesses,
@@ -28,9 +30,8 @@ from knode_cosserat.solvers.guess import (
     largest_turns,
     turns_between,
 )
-from knode_cosserat.solvers.history import StepRows, unloaded_shape
 from knode_cosserat.solvers.refinement import is_too_coarse
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.solvers.rest import unloaded_shape
 from knode_cosserat.solvers.run import TimeIntegration, run_batch, run_one
 
 #: number of times that a change of control is divided where turns are lost, and parts of each division

@@ -12,16 +12,16 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.schemes.history import SolverState, StateHistory, StepRows, at_stages
+from knode_cosserat.schemes.result import Result, SimulationError
+from knode_cosserat.schemes.settings import Errors, NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.schemes.time import TimeScheme
 from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, turns_between, turns_within
-from knode_cosserat.solvers.history import SolverState, StateHistory, StepRows, at_stages
 from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.recovery import Budget
-from knode_cosserat.solvers.result import Result, SimulationError
 from knode_cosserat.solvers.run import TimeIntegration, carried_results, rows_of
-from knode_cosserat.solvers.settings import Errors, NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
-from knode_cosserat.solvers.space import SpaceScheme
-from knode_cosserat.solvers.time import TimeScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: function that returns a solved step's row and the state of the solver after it

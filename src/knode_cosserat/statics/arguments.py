@@ -9,8 +9,8 @@ import numpy as np
 from knode_cosserat._numbers import real_array
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
 
 
 def static_settings(space: str | SpaceScheme, newton: NewtonOptions) -> Settings:

@@ -10,9 +10,9 @@ import numpy as np
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import quantity, wrapped
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.settings import NewtonOptions
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refined
-from knode_cosserat.solvers.settings import NewtonOptions
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, static_settings
 from knode_cosserat.statics.response import Pose, first_solved, tip_pose
 

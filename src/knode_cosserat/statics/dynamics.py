@@ -11,10 +11,11 @@ from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.strands import of_rods, strand_count, strand_of
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.grid import grid_of
-from knode_cosserat.solvers.history import repeated_record_history, used_places
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.history import repeated_record_history, used_places
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import Lobatto4
 from knode_cosserat.solvers.run import TimeIntegration
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.small_motion import (
     NEUTRAL,
     RATE,
@@ -23,7 +24,6 @@ from knode_cosserat.solvers.small_motion import (
     largest_eigenvalues,
     natural_time,
 )
-from knode_cosserat.solvers.space import Lobatto4
 
 #: nodes of the two grids that are compared: for robots of at most as many nodes as the finer one, or the last
 GRIDS = ((11, 21), (21, 41))

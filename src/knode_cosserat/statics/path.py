@@ -22,12 +22,12 @@ from tqdm import tqdm
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.system import System, unknowns_of
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import checked_control, static_settings
 from knode_cosserat.statics.response import node_values
 from knode_cosserat.statics.stability import stability

@@ -23,10 +23,10 @@ from knode_cosserat._reprs import packed_text, quantity, wrapped
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.result import Code, Codes, Result, SimulationError
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refined
-from knode_cosserat.solvers.result import Code, Codes, Result, SimulationError
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics.arguments import (
     checked_control,
     checked_limits,

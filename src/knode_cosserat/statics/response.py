@@ -16,13 +16,13 @@ import numpy as np
 
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, unknown_count
-from knode_cosserat.solvers.history import rest_record, unloaded_shape
-from knode_cosserat.solvers.problem import row_of
+from knode_cosserat.schemes.problem import row_of
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.replay import still_state
+from knode_cosserat.solvers.rest import rest_record, unloaded_shape
 from knode_cosserat.solvers.run import TimeIntegration
 from knode_cosserat.solvers.sensitivity import Changes, static_tangents
-from knode_cosserat.solvers.settings import Settings
 
 #: function from a system and its last node's y to position (d,) in m and quaternion (scalar first) or None
 Pose = Callable[[System, Any], tuple[Any, Any]]

@@ -30,13 +30,13 @@ from knode_cosserat.rods.aspects import Observed
 from knode_cosserat.rods.strands import in_strands, of_rods, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.rods.wrapped import nominal_model
+from knode_cosserat.schemes.problem import StepProblem
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.space import Lobatto4, SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.problem import StepProblem
 from knode_cosserat.solvers.refinement import fixed
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import Lobatto4, SpaceScheme
 from knode_cosserat.statics.dynamics import displacements, linearised_modes, normalised
 from knode_cosserat.statics.stiffness import NEEDED, Pieces, divided, firm, joined, narrow, symmetric, wide
 from knode_cosserat.trajectory import Trajectory

@@ -24,10 +24,10 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, unknowns_of
-from knode_cosserat.solvers.grid import grid_of, inside
-from knode_cosserat.solvers.problem import StepProblem, no_history
+from knode_cosserat.schemes.grid import grid_of, inside
+from knode_cosserat.schemes.problem import StepProblem, no_history
+from knode_cosserat.schemes.space import Lobatto4
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.solvers.space import Lobatto4
 
 #: fields of y that a strand with pose and stress needs
 NEEDED = ("p", "h", "n", "m")

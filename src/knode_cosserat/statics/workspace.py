@@ -18,12 +18,12 @@ from knode_cosserat.controls import titles
 from knode_cosserat.io import container
 from knode_cosserat.io.container import Variable
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.result import Result, ResultCodes
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.refinement import fixed
-from knode_cosserat.solvers.result import Result, ResultCodes
 from knode_cosserat.solvers.run import usable_cores
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.statics import arguments
 from knode_cosserat.statics.response import Pose, equilibrium_poses, tip_pose
 

@@ -12,7 +12,7 @@ import numpy as np
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import count_of, quantity, wrapped
 from knode_cosserat.errors import first_line
-from knode_cosserat.solvers.result import ResultCodes
+from knode_cosserat.schemes.result import ResultCodes
 from knode_cosserat.sweeps._description import SweepError
 from knode_cosserat.sweeps._folder import read_manifest, shard_numbers, shard_path
 from knode_cosserat.sweeps._shards import read_shard, require_pyarrow

@@ -25,7 +25,7 @@ from knode_cosserat.rods.parameters import owner_at, parameter_at
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.settings import NewtonOptions, Settings
+from knode_cosserat.schemes.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import checked_dt
 from knode_cosserat.sweeps._description import Range, RobotEntry, Sweep, SweepError, value_count, values_at
 from knode_cosserat.sweeps._sampling import case_seeds, unit_points

@@ -21,11 +21,12 @@ from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.history import SolverState, rest_record
+from knode_cosserat.schemes.history import SolverState
+from knode_cosserat.schemes.result import Result, SimulationError
 from knode_cosserat.solvers.initial import initial_state, start_of
 from knode_cosserat.solvers.recovery import likely_cause
 from knode_cosserat.solvers.replay import at_one_state, history_settings
-from knode_cosserat.solvers.result import Result, SimulationError
+from knode_cosserat.solvers.rest import rest_record
 from knode_cosserat.solvers.run import (
     InitialState,
     TimeIntegration,

@@ -31,7 +31,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.result import SimulationError
+from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.live import PATIENCE, PageSession, require_websockets, sequence_of
 from knode_cosserat.viewer.pages import Opening, checked_port, document, serve_page, write_page

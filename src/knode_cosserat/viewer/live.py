@@ -29,8 +29,8 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.result import SimulationError
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer.pages import Opening, checked_port, document, serve_page

@@ -25,7 +25,7 @@ from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers.result import Result
+from knode_cosserat.schemes.result import Result
 from knode_cosserat.trajectory import Trajectory
 
 #: largest number of trajectories in a view

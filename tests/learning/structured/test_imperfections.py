@@ -10,8 +10,8 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.rotation import rotation_matrix
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.semi_discrete import History, Point
 from studies import imperfections, truths
 from studies.imperfections import as_markdown, figure, missed, ratios, rerun
 

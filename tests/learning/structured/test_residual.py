@@ -13,8 +13,8 @@ from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.explain import explain
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.fit import residuals_of
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.semi_discrete import History, Point
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.semi_discrete import History, Point
 from studies import truths
 from tests.learning.bar import BAR, pulled
 

@@ -47,8 +47,9 @@ from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknowns_of
 from knode_cosserat.rods.wrapped import with_length_factor
 from knode_cosserat.rotation import rotation_matrix
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import ON_NODE
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.grid import ON_NODE
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.segments import (
     Dataset,
     Samples,
@@ -62,7 +63,6 @@ from knode_cosserat.solvers.segments import (
     tip_point,
     undivided,
 )
-from knode_cosserat.solvers.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
 #: number of repeated solves with states between nodes: each reduces the error to a hundredth

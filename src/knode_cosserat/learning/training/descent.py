@@ -29,11 +29,11 @@ from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import rotation_matrix
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import grid_of
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.semi_discrete import Point
+from knode_cosserat.schemes.space import Euler, SpaceScheme
 from knode_cosserat.solvers.segments import Dataset, Samples, end_point, predict_segment, start_point
-from knode_cosserat.solvers.semi_discrete import Point
-from knode_cosserat.solvers.space import Euler, SpaceScheme
 
 #: largest number of epochs in one call of the program
 PIECE = 50

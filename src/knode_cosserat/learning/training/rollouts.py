@@ -23,9 +23,9 @@ from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training import runs
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
+from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.initial import named_start
 from knode_cosserat.solvers.segments import DataError, samples, settings_of
-from knode_cosserat.solvers.settings import Settings
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 

@@ -17,10 +17,10 @@ from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.rods.parts import Contribution
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.history import coefficient_table
-from knode_cosserat.solvers.semi_discrete import History, Point
-from knode_cosserat.solvers.settings import Settings
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.history import coefficient_table
+from knode_cosserat.schemes.semi_discrete import History, Point
+from knode_cosserat.schemes.settings import Settings
 
 #: required fields of a rod's state: known from poses, known from the balance, and the strains
 KNOWN, LOADS, STRAINS = ("p", "h", "q", "w"), ("n", "m"), ("v", "u")

@@ -19,8 +19,8 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.recordings.streams import Body
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.settings import MEASURED, Settings
-from knode_cosserat.solvers.space import Euler
+from knode_cosserat.schemes.settings import MEASURED, Settings
+from knode_cosserat.schemes.space import Euler
 from knode_cosserat.trajectory import Trajectory
 
 Method = Literal["best", "paper"]

@@ -3,9 +3,9 @@
     y_t,n = c0 y_n + ʰy,     ʰy = c1 y_{n-1} + c2 y_{n-2} + … + d1 y_t,{n-1}
 
 A scheme is defined by its coefficients, of as many earlier states as its `memory`. Consecutive steps may
-differ in length, so that a step can be halved. A one-step scheme of several stages solves one such problem a
-stage; the earlier states are then those of the stage before and of the last row. A scheme with a `name` can
-be chosen by it.
+differ in length, so that a step can be halved. A one-step scheme of several stages (`SDIRK`) is defined by
+its tableau, and solves one such problem a stage; the earlier states are then those of the stages before and
+of the last row. A scheme with a `name` can be chosen by it.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import abc
 import dataclasses
 import math
 from typing import ClassVar
+
+import numpy as np
 
 #: c0, c1, c2, … in 1/s and d1 (no unit) of one step
 Coefficients = tuple[float, ...]
@@ -31,6 +33,9 @@ class TimeScheme(abc.ABC):
     uses_rate = False
     #: ends of the stages as parts of a step; multistep schemes have one stage
     ends: ClassVar[tuple[float, ...]] = (1.0,)
+    #: weights of the states (newest first) in a sum d: a step of y_t = J y adds the error J d / c0; empty: no
+    #: estimate
+    defect: ClassVar[tuple[float, ...]] = ()
 
     @property
     @abc.abstractmethod
@@ -56,34 +61,57 @@ class TimeScheme(abc.ABC):
 
 
 @dataclasses.dataclass(frozen=True)
-class SDIRK2(TimeScheme):
-    """The singly diagonally implicit Runge-Kutta scheme of two stages, L-stable and stiffly accurate.
+class SDIRK(TimeScheme):
+    """A singly diagonally implicit Runge-Kutta scheme, stiffly accurate, defined by its tableau and order.
 
-    Order 2 for controls that are held in each step, because no step remembers the one before (Alexander 1977,
-    γ = 1 - √½). Both stages have the same c0.
+    No step remembers the one before. All stages have the same c0 = 1 / (γ dt), so that they share factors.
+    The error estimate is that of the leading error of y_t = J y, dt^(p+1) J^p y_t with the order p. The
+    equations of the step supply the last J, and damp the vibrations that a step does not resolve.
     """
 
-    name = "sdirk2"
-    order = 2
-    #: γ, and the end of the step
-    ends: ClassVar[tuple[float, ...]] = (1.0 - math.sqrt(0.5), 1.0)
+    #: weights of the rates, a row a stage: γ is the last of each, and the last row is the step's own
+    tableau: ClassVar[tuple[tuple[float, ...], ...]]
+    #: γ dt times the rate at each stage, by the states (newest first)
+    rates: ClassVar[np.ndarray]
 
-    @property
-    def defect(self) -> float:
-        """Error that a step of y' = J y adds, as a multiple of (γ dt J)² (difference of Y between stages)."""
-        gamma = self.ends[0]
-        return (3.0 * gamma**2 - 2.0 * gamma**3 - 1.0 / 6.0) / (gamma**2 * (1.0 - gamma))
+    def __init_subclass__(cls) -> None:
+        count, order = len(cls.tableau), int(cls.order)  # type: ignore[call-overload]
+        A = np.array([[*row, *[0.0] * (count - len(row))] for row in cls.tableau])
+        # y at stage i is Σ (A^k 1)_i dt^k J^k y, and in the exact motion Σ dt^k J^k y / k!
+        powers = np.array([np.linalg.matrix_power(A, k).sum(axis=1) for k in range(order + 2)])
+        excess = powers[:, -1] - [1.0 / math.factorial(k) for k in range(order + 2)]
+        gamma = A[-1, -1]
+        if count < 2 or gamma <= 0.0 or np.any(np.diag(A) != gamma) or np.any(abs(excess[:-1]) > 1e-9):
+            allowed = "two or more rows of 1, 2, … weights that end in one γ, the last row for the step"
+            raise ValueError(f"{cls.__name__}: the tableau has not order {order}; allowed are {allowed}")
+        # combined so that only the power dt^(order - 1) of the rates remains
+        wanted = np.append(np.zeros(order - 1), excess[-1] / gamma**2)
+        R = gamma * np.linalg.inv(A)
+        defect = np.linalg.lstsq(powers[:order], wanted)[0] @ R
+        cls.memory, cls.ends = count, tuple(powers[1].tolist())
+        cls.rates = np.array([[*row[i::-1], -row.sum(), *[0.0] * (count - 1 - i)] for i, row in enumerate(R)])
+        cls.defect = tuple(np.append(defect[::-1], -defect.sum()).tolist())
 
     def coefficients(self, dt: float, *previous: float) -> Coefficients:
         """Return those of BDF2, for rows whose stages are not known."""
         return BDF2().coefficients(dt, *previous)
 
     def stages(self, dt: float) -> tuple[Coefficients, ...]:
-        """Return the coefficients of both stages of a step of dt (s)."""
-        gamma = self.ends[0]
-        c0 = 1.0 / (gamma * dt)
-        second = c0 * (1.0 - gamma) / gamma
-        return (c0, -c0, 0.0, 0.0), (c0, -second, second - c0, 0.0)
+        """Return the coefficients of all stages of a step of dt (s)."""
+        c0 = 1.0 / (self.tableau[-1][-1] * dt)
+        return tuple((*row, 0.0) for row in (c0 * self.rates).tolist())
+
+
+@dataclasses.dataclass(frozen=True)
+class SDIRK2(SDIRK):
+    """The scheme of two stages, L-stable (Alexander 1977, γ = 1 - √½).
+
+    Order 2 for controls that are held in each step, because no step remembers the one before.
+    """
+
+    name = "sdirk2"
+    order = 2
+    tableau = ((1.0 - math.sqrt(0.5),), (math.sqrt(0.5), 1.0 - math.sqrt(0.5)))
 
 
 @dataclasses.dataclass(frozen=True)

@@ -22,7 +22,7 @@ from jaxtyping import Float, Int
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
+from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
 
 #: a discontinuity closer to a node than this part of a segment is placed on the node
 ON_NODE = 0.1 * INWARD

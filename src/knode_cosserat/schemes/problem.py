@@ -23,10 +23,10 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.solvers import semi_discrete
-from knode_cosserat.solvers.grid import Grid, grid_of, taken
-from knode_cosserat.solvers.semi_discrete import History, Point, records_in_strands, unpacked_history
-from knode_cosserat.solvers.space import Formula, SpaceScheme
+from knode_cosserat.schemes import semi_discrete
+from knode_cosserat.schemes.grid import Grid, grid_of, taken
+from knode_cosserat.schemes.semi_discrete import History, Point, records_in_strands, unpacked_history
+from knode_cosserat.schemes.space import Formula, SpaceScheme
 
 #: Newton corrections of y at discontinuities inside a segment, for each discontinuity of the segment
 FILLING = 5

@@ -7,8 +7,8 @@ import math
 from collections.abc import Iterator
 from typing import Any, Literal, Self
 
-from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
-from knode_cosserat.solvers.time import BDF2, TWO_STAGES, TimeScheme
+from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
+from knode_cosserat.schemes.time import BDF2, TWO_STAGES, TimeScheme
 
 Start = Literal["paper", "consistent"]
 Between = Literal["held", "linear"]

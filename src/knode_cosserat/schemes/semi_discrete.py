@@ -23,7 +23,7 @@ from knode_cosserat.rods.law import InternalState, JointLaw, MaterialLaw, Stress
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import corrections_of, nominal_model
-from knode_cosserat.solvers.discrete_law import DiscreteLaw, discrete_law
+from knode_cosserat.schemes.discrete_law import DiscreteLaw, discrete_law
 
 
 class History(NamedTuple):

@@ -8,8 +8,6 @@ equations (`grid.Grid`). The history stores them there. The rows of a trajectory
 from __future__ import annotations
 
 import dataclasses
-import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -17,23 +15,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.engine.pattern import values_along
-from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.system import System, is_traced, unknown_count
-from knode_cosserat.solvers.grid import at_places, grid_of
-from knode_cosserat.solvers.problem import Evaluated, StepProblem, no_history, row_of
-from knode_cosserat.solvers.result import Result
-from knode_cosserat.solvers.settings import Settings
-from knode_cosserat.solvers.space import LOBATTO2, SpaceScheme
-from knode_cosserat.solvers.time import BDF1, padded
+from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.problem import no_history
+from knode_cosserat.schemes.result import Result
+from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
+from knode_cosserat.schemes.time import BDF1, padded
 
 #: number of earlier states in the first guess of a step, and the extrapolations in time (constant, linear,
 #: quadratic) of which the guess is the weighted mean
 GUESS_STATES = 3
 EXTRAPOLATIONS = np.array([[1.0, 0.0, 0.0], [2.0, -1.0, 0.0], [3.0, -3.0, 1.0]])
-#: a row counts as an equilibrium of its grid if its residuals are at most this (natural units); it is larger
-#: than the solver's `acceptable`
-SOLVED = 2e-8
 
 
 class StateHistory(NamedTuple):
@@ -137,79 +130,6 @@ def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) 
     return past._replace(records=records, rate=rate, y=y, weights=weights)
 
 
-# histories of one state
-
-
-def unloaded(
-    system: System, space: SpaceScheme
-) -> tuple[Float[Any, "... nodes x"], Float[Any, "... places x"]]:
-    """Return y and z of the unloaded system, or of a batch of robots, at the nodes and at all places."""
-    along = np.concatenate([np.linspace(0.0, 1.0, system.nodes), grid_of(system, space).along])
-    if is_traced(system):
-        if np.ndim(system.length):
-            return map_robots(lambda one: unloaded(one, space), system)
-        found: Any = jnp.concatenate(jax.vmap(system.rest)(along * system.length), axis=1)
-    else:
-        rest = values_along(_rest, system, np.multiply.outer(system.length, along))
-        found = np.concatenate(rest, axis=-1)
-    return found[..., : system.nodes, :], found[..., system.nodes :, :]
-
-
-def unloaded_shape(system: System, space: SpaceScheme) -> Any:
-    """Return y at all points (points, y) of the unloaded robot, or of a batch of robots."""
-    return unloaded(system, space)[1][..., : grid_of(system).tip + 1, : system.y_layout.size]
-
-
-def map_robots(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
-    """Return the results of a function for each robot of a batch, with its part of the arguments."""
-    if is_traced((system, arguments)):
-        return jax.vmap(function)(system, *arguments)
-    leaves, structure = jax.tree.flatten((system, *arguments))
-    leaves = [np.asarray(leaf) for leaf in leaves]
-    robots = [jax.tree.unflatten(structure, own) for own in zip(*leaves, strict=True)]
-    return jax.tree.map(lambda *parts: np.stack(parts), *(function(*own) for own in robots))
-
-
-def _rest(system: System, s: Any, _: Any) -> Any:
-    return system.rest(s)
-
-
-@kept
-def rest_record(system: System) -> Float[Any, "... nodes x"]:
-    """Return y and z (nodes, y + z) of the system at rest, or of a batch of robots."""
-    return unloaded(system, LOBATTO2)[0]
-
-
-@kept
-def resting_history(system: System, settings: Settings) -> StateHistory:
-    """Return the history of the robot at rest under zero control, at time 0, or of a batch of robots."""
-    if system.mixed:
-        control = np.zeros(system.control_layout.size)
-
-        def begun(one: System) -> StateHistory:
-            return constant_history(one, settings, rest_record(one), control)
-
-        return map_robots(begun, system) if np.ndim(system.length) else begun(system)
-    _, records = unloaded(system, settings.space)
-    y = records[..., : grid_of(system).tip + 1, : system.y_layout.size]
-    return repeated_record_history(system, settings, records, y, 0.0)
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def constant_history(
-    system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0
-) -> StateHistory:
-    """Return a history in which all earlier states equal one state, given by y and z at the nodes.
-
-    Between nodes, an equilibrium under this control is evaluated from its equations; any other state is
-    interpolated.
-    """
-    still = StepProblem.still(system, settings.space, control, t0)
-    found = still.evaluated(row[:, : system.y_layout.size])
-    records = still_records(system, settings.space, row, found)
-    return repeated_record_history(system, settings, records, found.y, t0)
-
-
 def repeated_record_history(
     system: System,
     settings: Settings,
@@ -237,22 +157,6 @@ def used_places(system: System, space: SpaceScheme) -> int:
     """Return the number of places that the scheme itself uses, without the extra stages of its check."""
     grid = grid_of(system, space)
     return grid.ends + len(space.formula.stages) * grid.tip
-
-
-def still_records(
-    system: System, space: SpaceScheme, row: Float[Any, "nodes x"], still: Evaluated
-) -> Float[Any, "places x"]:
-    """Return records of a row at all places.
-
-    They are those of the state at rest if the row is an equilibrium. If not, they are interpolated.
-    """
-    numeric: Any = jnp if is_traced((system, row, still)) else np
-    ny, own = system.y_layout.size, row_of(system, still.y, still.records)
-    nodes = numeric.concatenate([row, own[:, row.shape[1] :]], axis=1)
-    # the strains must also equal the equilibrium's: otherwise the state moves
-    bent = numeric.max(abs(nodes - own)[:, ny:]) <= SOLVED * (1.0 + numeric.max(abs(own[:, ny:])))
-    solved = (still.error <= SOLVED) & bent
-    return numeric.where(solved, still.records, at_places(system, space, nodes))
 
 
 # the steps of a run, and their results

@@ -61,6 +61,8 @@ class SpaceScheme(abc.ABC):
     formula: ClassVar[Formula]
     #: a formula of higher order; its stages begin with those of `formula`
     check: ClassVar[Formula]
+    #: true if the scheme only reproduces results of others: large errors neither warn nor change the grid
+    is_reproduction: ClassVar[bool] = False
 
     @property
     @abc.abstractmethod
@@ -105,6 +107,7 @@ class Euler(SpaceScheme):
 
     name = "euler"
     order = 1
+    is_reproduction = True
     formula = Formula((), (1.0, 0.0))
     check = _SIMPSON
 
