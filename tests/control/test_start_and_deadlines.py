@@ -139,6 +139,10 @@ def test_simulations_start_in_equilibrium():
         match=r"initial is a str 'rest'; allowed is a Trajectory or \"equilibrium\" or \"unstressed\"",
     ):
         kc.simulate(SAGGING, none, DT, initial="rest")
+    # one linearisation does not find how it sags
+    newton = kc.solvers.NewtonOptions(max_linearisations=1)
+    with pytest.raises(kc.SimulationError, match=r'^equilibrium: .* initial="unstressed" starts without it'):
+        kc.simulate(SAGGING, none, DT, newton=newton, recovery_budget=0.0)
 
 
 @pytest.mark.slow

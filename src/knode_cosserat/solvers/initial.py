@@ -41,12 +41,20 @@ def start_of(
     """Return where a run starts: a named state at rest, or the last row of a trajectory.
 
     A system that nothing holds has no equilibrium, and starts unstressed.
+
+    Raises:
+        SimulationError: the equilibrium was not found.
     """
     if isinstance(initial, Trajectory):
         return continued_state(system, initial, settings, dt)
     settles = initial == "equilibrium" and Ends.of(system).held
     held = np.zeros(system.control_layout.size) if settles else None
-    return initial_state(system, settings, batch, recovery_budget, held)
+    try:
+        return initial_state(system, settings, batch, recovery_budget, held)
+    except SimulationError as error:
+        cause = f'{error.cause} The motion would start there; initial="unstressed" starts without it.'
+        facts = error.step, error.time, error.residual, error.result
+        raise SimulationError(*facts, cause, error.robot) from None
 
 
 def named_start(
