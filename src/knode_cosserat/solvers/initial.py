@@ -123,7 +123,6 @@ def _settled(system: System, settings: Settings, budget: float | None, control: 
     if is_traced(system):
         find, y = static_rollout(task, Pattern.of(system)), unloaded_shape(system, settings.space)
         rows = jax.vmap(find, in_axes=(0, None, 0))(system, held, y) if many else find(system, held, y)
-        found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
     else:
         robots = np.shape(system.length)[:1]
         rows, _, causes = (static_batch if many else static_run)(
@@ -132,8 +131,8 @@ def _settled(system: System, settings: Settings, budget: float | None, control: 
         if causes:
             raise failure(rows, causes, None)
         warn_of_results(rows)
-        found, result = rows.records[..., 0, :, :], _coarse_only(rows.result[..., 0])
-    return found[..., : system.y_layout.size + system.z_layout.size], result
+    size = system.y_layout.size + system.z_layout.size
+    return rows.records[..., 0, :, :size], _coarse_only(rows.result[..., 0])
 
 
 # continuation of another trajectory
