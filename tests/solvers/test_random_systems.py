@@ -1,5 +1,8 @@
 """Random robots of each kind that has parts: every step is solved, or the one that is not says why.
 
+A case that has no solution with 11 nodes is asked again with 41: discrete equations of a coarse grid need not
+have one.
+
 What is drawn is of everyday sizes, without regard to whether it is easy: rods of 0.1 to 1 m and 1 to 10 mm
 from silicone to steel, loaded up to a few times EI/L², pushed at obstacles, pulled by tendons or reels. All
 of one kind have the same parts, and so one program. Time steps of 1 to 100 ms are a hundred thousandth to a
@@ -7,6 +10,7 @@ thousand of a rod's natural times.
 """
 
 import collections
+import dataclasses
 
 import numpy as np
 import pytest
@@ -210,12 +214,21 @@ def outcome(case):
         return error.result
 
 
+def on_fine_grid(case):
+    """The same case with four segments in place of one: what is without a solution may lack nodes."""
+    return dataclasses.replace(case, robot=case.robot.replace(nodes=41))
+
+
 def share_solved(name, seeds, **drawn):
-    results = {seed: outcome(KINDS[name](seed, **drawn)) for seed in seeds}
+    cases = {seed: KINDS[name](seed, **drawn) for seed in seeds}
+    results = {seed: outcome(case) for seed, case in cases.items()}
+    coarse = [seed for seed, result in results.items() if not result.solved]
+    results |= {seed: outcome(on_fine_grid(cases[seed])) for seed in coarse}
     counted = collections.Counter(result.name for result in results.values())
     share = float(np.mean([result.solved for result in results.values()]))
     print(f"\n{name}: {100 * share:.1f} % of {len(results)} solved; {dict(counted)}")
-    print(f"not solved: {[seed for seed, result in results.items() if not result.solved]}")
+    print(f"not solved with 11 nodes: {coarse}")
+    print(f"not solved with 41 nodes: {[seed for seed, result in results.items() if not result.solved]}")
     return share
 
 
@@ -235,14 +248,10 @@ def test_some_random_cases(name):
     assert share_solved(name, range(SOME)) == 1.0
 
 
-#: the least share that is to be solved
-LEAST = {"with_loads": 0.98, "with_sections": 0.98}
-
-
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", KINDS)
 def test_500_random_cases(name):
-    assert share_solved(name, range(500)) >= LEAST.get(name, 0.95)
+    assert share_solved(name, range(500)) >= 0.99
 
 
 @pytest.mark.campaign
