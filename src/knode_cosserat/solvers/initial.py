@@ -147,7 +147,7 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
     numeric: Any = jnp if is_traced((system, initial)) else np
     record = numeric.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
     control, t0 = initial.control[-1], initial.time[-1]
-    state = _last_state(system, initial, settings, dt, record)
+    state = _last_state(system, initial, settings, record)
     if state is None:
         state = SolverState(at_one_state(system, history_settings(settings), record, control, t0))
     elif (
@@ -177,9 +177,7 @@ def _coarse_only(result: Any) -> Any:
     return int(Result.COARSE) * (result == int(Result.COARSE))
 
 
-def _last_state(
-    system: System, initial: Trajectory, settings: Settings, dt: float, record: Any
-) -> SolverState | None:
+def _last_state(system: System, initial: Trajectory, settings: Settings, record: Any) -> SolverState | None:
     """Return the solver's state at a trajectory's last row; None if one state is all that is known."""
     made = initial.settings
     if made is not None and made.time is None:
@@ -187,18 +185,21 @@ def _last_state(
     grid_before, grid = (
         (it.discontinuities.places, it.nodes, strand_count(it), it.mixed) for it in (initial.system, system)
     )
-    if made is None or made.space != settings.space or grid_before != grid:
+    same_grid = made is not None and made.space == settings.space and grid_before == grid
+    state = initial.final_state
+    if not same_grid or state is None or state.history.rate.shape != no_history(system, settings.space).shape:
         if len(initial.time) < 2:
             return None
-        numeric: Any = jnp if is_traced(initial) else np
-        count = settings.memory
-        rows = numeric.concatenate([initial.y[-count:], initial.z[-count:]], axis=-1)
-        apart = dt if is_traced(initial.time) else float(initial.time[-1] - initial.time[-2])
-        return state_of_rows(system, settings, rows, apart)
-    state = initial.final_state
-    if state is None or state.history.rate.shape != no_history(system, settings.space).shape:
-        known = replay(initial, initial.system, dt)
-        return None if known is None else known.state
+        if is_traced(initial):
+            raise ValueError(
+                "inside JAX's transformations initial is a motion without its final state on this grid; "
+                "allowed is a name, an equilibrium, or a result of simulate with the same nodes and space"
+            )
+        if same_grid:
+            known = replay(initial, initial.system)
+            return None if known is None else known.state
+        rows = np.concatenate([initial.y, initial.z], axis=-1)[-settings.memory :]
+        return state_of_rows(system, settings, rows, float(initial.time[-1] - initial.time[-2]))
     # the row may have been changed since; rates are unchanged
     history = state.history
     change = record - row_of(system, history.y[0], history.records[0])[:, : record.shape[1]]

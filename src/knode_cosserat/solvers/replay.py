@@ -7,10 +7,8 @@ an earlier version. Rows hold the nodes only; the equations give the other place
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
@@ -28,7 +26,7 @@ from knode_cosserat.schemes.history import (
     history_of,
     repeated_record_history,
 )
-from knode_cosserat.schemes.problem import Evaluated, StepProblem, no_history, row_of
+from knode_cosserat.schemes.problem import Evaluated, no_history, row_of
 from knode_cosserat.schemes.settings import MEASURED, Settings
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.rest import (
@@ -44,27 +42,9 @@ from knode_cosserat.trajectory import Trajectory
 AT_REST = 1e-12
 
 
-def evaluator(system: System, settings: Settings, traced: bool = False) -> Callable[..., Evaluated]:
-    """Return a function that evaluates states.
-
-    Its arguments are c0, the time (s), the control, history terms (places, x), and y at all points, or at the
-    nodes. Inside JAX's transformations, all may be `traced`.
-    """
-    if not traced:
-        return engine.evaluator(system, settings)
-    return lambda c0, t, control, history, y: _evaluated(
-        StepProblem(system, t, control, c0, history, settings.space), y
-    )
-
-
-@jax.jit
-def _evaluated(problem: StepProblem, y: Any) -> Evaluated:
-    return problem.evaluated(y)
-
-
 def still_state(system: System, space: SpaceScheme, control: Any, y: Any, t: Any = 0.0) -> Evaluated:
     """Return the state at rest of y at all points, or at the nodes, under a control."""
-    return evaluator(system, Settings(None, space))(0.0, t, control, no_history(system, space), y)
+    return engine.evaluator(system, Settings(None, space))(0.0, t, control, no_history(system, space), y)
 
 
 def at_one_state(system: System, settings: Settings, row: Any, control: Any, t0: Any = 0.0) -> StateHistory:
@@ -99,38 +79,31 @@ class _Replay(NamedTuple):
     state: SolverState
 
 
-def replay(trajectory: Trajectory, system: System, dt: float | None = None) -> _Replay | None:
-    """Return the histories along a motion's rows by a system's equations; None if the rows do not suffice.
-
-    `dt` is the time step (s) of rows whose times are traced.
-    """
+def replay(trajectory: Trajectory, system: System) -> _Replay | None:
+    """Return the histories along a motion's rows by a system's equations; None if the rows do not suffice."""
     made, time = replayed_settings(trajectory), trajectory.time
     if len(time) < 2:
         return None
-    apart = (trajectory.initial_state and trajectory.initial_state.dt) or dt
-    if not is_traced(time):
-        apart = trajectory.dt
-    assert apart is not None
-    known = _known_row(trajectory, system, made, apart)
+    dt = trajectory.dt
+    known = _known_row(trajectory, system, made, dt)
     if known is None:
         return None
     row, state = known
-    numeric: Any = jnp if is_traced((trajectory, system)) else np
-    rows: Any = numeric.concatenate([trajectory.y, trajectory.z], axis=-1)[row:]
+    rows: Any = np.concatenate([trajectory.y, trajectory.z], axis=-1)[row:]
     controls: Any = trajectory.control[row:]
     if made.stages > 1:
         between: Any = trajectory.stages[row + 1 :, :, :, : rows.shape[-1]]
-        every = numeric.concatenate([between, rows[1:, None]], axis=1)
-        rows = numeric.concatenate([rows[:1], every.reshape(-1, *rows.shape[1:])])
+        every = np.concatenate([between, rows[1:, None]], axis=1)
+        rows = np.concatenate([rows[:1], every.reshape(-1, *rows.shape[1:])])
         acting = at_stages(system, made, controls[1:], controls[:1], state.dt is None)
         if acting.shape[1] == controls.shape[1]:
-            acting = numeric.tile(acting, made.stages)
+            acting = np.tile(acting, made.stages)
         acting = acting.reshape(len(acting) * made.stages, controls.shape[1])
-        controls = numeric.concatenate([controls[:1], acting])
-    steps = StepCoefficients.of(made, apart, state.known(made))
-    past = state.history._replace(t0=numeric.asarray(time[row], dtype=float))
+        controls = np.concatenate([controls[:1], acting])
+    steps = StepCoefficients.of(made, dt, state.known(made))
+    past = state.history._replace(t0=np.asarray(time[row], dtype=float))
     history, terms = _along(system, made, past, (rows, controls), steps)
-    last = state.after(history, apart, len(time) - 1 - row, made)
+    last = state.after(history, dt, len(time) - 1 - row, made)
     last = dataclasses.replace(last, rate_known=state.rate_known and made.uses_rate)
     return _Replay(row + 1, terms[made.stages - 1 :: made.stages], last)
 
@@ -158,17 +131,14 @@ def _known_row(
     time, state = trajectory.time, trajectory.initial_state
     if state is not None and state.history.rate.shape == no_history(system, made.space).shape:
         return 0, state
-    numeric: Any = jnp if is_traced(trajectory) else np
     count = made.memory
-    rows: Any = numeric.concatenate([trajectory.y[:count], trajectory.z[:count]], axis=-1)
-    if is_traced(time) or time[0] != 0.0:
+    rows: Any = np.concatenate([trajectory.y[:count], trajectory.z[:count]], axis=-1)
+    if time[0] != 0.0:
         state = state_of_rows(system, made, rows, dt)
         return None if state is None else (count - 1, state)
-    history = resting_history(system, made)
-    rest = rest_record(system)
-    if not is_traced((rest, rows)) and not np.allclose(rest, rows[0], rtol=0.0, atol=AT_REST):
-        history = at_one_state(system, made, rows[0], trajectory.control[0])
-    return 0, SolverState(history)
+    if np.allclose(rest_record(system), rows[0], rtol=0.0, atol=AT_REST):
+        return 0, SolverState(resting_history(system, made))
+    return 0, SolverState(at_one_state(system, made, rows[0], trajectory.control[0]))
 
 
 def state_of_rows(
@@ -180,11 +150,10 @@ def state_of_rows(
     """
     if system.mixed or len(rows) < settings.memory:
         return None
-    numeric: Any = jnp if is_traced((system, rows)) else np
     records = [at_places(system, settings.space, row) for row in rows[::-1]]
     y = grid_of(system).spread(rows[-1, :, : system.y_layout.size])
     repeated = repeated_record_history(system, settings, records[0], y, 0.0)
-    return SolverState(repeated._replace(records=numeric.stack(records)), dt, rate_known=False)
+    return SolverState(repeated._replace(records=np.stack(records)), dt, rate_known=False)
 
 
 def _along(
@@ -196,29 +165,21 @@ def _along(
     solved, its difference from the equations at the nodes is interpolated to the other places.
     """
     t0, stages, (rows, controls) = past.t0, settings.stages, motion
-    traced = is_traced((system, past, motion))
-    evaluate = evaluator(system, settings, traced)
-
-    def one(past: StateHistory, step: Any) -> Any:
-        i, row, control = step
-        coefficients, t = steps.at(t0, i // stages)
-        if stages > 1:
-            coefficients, t = coefficients[i % stages], t[i % stages]
-        history = history_of(past.records, past.rate, coefficients, settings)
-        found = evaluate(coefficients[0], t, control, history, row[:, : system.y_layout.size])
-        change = row - row_of(system, found.y, found.records)[:, : row.shape[1]]
-        records = found.records + carried(system, settings.space, change)
-        return advanced(past, records, coefficients[0] * records + history, found.y, past.weights), history
+    evaluate = engine.evaluator(system, settings)
 
     # errors in time are not evaluated again
     lost = np.full(past.time_error.shape, np.nan)
     past, count = past._replace(time_error=lost, weights=EXTRAPOLATIONS[1]), len(rows) - 1
-    if traced:
-        past, terms = jax.lax.scan(one, past, (jnp.arange(count), rows[1:], controls[1:]))
-    else:
-        terms = np.empty((count, *past.rate.shape))
-        for i in range(count):
-            past, terms[i] = one(past, (i, rows[i + 1], controls[i + 1]))
+    terms = np.empty((count, *past.rate.shape))
+    for i, (row, control) in enumerate(zip(rows[1:], controls[1:], strict=True)):
+        coefficients, t = steps.at(t0, i // stages)
+        if stages > 1:
+            coefficients, t = coefficients[i % stages], t[i % stages]
+        terms[i] = history_of(past.records, past.rate, coefficients, settings)
+        found = evaluate(coefficients[0], t, control, terms[i], row[:, : system.y_layout.size])
+        change = row - row_of(system, found.y, found.records)[:, : row.shape[1]]
+        records = found.records + carried(system, settings.space, change)
+        past = advanced(past, records, coefficients[0] * records + terms[i], found.y, past.weights)
     return past._replace(t0=t0 + count // stages * steps.dt), terms
 
 
