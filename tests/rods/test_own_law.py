@@ -1,0 +1,50 @@
+"""A law of the material in one file, known nowhere else."""
+
+from typing import Any, ClassVar
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.tree_util import Partial
+
+import knode_cosserat as kc
+from knode_cosserat.robots import Effect, parameter
+
+
+def cubic_moment(k, u, u_t):
+    """Return k |u|² u."""
+    return k * jnp.sum(u * u) * u
+
+
+class Stiffening(Effect):
+    """Bending and twisting that stiffen: the moment k |u|² u of the curvature u, beside Hooke's law."""
+
+    kind: ClassVar[str] = "stiffening"
+
+    cubic: Any = parameter(
+        "N m4", "k, of the moment that grows with the cube of the curvature", low=0.0, high=1e3
+    )
+
+    def law(self, point, law, internal):
+        bending = law.strains["u"]
+        return law.with_strain("u", bending._replace(moment=Partial(cubic_moment, self.cubic)))
+
+
+@pytest.mark.parametrize("cubic", [0.0, 2e-5])
+def test_a_stiffening_rod_bends_to_a_circle(cubic):
+    """EI κ + k κ³ is the moment at the tip; the height of the tip is sin(κ L) / κ."""
+    length, curvature, EI = 0.3, 4.0, 2e9 * np.pi * 2e-3**4 / 4
+    moment = EI * curvature + cubic * curvature**3
+    rod = kc.robots.SlenderRod(
+        length=length,
+        radius=2e-3,
+        density=1000.0,
+        youngs_modulus=2e9,
+        gravity=(0.0, 0.0, 0.0),
+        nodes=41,
+        loads=(kc.robots.loads.PointWrench(at=1.0, moment=(moment, 0.0, 0.0)),),
+        effects=(Stiffening(cubic),),
+    )
+    found = kc.equilibrium(rod, np.zeros(0), space="lobatto4")
+    height = np.sin(curvature * length) / curvature
+    assert found.tip_position[0, 2] == pytest.approx(height, rel=1e-9)
