@@ -50,19 +50,20 @@ def test_it_swings_and_comes_to_rest(string):
 
 @pytest.mark.campaign
 def test_its_velocity_is_that_of_its_position(string):
-    """q_s = p_st holds through the history of y_s: q is the rate of p at nodes, to the scheme's order."""
+    """q_s = p_st holds through the history of y_s: q is BDF2's rate of p at the nodes, on any grid."""
     t = np.arange(1, 41) * 0.05
     hand = HAND + np.stack([0.05 * np.sin(np.pi * t) ** 2, 0.0 * t], axis=1)
     errors = []
     for nodes in (21, 41):
         finer = string.replace(nodes=nodes)
         rest = kc.equilibrium(finer, HAND, space="lobatto4")
-        moved = kc.simulate(finer, hand, 0.05, space="lobatto4", initial=rest)
+        moved = kc.simulate(finer, hand, 0.05, time="bdf2", space="lobatto4", initial=rest)
         p, q = moved.part("p"), moved.part("q")
         by_bdf2 = (1.5 * p[2:] - 2.0 * p[1:-1] + 0.5 * p[:-2]) / 0.05
         assert np.max(np.abs(q)) > 0.1
         errors.append(np.max(np.abs(q[2:] - by_bdf2)))
-    assert errors[1] < 5e-4 and errors[0] / errors[1] > 8.0
+    # as far as steps are solved
+    assert max(errors) < 1e-7
 
 
 @pytest.mark.campaign

@@ -57,7 +57,7 @@ def test_an_orientation_s_error_is_an_angle_whatever_the_quaternion_s_sign_or_si
 @pytest.mark.campaign
 def test_a_finer_truth_is_looked_up(truth):
     fine = ROBOT.replace(nodes=28)
-    finer = kc.simulate(fine, kc.controls.constant(5.0, 20, tendons=4), 0.025)
+    finer = kc.simulate(fine, kc.controls.sine(1.0, 20, 0.025), 0.025)
     coarse = dataclasses.replace(
         finer[::2], y=np.asarray(finer.y)[::2, ::3], z=np.asarray(finer.z)[::2, ::3], system=ROBOT
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from knode_cosserat import envs
+from studies.ppo import PolicyTraining, PPOSettings
 
 
 @pytest.fixture
@@ -54,7 +55,7 @@ def test_the_predictive_controller_and_a_trained_policy_follow(robot):
     keys = jax.random.split(jax.random.PRNGKey(4), 2)
     reference = envs.controller_scores(environment, keys).mean()
     assert reference > 0.98
-    training = envs.PolicyTraining(environment, steps=500_000)
+    training = PolicyTraining(environment, PPOSettings(steps=500_000))
     training.run(seconds=400.0)
     assert envs.policy_scores(environment, training.policy, keys).mean() > 0.9 * reference
 

@@ -229,7 +229,7 @@ def eigenvalue(dt, pull=1.0):
     """λ of xᵢ₊₁ = 2 Re(λ) xᵢ - |λ|² xᵢ₋₁, fitted to how the tip swings."""
     aside = kc.equilibrium(SWINGING, np.array([pull]), space="lobatto4")
     along = kc.simulate(
-        SWINGING, np.zeros((60, 1)), dt, space="lobatto4", initial=aside, start="consistent"
+        SWINGING, np.zeros((60, 1)), dt, time="bdf2", space="lobatto4", initial=aside, start="consistent"
     ).tip_position[:, 0]
     twice, minus_square = np.linalg.lstsq(np.stack([along[11:-1], along[10:-2]], 1), along[12:], rcond=None)[
         0

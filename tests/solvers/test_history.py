@@ -10,6 +10,7 @@ import pytest
 import knode_cosserat as kc
 from benchmarks.motions import soft_rod
 from examples.hanging_string import HangingString
+from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.schemes.grid import at_places, grid_of
 from knode_cosserat.schemes.problem import StepProblem
 from knode_cosserat.schemes.settings import Settings, schemes
@@ -209,15 +210,14 @@ def test_rest_is_rest_at_all_places(space):
 
 
 def tips(rod, steps, nodes, until=0.4):
-    """Of the second half of a fall, at ten times: what lets go at its beginning has died out."""
-    found = kc.simulate(
-        rod.replace(nodes=nodes),
-        np.zeros((steps, 0)),
-        until / steps,
-        space="lobatto4",
-        start="consistent",
-        initial="unstressed",
-    )
+    """Return the tip's position at ten times while a force at the tip grows smoothly.
+
+    A rod that is let go rings along itself, undamped, 31 ms at a time: steps that do not resolve it show no
+    order (SDIRK2: -0.9, -0.7, 1.6, 1.8 from 20 steps on), and neither do BDF2's.
+    """
+    force = np.sin(np.linspace(0.0, 0.5 * np.pi, steps + 1)[1:, None]) ** 2
+    pulled = rod.replace(nodes=nodes, loads=(PointWrench(controlled=True, force=[0.02, 0.01, 0.0]),))
+    found = kc.simulate(pulled, force, until / steps, space="lobatto4", between="linear")
     assert np.all(found.result == kc.Result.CONVERGED)
     return found.tip_position[steps // 2 :: steps // 20]
 
@@ -271,16 +271,23 @@ def test_a_robot_that_was_changed_begins_where_the_other_one_rested(rod):
 
 
 @pytest.mark.campaign
+@pytest.mark.parametrize("time", ["bdf2", "bdf-alpha", "sdirk2"])
 @pytest.mark.parametrize("dt", [0.02, 0.005])
-def test_waves_of_a_string_do_not_grow(dt):
-    """Of an undamped one, in whose slowest part they go 1.2 segments in a time step, or a third of one."""
-    hand = np.array([[0.6 + 0.05 * np.sin(2.0 * np.pi * dt * i), 0.0] for i in range(1, 61)])
+def test_waves_of_a_string_do_not_grow(dt, time):
+    """Of an undamped one, in whose slowest part they go 1.2 segments in a time step, or a third of one.
 
+    The hand goes to and fro once, in 0.8 s, and rests three times as long. It begins smoothly: a jump of its
+    velocity makes the string slack, which then has no solution.
+    """
+    rows = round(0.8 / dt)
+    way = np.sin(np.pi * np.minimum(np.arange(1, 4 * rows + 1) / rows, 1.0)) ** 2
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.15, nodes=41)
     hanging = kc.equilibrium(string, np.array([0.6, 0.0]), space="lobatto4")
-    found = kc.simulate(string, hand, dt, space="lobatto4", initial=hanging)
+    hand = np.stack([0.6 + 0.05 * way, 0.0 * way], axis=1)
+    found = kc.simulate(string, hand, dt, space="lobatto4", time=time, initial=hanging)
     rough = np.abs(np.diff(found.part("q"), n=4, axis=1)).max(axis=(1, 2))
-    assert rough[-1] < 0.1 * rough.max()
+    # the air takes it: 0.10 to 0.20 of it is left
+    assert rough[-rows:].max() < 0.25 * rough[:rows].max()
 
 
 def growth(formula, time, passed):
