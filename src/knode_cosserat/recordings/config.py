@@ -253,6 +253,7 @@ class _NumbersSource(_Settings):
     names: tuple[str, ...] | None
     unit: str
     gain: float | None
+    held: bool | None = None
 
     @property
     def factor(self) -> float:
@@ -260,6 +261,11 @@ class _NumbersSource(_Settings):
         return {**TENSION_UNITS, **PRESSURE_UNITS, **MOTOR_UNITS}[self.unit] * (
             1.0 if self.gain is None else self.gain
         )
+
+    @property
+    def is_force(self) -> bool:
+        """True for tensions (N), and False for pressures and for motors."""
+        return self.unit in TENSION_UNITS
 
     def __post_init__(self) -> None:
         if self.names is not None:
