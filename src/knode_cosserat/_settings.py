@@ -9,7 +9,7 @@
 
 The statement, a `Rule` in the annotation, serves the check when settings are made, mappings and files, error
 messages, and the JSON Schema. A field whose default is None may be None. Fields without a rule are not
-checked.
+checked, and those with `compare=False` are no settings: neither read nor written.
 """
 
 from __future__ import annotations
@@ -217,7 +217,7 @@ def plain(value: Any) -> Any:
 
 def _defaults(kind: Any) -> dict[str, Any]:
     """Return the defaults of all settings by name; `dataclasses.MISSING` for those that are required."""
-    return {field.name: field.default for field in dataclasses.fields(kind)}
+    return {field.name: field.default for field in dataclasses.fields(kind) if field.compare}
 
 
 @functools.cache

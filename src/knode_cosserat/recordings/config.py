@@ -467,6 +467,7 @@ class RecordingConfig(_Settings):
         initial_tension: tensions (N) before the first row, tendon 1 first; None: estimated from the rest.
         simulated: True if the robot was itself a simulation; None: not stated.
         description: one-line description of the recording.
+        remarks: remarks on the guesses of a proposal: comments in its file, and not read from there.
 
     Raises:
         RecordingError: a value is not allowed.
@@ -496,6 +497,7 @@ class RecordingConfig(_Settings):
     simulated: Annotated[bool | None, FLAG] = None
     description: Annotated[str, TEXT] = ""
     initial_tension: Annotated[Vector | None, numbers(None, "numbers (N), one of each tendon")] = None
+    remarks: tuple[str, ...] = dataclasses.field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -589,7 +591,7 @@ class RecordingConfig(_Settings):
     def to_yaml(self, *, brief: bool = False) -> str:
         """Return the settings as the text of a YAML file; `brief` leaves out those with default values."""
         defaults = {field.name: plain(field.default) for field in dataclasses.fields(self)}
-        lines = [f"format: {FORMAT}"]
+        lines = [*(f"# {remark}" for remark in self.remarks), f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
             if name in ("markers", "sensors"):
                 lines += [f"{name}:", *(f"  - {flow(source)}" for source in value)] if value else []

@@ -61,8 +61,8 @@ def load_example() -> Recording:
         return _recording(read_csv(file.read_bytes()), None, EXAMPLE)
 
 
-def proposed_config(path: str | Path) -> tuple[RecordingConfig, tuple[str, ...]]:
-    """Return a configuration proposed for a recording, and remarks on its guesses.
+def proposed_config(path: str | Path) -> RecordingConfig:
+    """Return a configuration proposed for a recording, with remarks on its guesses.
 
     Bodies and tensions are recognised by the names and types of topics, or by the titles of columns. Places
     on the rod are guessed from distances at the start.
@@ -92,7 +92,10 @@ def _recording(content: Bag | Table, config: RecordingConfig | None, name: str) 
         RecordingError: a topic or column is missing or unusable.
     """
     findings = list(content.findings)
-    config = content.completed(config or default_config(content, findings))
+    if config is None:
+        config = default_config(content)
+        findings += [Finding("warning", "", remark) for remark in config.remarks]
+    config = content.completed(config)
     streams = content.streams(config, findings)
     sensed = checks.cleaned(config, rows_on_one_clock(streams, config, findings))
     sensed, rest = frame.in_robot_frame(sensed, config, findings)

@@ -25,7 +25,7 @@ from knode_cosserat.recordings.config import (
     TableSource,
     TensionSource,
 )
-from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import (
     NUMBERS,
     POSE_ARRAY,
@@ -83,19 +83,17 @@ class _Body(NamedTuple):
     titles: tuple[str, ...] = ()
 
 
-def default_config(content: Bag | Table, findings: list[Finding]) -> RecordingConfig:
-    """Return the configuration of a recording that is read without one, and add findings on guesses.
+def default_config(content: Bag | Table) -> RecordingConfig:
+    """Return the configuration of a recording that is read without one.
 
     Raises:
         RecordingError: the content has another form.
     """
     if isinstance(content, Bag):
         return RecordingConfig.paper_robot()
-    if not content.bodies:
-        return configured(content.metadata, list(map(str, content.numbers.columns)))
-    config, remarks = config_of_table(content)
-    findings += [Finding("warning", "", remark) for remark in remarks]
-    return config
+    if content.bodies:
+        return config_of_table(content)
+    return configured(content.metadata, list(map(str, content.numbers.columns)))
 
 
 # bags
@@ -107,8 +105,8 @@ def useful_topics(bag: Bag) -> set[str]:
     return {name for name, topic in bag.topics.items() if topic.type in kinds}
 
 
-def config_of_bag(bag: Bag) -> tuple[RecordingConfig, tuple[str, ...]]:
-    """Return a configuration of a bag's topics, and remarks. Raises `RecordingError` without poses."""
+def config_of_bag(bag: Bag) -> RecordingConfig:
+    """Return a configuration of a bag's topics, with remarks. Raises `RecordingError` without poses."""
     names: dict[str, str] = {}
     for topic in bag.topics.values():
         messages = (message for _, message in topic.messages() if message is not None)
@@ -163,8 +161,8 @@ def _add_topic(
 # tables
 
 
-def config_of_table(table: Table) -> tuple[RecordingConfig, tuple[str, ...]]:
-    """Return a configuration of a table's columns, and remarks. Raises `RecordingError` without positions."""
+def config_of_table(table: Table) -> RecordingConfig:
+    """Return a configuration of a table's columns, with remarks. Raises `RecordingError` without poses."""
     titles, remarks = list(map(str, table.numbers.columns)), list[str]()
     if table.bodies:
         bodies = []
@@ -280,9 +278,7 @@ def _number_columns(
 # places on the rod
 
 
-def _config(
-    bodies: Sequence[_Body], settings: dict[str, Any], remarks: list[str]
-) -> tuple[RecordingConfig, tuple[str, ...]]:
+def _config(bodies: Sequence[_Body], settings: dict[str, Any], remarks: list[str]) -> RecordingConfig:
     """Return the configuration of bodies whose places are guessed from distances at the start.
 
     `settings` are those that are known: sources, columns, the unit of positions and the axis that points up.
@@ -321,7 +317,7 @@ def _config(
         kinds = "measured"
     if kinds == "none":
         remarks.append("no tensions were found: `tensions: none` makes a recording of poses only")
-    config = RecordingConfig(
+    return RecordingConfig(
         markers=tuple(
             MarkerSource(body.name, body.topic, fraction)
             for body, fraction in zip(others, fractions, strict=True)
@@ -329,9 +325,9 @@ def _config(
         base=BaseSource(base.topic) if base else None,
         tensions=kinds,  # type: ignore[arg-type]
         rotation=(1.0, 0.0, 0.0, 0.0) if rotation is None else rotation,
+        remarks=tuple(remarks),
         **settings,
     )
-    return config, tuple(remarks)
 
 
 def _rotation(axis: Float[np.ndarray, " 3"]) -> tuple[float, ...] | None:
