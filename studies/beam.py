@@ -22,11 +22,11 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat._files import csv_rows
-from knode_cosserat._files.reading import ReadError, read_bytes
+from knode_cosserat._files.reading import read_bytes
 from knode_cosserat.evaluation.comparison import REFERENCE, legend_below
 from knode_cosserat.evaluation.drawing import new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
-from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.findings import RecordingError, naming
 from knode_cosserat.recordings.formats.csv_table import read_csv
 from knode_cosserat.recordings.table import columns_of
 from knode_cosserat.rods.ends import Clamped
@@ -113,10 +113,8 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
         RecordingError: the file is invalid, its load is unknown, or the beam is never released.
     """
     load = load_of(path.stem) if load is None else load
-    try:
-        table = read_csv(read_bytes(path, csv_rows.LARGEST_FILE), str(path)).numbers
-    except ReadError as error:
-        raise RecordingError(f"{path}: {error}") from None
+    with naming(path):
+        table = read_csv(read_bytes(path, csv_rows.LARGEST_FILE)).numbers
     missing = [name for name in COLUMNS if name not in table.columns]
     if missing:
         raise RecordingError(
@@ -124,7 +122,8 @@ def read_beam(path: Path, load: float | None = None) -> BeamRecording:
             "of the markers 0 to 5"
         )
     titles = list(table.columns)
-    values = columns_of(table, [titles.index(name) for name in COLUMNS], str(path))
+    with naming(path):
+        values = columns_of(table, [titles.index(name) for name in COLUMNS])
     time, markers = values[:, 0], values[:, 1:].reshape(-1, len(TIP + BASE), 3)
     if not np.all(np.diff(time) > 0.0):
         raise RecordingError(f"{path}: time_s does not grow from row to row")

@@ -1,8 +1,10 @@
 import dataclasses
 import os
 
+import jsonschema
 import numpy as np
 import pytest
+import yaml
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, RecordingError
@@ -86,7 +88,7 @@ def test_a_short_file_is_enough(tmp_path):
         ("name: tip", "name: ''", "name is ''; allowed is text on one line"),
         ("markers:", "marker:", "the key 'marker' is unknown"),
         ("  - {name: tip, topic: /tip, fraction: 1}", "  []", "markers is (); allowed is a list of one"),
-        ("  - {name: tip, topic: /tip, fraction: 1}", "  - tip", "number 1 is 'tip'; allowed is a mapping"),
+        ("  - {name: tip, topic: /tip, fraction: 1}", "  - tip", "number 1 is 'tip'; allowed is a Marker"),
         ("topic: /tip", "topic: /pull", "the topic /pull is there twice"),
         ("tension:", "command:", "tension is missing; required where tensions is measured"),
         ("format: 1", "simulated: perhaps", "simulated is 'perhaps'; allowed is true or false"),
@@ -127,6 +129,37 @@ def test_a_file_that_is_not_right_gives_one_line(tmp_path, old, new, words):
     assert "\n" not in message
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("format: 1", "format: 2"),
+        ("format: 1", "formats: 1"),
+        ("unit: N", "unit: lb"),
+        ("order: [1, 2]", "order: [0, 1]"),
+        ("fraction: 4/9", "fraction: 1.5"),
+        ("name: tip, ", ""),
+        ("trim: [null, 2]", "trim: 3"),
+        ("format: 1", "longest_gap: -1"),
+        ("format: 1", "base: {heights: 1}"),
+        ("tip: [x, y, z]", "tip: x"),
+    ],
+)
+def test_the_schema_and_the_reader_agree(old, new):
+    text = (
+        "format: 1\ntension: {topic: /pull, order: [1, 2], unit: N}\ntrim: [null, 2]\n"
+        "columns: {time: 1, tip: [x, y, z]}\nmarkers:\n  - {name: tip, fraction: 4/9}\n"
+    )
+    schema = jsonschema.Draft202012Validator(RecordingConfig.json_schema())
+    for config in (FULL, RecordingConfig.paper_robot(), RecordingConfig.asl_trunk()):
+        schema.validate(config.to_dict())
+    schema.validate(yaml.safe_load(text))
+    RecordingConfig.from_dict(yaml.safe_load(text))
+    wrong = yaml.safe_load(text.replace(old, new))
+    assert not schema.is_valid(wrong)
+    with pytest.raises(RecordingError):
+        RecordingConfig.from_dict(wrong)
+
+
 def test_files_that_cannot_be_read_or_written(tmp_path):
     with pytest.raises(RecordingError, match=r"nowhere\.yaml: no such file"):
         RecordingConfig.load(tmp_path / "nowhere.yaml")
@@ -163,5 +196,5 @@ def test_settings_are_changed_by_name():
         FULL.replace(longest_gaps=0.3)
     with pytest.raises(RecordingError, match="markers have the names"):
         FULL.replace(markers=(MarkerSource("a", "/a", 0.5), MarkerSource("a", "/b", 1.0)))
-    with pytest.raises(RecordingError, match="base is '/base'; allowed is a BaseSource, or nothing"):
+    with pytest.raises(RecordingError, match="base is '/base'; allowed is a BaseSource, or a mapping"):
         FULL.replace(base="/base")

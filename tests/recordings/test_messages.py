@@ -507,14 +507,14 @@ def test_a_bag_with_other_topics_gets_a_proposal(tmp_path):
     rib = poses(2, "/mocap/rib/pose", position, rotation.as_quat(scalar_first=True))
     noise = [("/chatter", "std_msgs/msg/String", 0.0, it.make("std_msgs/msg/String", data="hello"))]
     path = write(tmp_path / "it", [*poses(), *base, *rib, *joint_states((1, 0, 3, 2)), *noise])
-    found, remarks = proposed_config(path)
+    found = proposed_config(path)
     assert [(each.topic, each.fraction) for each in found.markers] == [
         ("/mocap/rib/pose", 0.5),
         ("/tip", 1.0),
     ]
     assert (found.base.topic, found.tension.topic) == ("/mocap/base_plate/pose", "/joint_states")
     assert found.tension.names == ("tendon_1", "tendon_2", "tendon_3", "tendon_4")
-    assert any("places on the rod (fractions) are guessed" in each for each in remarks)
+    assert any("places on the rod (fractions) are guessed" in each for each in found.remarks)
     recording = load_recording(path, found)
     np.testing.assert_allclose(recording.bodies[1].position, POSITION, atol=1e-9)
     np.testing.assert_allclose(measured(recording), PULLS, atol=1e-12)
@@ -532,14 +532,14 @@ def test_parts_and_topics_of_tendons_are_proposed(tmp_path):
         for k in (1, 2)
     ]
     path = write(tmp_path / "it", [*array(), *cells])
-    found, remarks = proposed_config(path)
+    found = proposed_config(path)
     assert [each.topic for each in found.markers] == ["/poses[0]", "/poses[1]", "/poses[2]"]
     assert (found.tension.topic, found.tension.names) == ("/cell{}/force", ("1", "2"))
-    assert any("no body is called base" in each for each in remarks)
+    assert any("no body is called base" in each for each in found.remarks)
     seen = load_recording(path, found).tension
     np.testing.assert_allclose(seen.tension, seen.time[:, None] + [5.0, 10.0], atol=1e-9)
     path = write(tmp_path / "tf", [*transforms(), *cells])
-    found, _ = proposed_config(path)
+    found = proposed_config(path)
     assert sorted(each.topic for each in found.markers) == ["/tf[camera]", "/tf[tip]"]
     assert found.base.topic == "/tf[base]"
     with pytest.raises(

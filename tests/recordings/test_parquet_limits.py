@@ -113,14 +113,13 @@ BOUNDED = """
 import resource
 import sys
 from pathlib import Path
-from knode_cosserat.recordings import RecordingError
-from knode_cosserat.recordings.formats import parquet
-parquet._pyarrow()
+from knode_cosserat.recordings import RecordingError, load_recording
+import pyarrow.parquet
 pages = int(Path("/proc/self/statm").read_text().split()[0])
 limit = pages * resource.getpagesize() + 1_500_000_000
 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 try:
-    parquet.read_parquet(Path(sys.argv[1]))
+    load_recording(sys.argv[1])
 except RecordingError as error:
     print(error)
 """

@@ -83,25 +83,19 @@ def _loaded(path: Path, config: Path | None) -> tuple[Recording, str]:
     from knode_cosserat.recordings import load_recording, proposed_config
     from knode_cosserat.recordings.findings import RecordingError
 
-    remarks: tuple[str, ...] = ()
     try:
         (loaded,) = load_recordings([path], config, proposals=False)
         # exports of motion capture are read by a proposal, which states the axis that points up
-        if config is not None or loaded.config.up is None:
-            return loaded, ""
-        remarks = proposed_config(path)[1]
-    except ValueError:
+        is_proposal = config is None and loaded.config.up is not None
+    except ValueError as unread:
         if config is not None:
             raise
         try:
-            meaning, remarks = proposed_config(path)
+            meaning = proposed_config(path)
         except RecordingError:
-            meaning = None
-        if meaning is None:
-            raise
-        loaded = load_recording(path, meaning)
-    comments = [f"# {remark}" for remark in remarks]
-    return loaded, "\n".join([*comments, loaded.config.to_yaml(brief=True)])
+            raise unread from None
+        loaded, is_proposal = load_recording(path, meaning), True
+    return loaded, loaded.config.to_yaml(brief=True) if is_proposal else ""
 
 
 def _lines(report: Health) -> list[str]:

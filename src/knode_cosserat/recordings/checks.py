@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 import scipy.ndimage
@@ -14,7 +15,6 @@ from scipy.spatial.transform import Rotation
 from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations, Output
 from knode_cosserat.recordings.config import (
     POSITION_UNITS,
-    PRESSURE_UNITS,
     SENSOR_UNITS,
     MotorSource,
     RecordingConfig,
@@ -24,7 +24,7 @@ from knode_cosserat.recordings.config import (
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
 from knode_cosserat.recordings.recording import bridge, continuous
-from knode_cosserat.recordings.streams import SLOW, Body, Sensor, Tensions, period
+from knode_cosserat.recordings.streams import SLOW, Body, Rows, Sensor, Tensions, period
 
 #: allowed numbers in a row of a sensor, by its kind; of curvatures two for each place
 SENSOR_COUNTS = {"orientation": (4, 3), "bending_angle": (2,), "base_wrench": (6,)}
@@ -44,88 +44,86 @@ FACTOR = 20.0
 RARE = 0.05
 
 
-@dataclasses.dataclass
-class _Rows:
-    """Rows of a topic, times (s) and numbers, from which errors are removed; and findings on these."""
+class Sensed(NamedTuple):
+    """Streams of a recording without errors; positions are in the recording's own frame and unit."""
 
-    topic: str
-    time: Float[np.ndarray, " n"]
-    values: Float[np.ndarray, "n size"]
-    findings: list[Finding] = dataclasses.field(default_factory=list)
+    bodies: list[Body]
+    base: Body | None
+    sensors: list[Sensor]
+    tension: Tensions | None
+    command: Tensions | None
 
-    def drop(self, wrong: Bool[np.ndarray, " n"], words: Sequence[str], severity: Severity) -> None:
-        """Remove rows, with a finding in words: for one row, for several, and the reason."""
-        one, several, reason = words
-        if wrong.any():
-            self.add(f"{counted(int(wrong.sum()), one, several)} {reason}; left out", severity, wrong)
-            self.time, self.values = self.time[~wrong], self.values[~wrong]
 
-    def drop_unusable(self, wrong: Bool[np.ndarray, " n"], words: Sequence[str]) -> None:
-        """Remove rows with numbers that are not finite or implausibly large, and others that are wrong."""
-        large = ~np.all(np.abs(np.nan_to_num(self.values, nan=np.inf)) < 1e9, axis=1)
-        self.drop(wrong | large, words, "warning")
+def cleaned(config: RecordingConfig, rows: Mapping[str, Rows]) -> Sensed:
+    """Return the streams without errors; findings are added to those of the rows.
 
-    def require(self, config: RecordingConfig, what: str, name: str, path: str) -> None:
-        """Remove repeated rows, unless they are kept; `RecordingError` with fewer than two rows."""
-        if config.repeats == "drop":
-            again = np.concatenate([[False], np.all(np.diff(self.values, axis=0) == 0.0, axis=1)])
-            words = f"{what} repeats", f"{what}s repeat", "the one before"
-            self.drop(again[: len(self.time)], words, "note")
-        if len(self.time) < FEWEST_FRAMES:
-            count = f"{len(self.time)} usable {what}s of {name}; required is {FEWEST_FRAMES} or more"
-            raise RecordingError(f"{path}: topic {self.topic}: {count}")
+    Raises:
+        RecordingError: a body or sensor has fewer than two usable rows, rows have another count of numbers
+            than the configuration, or required tensions have no usable row.
+    """
+    bodies = [_body(config, it.name, it.fraction, rows[it.topic]) for it in config.markers]
+    base = _body(config, "base", math.nan, rows[config.base.topic]) if config.base else None
+    sensors = [_sensor(config, source, rows[source.topic]) for source in config.sensors]
+    tension, command = (
+        _tensions(config, source, rows[source.topic], kind) if source and source.topic in rows else None
+        for source, kind in ((config.measured, "measured"), (config.command, "commanded"))
+    )
+    return Sensed(bodies, base, sensors, tension, command)
 
-    def add(self, message: str, severity: Severity, rows: Bool[np.ndarray, " n"]) -> None:
-        """Add a finding on rows."""
-        self.findings.append(Finding(severity, self.topic, message, tuple(self.time[rows][:1000].tolist())))
 
-    def add_pauses(self, longest: float) -> None:
-        """Add a finding on pauses that are too long to be bridged."""
-        steps = np.diff(self.time)
-        long = steps > bridge(self.time, longest)
-        if long.any():
-            begins = self.time[:-1][long]
-            pairs = zip(begins[:3], steps[long][:3], strict=True)
-            listed = ", ".join(f"{begin:.2f} to {begin + step:.2f} s" for begin, step in pairs)
-            more = f" and {len(begins) - 3} more" if len(begins) > 3 else ""
-            pauses = counted(len(begins), "pause", "pauses")
-            what = f"{pauses} too long to be bridged ({listed}{more}): the recording is in parts"
-            self.findings.append(Finding("warning", self.topic, what, tuple(begins.tolist())))
+def _drop(rows: Rows, wrong: Bool[np.ndarray, " n"], words: tuple[str, str, str], severity: Severity) -> None:
+    """Remove rows, with a finding in words: for one row, for several, and the reason."""
+    one, several, reason = words
+    if wrong.any():
+        rows.add(f"{counted(int(wrong.sum()), one, several)} {reason}; left out", severity, wrong)
+        rows.keep(~wrong)
+
+
+def _drop_unusable(rows: Rows, wrong: Bool[np.ndarray, " n"], words: tuple[str, str, str]) -> None:
+    """Remove rows with numbers that are not finite or implausibly large, and others that are wrong."""
+    large = ~np.all(np.abs(np.nan_to_num(rows.values, nan=np.inf)) < 1e9, axis=1)
+    _drop(rows, wrong | large, words, "warning")
+
+
+def _require(rows: Rows, config: RecordingConfig, what: str, name: str) -> None:
+    """Remove repeated rows, unless they are kept; `RecordingError` with fewer than two rows."""
+    if config.repeats == "drop":
+        again = np.concatenate([[False], np.all(np.diff(rows.values, axis=0) == 0.0, axis=1)])
+        words = f"{what} repeats", f"{what}s repeat", "the one before"
+        _drop(rows, again[: len(rows.time)], words, "note")
+    if len(rows.time) < FEWEST_FRAMES:
+        count = f"{len(rows.time)} usable {what}s of {name}; required is {FEWEST_FRAMES} or more"
+        raise RecordingError(f"topic {rows.topic}: {count}")
+
+
+def _add_pauses(rows: Rows, longest: float) -> None:
+    """Add a finding on pauses that are too long to be bridged."""
+    steps = np.diff(rows.time)
+    long = steps > bridge(rows.time, longest)
+    if long.any():
+        begins = rows.time[:-1][long]
+        pairs = zip(begins[:3], steps[long][:3], strict=True)
+        listed = ", ".join(f"{begin:.2f} to {begin + step:.2f} s" for begin, step in pairs)
+        more = f" and {len(begins) - 3} more" if len(begins) > 3 else ""
+        pauses = counted(len(begins), "pause", "pauses")
+        what = f"{pauses} too long to be bridged ({listed}{more}): the recording is in parts"
+        rows.findings.append(Finding("warning", rows.topic, what, tuple(begins.tolist())))
 
 
 # poses
 
 
-def cleaned_body(
-    config: RecordingConfig, source: tuple[str, str, float], time: np.ndarray, pose: np.ndarray, path: str
-) -> tuple[Body, list[Finding]]:
-    """Return a body without errors, in the recording's own frame and units, and the findings.
-
-    `source` is its name, topic and fraction; `pose` has positions and, if known, quaternions; `path` is named
-    in errors.
-
-    Raises:
-        RecordingError: the body has fewer than two usable frames.
-    """
-    name, topic, fraction = source
-    rows, is_oriented = _Rows(topic, time, pose), pose.shape[1] == 7
-    no_rotation = np.zeros(len(time), dtype=bool)
+def _body(config: RecordingConfig, name: str, fraction: float, rows: Rows) -> Body:
+    """Return a body without jumps and swapped axes. Raises `RecordingError` with fewer than two frames."""
+    is_oriented = rows.values.shape[1] == 7
+    no_rotation = np.zeros(len(rows.time), dtype=bool)
     if is_oriented:
         # some drivers send a zero quaternion while the body is not seen
         with np.errstate(all="ignore"):
-            no_rotation = ~(np.abs(np.linalg.norm(pose[:, 3:], axis=1) - 1.0) < 0.05)
-    rows.drop_unusable(no_rotation, ("pose is", "poses are", "not finite, or no rotation"))
-    rows.require(config, "pose", name, path)
-    unclear: list[int] = []
-    if is_oriented:
-        quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
-        quaternion, swaps, unclear = swaps_undone(rows.time, quaternion)
-        rows.values = np.concatenate([rows.values[:, :3], quaternion], axis=1)
-        for row, angle, axis in swaps:
-            when = float(rows.time[row])
-            turned = f"by {angle:.0f} degrees about {axis}"
-            what = f"its axes were swapped at {when:.3f} s, {turned}; undone"
-            rows.findings.append(Finding("warning", topic, what, (when,)))
+            no_rotation = ~(np.abs(np.linalg.norm(rows.values[:, 3:], axis=1) - 1.0) < 0.05)
+    _drop_unusable(rows, no_rotation, ("pose is", "poses are", "not finite, or no rotation"))
+    _require(rows, config, "pose", name)
+    unclear = _undo_swaps(rows) if is_oriented else []
     wrong = np.zeros(len(rows.time), dtype=bool)
     if not config.static:
         # as many rows as can be bridged, but not most of the filter's window
@@ -139,34 +137,43 @@ def cleaned_body(
     large = [row for row in unclear if not wrong[row - 1 : row + 1].any()]
     if large:
         what = f"{counted(len(large), 'turn', 'turns')} too large for a motion, and no swap of axes"
-        mask = np.isin(np.arange(len(wrong)), large)
-        rows.add(f"{what}; left as seen", "warning", mask)
-    rows.drop(wrong, ("pose jumps", "poses jump", "out of the motion and back"), "note")
-    rows.add_pauses(config.longest_gap)
+        rows.add(f"{what}; left as seen", "warning", np.isin(np.arange(len(wrong)), large))
+    _drop(rows, wrong, ("pose jumps", "poses jump", "out of the motion and back"), "note")
+    _add_pauses(rows, config.longest_gap)
     orientation = rows.values[:, 3:] if is_oriented else None
-    return Body(rows.time, rows.values[:, :3], orientation, name, topic, fraction), rows.findings
+    return Body(rows.time, rows.values[:, :3], orientation, name, rows.topic, fraction)
+
+
+def _undo_swaps(rows: Rows) -> list[int]:
+    """Undo swapped axes of poses, with findings, and return the rows of other large rotations."""
+    quaternion = rows.values[:, 3:] / np.linalg.norm(rows.values[:, 3:], axis=1, keepdims=True)
+    quaternion, swaps, unclear = swaps_undone(rows.time, quaternion)
+    rows.values = np.concatenate([rows.values[:, :3], quaternion], axis=1)
+    for row, angle, axis in swaps:
+        when = float(rows.time[row])
+        what = f"its axes were swapped at {when:.3f} s, by {angle:.0f} degrees about {axis}; undone"
+        rows.findings.append(Finding("warning", rows.topic, what, (when,)))
+    return unclear
 
 
 # other sensors
 
 
-def cleaned_sensor(
-    config: RecordingConfig, source: SensorSource, time: np.ndarray, numbers: np.ndarray, path: str
-) -> tuple[Sensor, list[Finding]]:
-    """Return a sensor's usable rows in SI units and in the robot's frame, and the findings.
+def _sensor(config: RecordingConfig, source: SensorSource, rows: Rows) -> Sensor:
+    """Return a sensor's usable rows in SI units and in the robot's frame.
 
     Raises:
         RecordingError: another number of numbers than its kind has, or too few usable rows.
     """
     counts = SENSOR_COUNTS.get(source.kind, (2 * len(source.fractions),))
-    if (count := numbers.shape[1]) not in counts:
+    if (count := rows.values.shape[1]) not in counts:
         words = f"allowed for {source.kind} is {' or '.join(map(str, counts))}"
-        raise RecordingError(f"{path}: {source.topic} has {count} numbers in a row; {words}")
-    rows = _Rows(source.topic, time, numbers)
+        raise RecordingError(f"{source.topic} has {count} numbers in a row; {words}")
     is_turn = source.kind == "orientation" and count == 4
-    length = np.linalg.norm(numbers, axis=1) if is_turn else np.ones(len(time))
-    rows.drop_unusable(~(np.abs(length - 1.0) < 0.05), ("row is", "rows are", "not finite, or no rotation"))
-    rows.require(config, "row", source.kind, path)
+    length = np.linalg.norm(rows.values, axis=1) if is_turn else np.ones(len(rows.time))
+    wrong = ~(np.abs(length - 1.0) < 0.05)
+    _drop_unusable(rows, wrong, ("row is", "rows are", "not finite, or no rotation"))
+    _require(rows, config, "row", source.kind)
     units = SENSOR_UNITS[source.kind]
     values = rows.values * units[source.unit or next(iter(units))]
     frame = Rotation.from_quat(source.rotation or (1.0, 0.0, 0.0, 0.0), scalar_first=True)
@@ -183,58 +190,46 @@ def cleaned_sensor(
     elif source.kind == "base_wrench":
         output = BaseWrench()
         values = frame.apply(values.reshape(-1, 3)).reshape(values.shape)
-    rows.add_pauses(config.longest_gap)
-    return Sensor(rows.time, values, output, rows.topic), rows.findings
+    _add_pauses(rows, config.longest_gap)
+    return Sensor(rows.time, values, output, rows.topic)
 
 
 # tensions
 
 
-def cleaned_tensions(
-    config: RecordingConfig, seconds: Mapping[str, np.ndarray], values: Mapping[str, np.ndarray], path: str
-) -> tuple[Tensions | None, Tensions | None, list[Finding]]:
-    """Return measured and commanded tensions (N, tendon 1 first; None if absent), and the findings.
-
-    `seconds` (s) and `values` are by topic; `path` is named in errors.
+def _tensions(
+    config: RecordingConfig, source: TensionSource | MotorSource, rows: Rows, kind: str
+) -> Tensions | None:
+    """Return measured or commanded tensions (N, tendon 1 first); None without usable rows.
 
     Raises:
-        RecordingError: messages have another number of tendons, or required tensions have no usable row.
+        RecordingError: messages have another number of tendons, or tensions that are required have no usable
+            row.
     """
-    findings: list[Finding] = []
-    both: list[Tensions | None] = []
-    for kind, source in (("measured", config.measured), ("commanded", config.command)):
-        tensions = None
-        if source is not None and source.topic in seconds:
-            topic = source.topic
-            rows = _cleaned_rows(source, seconds[topic], values[topic], kind, path)
-            if len(rows.time):
-                tensions = Tensions(rows.time, rows.values, topic)
-                if kind == "measured":
-                    rows.add_pauses(config.longest_gap)
-            elif config.tensions == kind:
-                raise RecordingError(f"{path}: topic {topic}: no usable {kind} tension")
-            findings += rows.findings
-        both.append(tensions)
-    return both[0], both[1], findings
+    if len(rows.time):
+        _mend_tensions(source, rows, is_sample=kind == "measured" and not source.held)
+    else:
+        rows.findings.append(Finding("warning", source.topic, f"there are no {kind} tensions"))
+    if not len(rows.time):
+        if config.tensions == kind:
+            raise RecordingError(f"topic {source.topic}: no usable {kind} tension")
+        return None
+    if kind == "measured":
+        _add_pauses(rows, config.longest_gap)
+    return Tensions(rows.time, rows.values, source.topic)
 
 
-def _cleaned_rows(
-    source: TensionSource | MotorSource, time: np.ndarray, sent: np.ndarray, kind: str, path: str
-) -> _Rows:
-    if len(sent) == 0:
-        return _Rows(
-            source.topic, time, sent, [Finding("warning", source.topic, f"there are no {kind} tensions")]
-        )
-    if sent.shape[1] != len(source.order):
+def _mend_tensions(source: TensionSource | MotorSource, rows: Rows, *, is_sample: bool) -> None:
+    """Bring tensions to N in the order of the tendons, and remove errors; samples also lose spikes."""
+    if rows.values.shape[1] != len(source.order):
         raise RecordingError(
-            f"{path}: topic {source.topic}: a message has {sent.shape[1]} tensions; "
+            f"topic {source.topic}: a message has {rows.values.shape[1]} tensions; "
             f"the configuration's order has {len(source.order)} tendons"
         )
-    rows = _Rows(source.topic, time, sent[:, np.argsort(source.order)] * source.factor)
-    rows.drop_unusable(np.zeros(len(time), dtype=bool), ("tension is", "tensions are", "not finite"))
-    if not isinstance(source, TensionSource) or source.unit in PRESSURE_UNITS:
-        return rows
-    is_sample = kind == "measured" and not source.held
+    rows.values = rows.values[:, np.argsort(source.order)] * source.factor
+    _drop_unusable(rows, np.zeros(len(rows.time), dtype=bool), ("tension is", "tensions are", "not finite"))
+    if not source.is_force:
+        return
     wrong = implausible_tensions(rows.values)
     if wrong.any():
         worst = rows.values[wrong].ravel()
@@ -247,15 +242,14 @@ def _cleaned_rows(
         fate: tuple[str, Severity] = ("left out", "warning") if is_sample else ("kept", "problem")
         rows.add(f"{what}; {fate[0]}", fate[1], wrong)
         if is_sample:
-            rows.time, rows.values = rows.time[~wrong], rows.values[~wrong]
+            rows.keep(~wrong)
     if is_sample and 0.0 < period(rows.time) <= LONGEST_SPIKE:
         longest = min(2, int(LONGEST_SPIKE / period(rows.time)))
         spikes = [
             outliers(np.diff(tendon)[:, None], rows.time, floor=SMALLEST_PULL, longest=longest)
             for tendon in rows.values.T
         ]
-        rows.drop(np.any(spikes, axis=0), ("tension jumps", "tensions jump", "up or down and back"), "note")
-    return rows
+        _drop(rows, np.any(spikes, axis=0), ("tension jumps", "tensions jump", "up or down and back"), "note")
 
 
 # outliers
@@ -354,20 +348,16 @@ def swaps_undone(
 
 
 def implausible_sizes(
-    bodies: Sequence[Body],
-    tensions: tuple[Tensions | None, Tensions | None],
-    at_rest: Float[np.ndarray, "M 3"] | None,
-    *,
-    is_static: bool,
+    sensed: Sensed, at_rest: Float[np.ndarray, "M 3"] | None, config: RecordingConfig
 ) -> list[Finding]:
     """Return findings on implausible times and units, with the likely error.
 
-    `tensions` are measured and commanded ones, `at_rest` the positions of the bodies at rest (m), if known.
-    Times of equilibria (`is_static`) are arbitrary.
+    The streams are in the robot's frame; `at_rest` are the positions of the bodies at rest (m), if known.
+    Times of equilibria are arbitrary.
     """
-    findings, sizes = [], []
-    for stream, is_measured in zip(tensions, (True, False), strict=True):
-        if stream is None:
+    findings, sizes = list[Finding](), []
+    for stream, source in ((sensed.tension, config.measured), (sensed.command, config.command)):
+        if stream is None or source is None or not source.is_force:
             continue
         size = float(np.median(np.abs(stream.tension)))
         sizes.append(size)
@@ -375,24 +365,24 @@ def implausible_sizes(
             hint = "newtons read as grams-force" if size < SLACK else "grams-force read as newtons"
             what = f"tensions of {size:.3g} N are not plausible: are {hint}?"
             findings.append(Finding("problem", stream.topic, what))
-        elif is_measured and np.median(stream.tension.min(axis=1)) < -SLACK:
+        elif stream is sensed.tension and np.median(stream.tension.min(axis=1)) < -SLACK:
             findings.append(Finding("warning", stream.topic, "tensions are below zero: is the sign right?"))
     if len(sizes) == 2 and min(sizes) > 0.0 and max(sizes) > FACTOR * min(sizes):
         what = (
             f"measured tensions are {sizes[0]:.3g} N and commanded ones {sizes[1]:.3g} N: not the same unit?"
         )
         findings.append(Finding("problem", "", what))
-    if not bodies:
+    if not sensed.bodies:
         return findings
-    places = [np.median(body.position, axis=0) for body in bodies] if at_rest is None else at_rest
+    places = [np.median(body.position, axis=0) for body in sensed.bodies] if at_rest is None else at_rest
     far = float(np.linalg.norm(places, axis=1).max())
     if not SHORT < far < LONG:
         what = (
             f"the bodies are up to {far:.3g} m from the clamped end: are positions in the unit that is said?"
         )
         findings.append(Finding("problem", "", what))
-    time = min((body.time for body in bodies), key=period)
-    if not is_static and SLOW <= period(time) < np.inf:
+    time = min((body.time for body in sensed.bodies), key=period)
+    if not config.static and SLOW <= period(time) < np.inf:
         what = (
             f"poses are {period(time):.3g} s apart, and the recording takes "
             f"{(time[-1] - time[0]) / 3600.0:.2g} h: are the times in ms? "

@@ -24,16 +24,29 @@ the columns; several bodies need their fractions in `markers`.
 from __future__ import annotations
 
 import dataclasses
-import fractions
 import functools
 import itertools
 import math
-from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self, get_origin, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
+from knode_cosserat._settings import (
+    FLAG,
+    LINE,
+    TEXT,
+    Rule,
+    ValidatedSettings,
+    choice,
+    finite_number,
+    items,
+    number,
+    numbers,
+    part,
+    parts,
+    plain,
+)
 from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -64,213 +77,103 @@ UP: dict[str, Vector] = {
 MAPPED = {"tensions": "tension", "commands": "command", "motors": "motor"}
 
 
-# checks: functions from a value and its name to the value as it is stored, or a `RecordingError`
-
-_Check = Callable[[Any, str], Any]
+# rules of settings
 
 
-def _refused(value: Any, name: str, words: str) -> RecordingError:
-    return RecordingError(f"{name} is {shown(value)}; allowed is {words}")
-
-
-def _text(value: Any, name: str) -> str:
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
-        raise _refused(value, name, "text on one line")
-    return value
-
-
-def _any_text(value: Any, name: str) -> str:
-    if not isinstance(value, str):
-        raise _refused(value, name, "text")
-    return value
-
-
-def _flag(value: Any, name: str) -> bool:
-    if not isinstance(value, bool):
-        raise _refused(value, name, "true or false")
-    return value
-
-
-def _choice(words: Any) -> _Check:
-    def check(value: Any, name: str) -> Any:
-        if not isinstance(value, str) or value not in words:
-            raise _refused(value, name, " or ".join(words))
-        return value
-
-    return check
-
-
-def _number(low: float, high: float, unit: str = "") -> _Check:
-    def check(value: Any, name: str) -> float:
-        number = _real(value)
-        if number is None or not low <= number <= high:
-            raise _refused(value, name, f"a number from {low:g} to {high:g} {unit}".strip())
-        return number
-
-    return check
-
-
-def _real(value: Any) -> float | None:
-    """Return a finite number, also from text such as 3/9; None for anything else."""
-    try:
-        if isinstance(value, str) and value.count("/") == 1 and len(value) < 40:
-            return float(fractions.Fraction(value.replace(" ", "")))
-        if isinstance(value, bool | str) or value is None:
-            return None
-        number = float(value)
-    except (TypeError, ValueError, OverflowError, ZeroDivisionError):
+def _unit_quaternion(value: Any) -> Vector | None:
+    known = numbers(4, "").read(value)
+    if known is None or abs((size := math.hypot(*known)) - 1.0) > 1e-3:
         return None
-    return number if math.isfinite(number) else None
-
-
-def _listed(value: Any) -> list[Any]:
-    return list(value) if isinstance(value, list | tuple) else []
-
-
-def _numbers(count: int, words: str) -> _Check:
-    def check(value: Any, name: str) -> Vector:
-        numbers = [number for number in map(_real, _listed(value)) if number is not None]
-        if not len(numbers) == len(_listed(value)) == count:
-            raise _refused(value, name, words)
-        return tuple(numbers)
-
-    return check
-
-
-def _fractions(value: Any, name: str) -> Vector:
-    return tuple(_number(0.0, 1.0)(place, name) for place in _listed(value) or [value])
-
-
-def _quaternion(value: Any, name: str) -> Vector:
-    words = "a quaternion of length 1, scalar first"
-    numbers = _numbers(4, words)(value, name)
-    size = math.hypot(*numbers)
-    if abs(size - 1.0) > 1e-3:
-        raise _refused(value, name, words)
     # a quaternion written with few digits has length 1 only to these digits
-    return numbers if abs(size - 1.0) < 1e-12 else tuple(number / size for number in numbers)
+    return known if abs(size - 1.0) < 1e-12 else tuple(one / size for one in known)
 
 
-def _interval(is_open: bool) -> _Check:
-    def check(value: Any, name: str) -> tuple[float | None, ...]:
-        listed = _listed(value)
-        ends = [_real(end) for end in listed]
-        unread = any(
-            end is None and not (is_open and word is None) for end, word in zip(ends, listed, strict=True)
-        )
+QUATERNION = Rule(
+    "a quaternion of length 1, scalar first",
+    _unit_quaternion,
+    {"type": "array", "items": {"type": "number"}, "minItems": 4, "maxItems": 4},
+)
+
+
+def _interval(is_open: bool) -> Rule:
+    def read(value: Any) -> tuple[float | None, ...] | None:
+        ends = [finite_number(end) for end in items(value)]
         known = [end for end in ends if end is not None]
-        if len(ends) != 2 or unread or (len(known) == 2 and not known[0] < known[1]):
-            words = "[start, end] in s, start before end" + (", either of them null" if is_open else "")
-            raise _refused(value, name, words)
-        return tuple(ends)
-
-    return check
-
-
-def _order(value: Any, name: str) -> tuple[int, ...]:
-    numbers = _listed(value)
-    whole = all(isinstance(number, int) and not isinstance(number, bool) for number in numbers)
-    if not numbers or not whole or sorted(numbers) != list(range(1, len(numbers) + 1)):
-        raise _refused(value, name, "the tendons 1, 2, 3, … in the order of the wire")
-    return tuple(numbers)
-
-
-def _templates(count: int) -> _Check:
-    """Return the check of titles of columns, each with a place for a number or a topic."""
-
-    def check(value: Any, name: str) -> tuple[str, ...]:
-        titles = _listed(value)
-        has_place = [isinstance(title, str) and title.count(PLACE) == 1 for title in titles]
-        if len(titles) != count or not all(has_place):
-            words = "text" if count == 1 else f"{count} texts"
-            raise _refused(value, name, f"{words}, with one {PLACE} in each")
-        return tuple(titles)
-
-    return check
-
-
-def _template(value: Any, name: str) -> str:
-    return str(_templates(1)([value], name)[0])
-
-
-def _titles(*counts: int) -> _Check:
-    """Return the check of titles, or numbers, of columns: so many of them, or any number."""
-
-    def check(value: Any, name: str) -> tuple[str, ...]:
-        titles = _listed(value)
-        fair = all(isinstance(title, str | int) and not isinstance(title, bool) for title in titles)
-        texts = tuple(str(title).strip() for title in titles)
-        if not titles or not fair or len(set(texts)) < len(texts) or (counts and len(texts) not in counts):
-            words = f"{' or '.join(map(str, counts))} titles" if counts else "a list of titles"
-            raise _refused(value, name, f"{words} of columns, each once")
-        return texts
-
-    return check
-
-
-def _bodies(value: Any, name: str) -> tuple[tuple[str, tuple[str, ...]], ...]:
-    return tuple((_text(body, "body"), _titles(3, 7)(titles, str(body))) for body, titles in value)
-
-
-def _time_title(value: Any, name: str) -> str:
-    return _text(str(value) if type(value) is int else value, name).strip()
-
-
-@functools.cache
-def _checks(kind: type) -> dict[str, _Check]:
-    """Return the checks of settings by name, from the annotations of their fields."""
-    hints = get_type_hints(kind, include_extras=True)
-    return {name: hint.__metadata__[0] for name, hint in hints.items() if get_origin(hint) is Annotated}
-
-
-class _Settings:
-    """Settings whose fields are checked when they are made; a field whose default is None may be None."""
-
-    def __post_init__(self) -> None:
-        defaults = {field.name: field.default for field in dataclasses.fields(self)}  # type: ignore[arg-type]
-        for name, check in _checks(type(self)).items():  # type: ignore[arg-type]
-            value = getattr(self, name)
-            if value is not None or defaults[name] is not None:
-                self._set(name, check(value, name))
-
-    def _set(self, name: str, value: Any) -> None:
-        object.__setattr__(self, name, value)
-
-    @classmethod
-    def from_dict(cls, values: dict[Any, Any]) -> Self:
-        """Return settings from plain values; missing keys get defaults. Raises `RecordingError`."""
-        fields = dataclasses.fields(cls)  # type: ignore[arg-type]
-        for key in values:
-            _require_known(key, [field.name for field in fields])
-        required = [field.name for field in fields if field.default is dataclasses.MISSING]
-        missing = [name for name in required if values.get(name) is None]
-        if missing:
-            raise RecordingError(f"the key {missing[0]} is missing; required is {', '.join(required)}")
-        return cls(**values)
-
-
-def _require_known(key: Any, known: list[str]) -> None:
-    if key not in known:
-        raise RecordingError(
-            f"the key {shown(key)} is unknown; allowed is {', '.join(known)}{did_you_mean(key, known)}"
+        is_read = all(
+            end is not None or (is_open and word is None)
+            for end, word in zip(ends, items(value), strict=True)
         )
+        return tuple(ends) if len(ends) == 2 and is_read and known == sorted(set(known)) else None
+
+    words = "[start, end] in s, start before end" + (", either of them null" if is_open else "")
+    end = {"type": ["number", "null"] if is_open else "number"}
+    return Rule(words, read, {"type": "array", "items": end, "minItems": 2, "maxItems": 2})
 
 
-def _part(kind: Any) -> _Check:
-    """Return the check of settings within settings, or of a mapping of them."""
+def _order(value: Any) -> tuple[int, ...] | None:
+    listed = items(value)
+    whole = all(type(one) is int for one in listed)
+    return tuple(listed) if listed and whole and sorted(listed) == list(range(1, len(listed) + 1)) else None
 
-    def check(value: Any, name: str) -> Any:
-        if isinstance(value, dict):
-            try:
-                return kind.from_dict(value)
-            except RecordingError as error:
-                raise RecordingError(f"{name}: {error}") from None
-        if type(value) is not kind:
-            keys = ", ".join(field.name for field in dataclasses.fields(kind))
-            raise _refused(value, name, f"a {kind.__name__}, or nothing; or a mapping with {keys}")
-        return value
 
-    return check
+ORDER = Rule(
+    "the tendons 1, 2, 3, … in the order of the wire",
+    _order,
+    {"type": "array", "items": {"type": "integer", "minimum": 1}},
+)
+
+
+def _place(value: Any) -> Any:
+    return value if isinstance(value, str) and value.count(PLACE) == 1 else None
+
+
+def _templates(count: int) -> Rule:
+    """Return the rule of titles of columns, each with a place for a topic."""
+
+    def read(value: Any) -> tuple[str, ...] | None:
+        titles = tuple(map(_place, items(value)))
+        return titles if len(titles) == count and all(titles) else None
+
+    words = f"{count} texts, with one {PLACE} in each"
+    return Rule(
+        words, read, {"type": "array", "items": {"type": "string"}, "minItems": count, "maxItems": count}
+    )
+
+
+TEMPLATE = Rule(f"text, with one {PLACE} in it", _place, {"type": "string"})
+
+
+def _titles(*counts: int) -> Rule:
+    """Return the rule of titles, or numbers, of columns: so many of them, or any number."""
+
+    def read(value: Any) -> tuple[str, ...] | None:
+        fair = all(isinstance(title, str | int) and not isinstance(title, bool) for title in items(value))
+        titles = tuple(str(title).strip() for title in items(value))
+        is_counted = len(titles) in counts if counts else bool(titles)
+        return titles if fair and is_counted and len(set(titles)) == len(titles) else None
+
+    words = f"{' or '.join(map(str, counts))} titles" if counts else "a list of titles"
+    schema = {"type": "array", "items": {"type": ["string", "integer"]}, "minItems": 1, "uniqueItems": True}
+    return Rule(f"{words} of columns, each once", read, schema)
+
+
+def _fractions(value: Any) -> Vector | None:
+    places = [number(0.0, 1.0).read(place) for place in items(value) or [value]]
+    return None if None in places else tuple(places)
+
+
+def _names(value: Any) -> tuple[str, ...] | None:
+    names = tuple(map(LINE.read, [value] if isinstance(value, str) else items(value)))
+    return names if names and None not in names and len(set(names)) == len(names) else None
+
+
+NAMES = Rule(
+    "names on one line, each once", _names, {"type": ["string", "array"], "items": {"type": "string"}}
+)
+
+
+class _Settings(ValidatedSettings):
+    error = RecordingError
 
 
 # sources
@@ -290,32 +193,13 @@ class MarkerSource(_Settings):
         deviation: standard deviation of `fraction`, if it is not well known: it is identified with the robot.
     """
 
-    name: Annotated[str, _text]
-    topic: Annotated[str, _text]
-    fraction: Annotated[float, _number(0.0, 1.0)]
-    rotation: Annotated[Vector | None, _quaternion] = None
-    deviation: Annotated[float | None, _number(0.0, 1.0)] = None
+    implied: ClassVar = {"topic": "name"}
 
-
-def _markers(value: Any, name: str) -> tuple[MarkerSource, ...]:
-    markers = []
-    for k, marker in enumerate(_listed(value)):
-        where = f"{name}, number {k + 1}"
-        if not isinstance(marker, MarkerSource):
-            if not isinstance(marker, dict):
-                raise _refused(marker, where, "a mapping with name, topic, fraction, rotation")
-            # without a topic it is called like the marker
-            named = {"topic": marker["name"]} if "name" in marker else {}
-            marker = _part(MarkerSource)(named | marker, where)
-        markers.append(marker)
-    if not markers and value not in ([], ()):
-        raise _refused(value, name, "a list of markers")
-    places, names = [marker.fraction for marker in markers], [marker.name for marker in markers]
-    if any(b <= a for a, b in itertools.pairwise(places)):
-        raise RecordingError(f"markers have the fractions {shown(places)}; allowed is each above the last")
-    if len(set(names)) < len(names):
-        raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
-    return tuple(markers)
+    name: Annotated[str, LINE]
+    topic: Annotated[str, LINE]
+    fraction: Annotated[float, number(0.0, 1.0)]
+    rotation: Annotated[Vector | None, QUATERNION] = None
+    deviation: Annotated[float | None, number(0.0, 1.0)] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -333,35 +217,32 @@ class SensorSource(_Settings):
         rotation: quaternion from its global frame to the robot's, of orientations and wrenches.
     """
 
-    kind: Annotated[str, _choice(SENSOR_UNITS)]
-    topic: Annotated[str, _text]
+    implied: ClassVar = {"topic": "kind"}
+
+    kind: Annotated[str, choice(SENSOR_UNITS)]
+    topic: Annotated[str, LINE]
     columns: Annotated[tuple[str, ...] | None, _titles()] = None
-    fractions: Annotated[Vector, _fractions] = (1.0,)
+    fractions: Annotated[Vector, Rule("numbers from 0 to 1", _fractions, {"type": ["number", "array"]})] = (
+        1.0,
+    )
     unit: str | None = None
-    rotation: Annotated[Vector | None, _quaternion] = None
+    rotation: Annotated[Vector | None, QUATERNION] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.unit is not None:
-            _choice(SENSOR_UNITS[self.kind])(self.unit, "unit")
+            self.accept("unit", choice(SENSOR_UNITS[self.kind]))
         if self.kind != "curvature" and len(self.fractions) > 1:
-            raise _refused(self.fractions, "fractions", f"one place for {self.kind}: list a sensor for each")
-
-
-def _sensors(value: Any, name: str) -> tuple[SensorSource, ...]:
-    sensors = []
-    for k, sensor in enumerate(_listed(value)):
-        named = {"topic": sensor.get("kind")} | sensor if isinstance(sensor, dict) else sensor
-        sensors.append(_part(SensorSource)(named, f"{name}, number {k + 1}"))
-    return tuple(sensors)
+            words = f"one place for {self.kind}: list a sensor for each"
+            raise self.refusal("fractions", self.fractions, words)
 
 
 @dataclasses.dataclass(frozen=True)
 class BaseSource(_Settings):
     """Body fixed to the base, `height` (m) above the rod's clamped end."""
 
-    topic: Annotated[str, _text]
-    height: Annotated[float, _number(-10.0, 10.0, "m")] = 0.0
+    topic: Annotated[str, LINE]
+    height: Annotated[float, number(-10.0, 10.0, "m")] = 0.0
 
 
 class _NumbersSource(_Settings):
@@ -372,6 +253,7 @@ class _NumbersSource(_Settings):
     names: tuple[str, ...] | None
     unit: str
     gain: float | None
+    held: bool | None = None
 
     @property
     def factor(self) -> float:
@@ -380,26 +262,28 @@ class _NumbersSource(_Settings):
             1.0 if self.gain is None else self.gain
         )
 
+    @property
+    def is_force(self) -> bool:
+        """True for tensions (N), and False for pressures and for motors."""
+        return self.unit in TENSION_UNITS
+
     def __post_init__(self) -> None:
-        names = None
         if self.names is not None:
-            names = tuple(_text(name, "names") for name in _listed(self.names) or [self.names])
-            if len(set(names)) < len(names) or self.names in ([], ()):
-                raise _refused(list(_listed(self.names)), "names", "each name once")
-            self._set("order", self.order or tuple(range(1, len(names) + 1)))
-        self._set("names", names)
+            self.accept("names", NAMES)
         if self.order == ():
-            raise RecordingError("the key order is missing; required is topic, order or names")
+            if not self.names:
+                raise RecordingError("the key order is missing; required is topic, order or names")
+            object.__setattr__(self, "order", tuple(range(1, len(self.names) + 1)))
         super().__post_init__()
-        if names is not None and len(names) != len(self.order):
+        if self.names is not None and len(self.names) != len(self.order):
             raise RecordingError(
-                f"names has {len(names)} names and order {len(self.order)} numbers; allowed is the same "
+                f"names has {len(self.names)} names and order {len(self.order)} numbers; allowed is the same "
                 "number"
             )
         if self.gain == 0.0:
-            raise _refused(self.gain, "gain", "any other number")
+            raise self.refusal("gain", self.gain, "any other number")
         if self.topic.count(PLACE) > 1:
-            raise _refused(self.topic, "topic", f"one {PLACE} at most")
+            raise self.refusal("topic", self.topic, f"one {PLACE} at most")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -419,20 +303,12 @@ class TensionSource(_NumbersSource):
             None: joints whose names end in numbers are matched by these.
     """
 
-    topic: Annotated[str, _text]
-    order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[Literal["N", "gf", "Pa", "kPa", "bar"], _choice({**TENSION_UNITS, **PRESSURE_UNITS})] = (
-        "N"
-    )
-    held: Annotated[bool | None, _flag] = None
-    names: tuple[str, ...] | None = None
-    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
-
-
-def _command_text(value: Any, name: str) -> str:
-    if str(value).count(PLACE) != 1:
-        raise _refused(value, name, f"text with one {PLACE} where the numbers stand")
-    return str(value)
+    topic: Annotated[str, LINE]
+    order: Annotated[tuple[int, ...], ORDER] = ()
+    unit: Annotated[Literal["N", "gf", "Pa", "kPa", "bar"], choice({**TENSION_UNITS, **PRESSURE_UNITS})] = "N"
+    held: Annotated[bool | None, FLAG] = None
+    names: Annotated[tuple[str, ...] | None, NAMES] = None
+    gain: Annotated[float | None, number(-1e6, 1e6)] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -445,8 +321,10 @@ class CommandSource(TensionSource):
         latency: delay from a command's stamp until it reaches the tendons (s).
     """
 
-    text: Annotated[str | None, _command_text] = None
-    latency: Annotated[float, _number(0.0, 10.0, "s")] = 0.0
+    text: Annotated[str | None, TEMPLATE._replace(words=f"text with one {PLACE} where the numbers stand")] = (
+        None
+    )
+    latency: Annotated[float, number(0.0, 10.0, "s")] = 0.0
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -469,12 +347,12 @@ class MotorSource(_NumbersSource):
             its positions.
     """
 
-    topic: Annotated[str, _text]
-    order: Annotated[tuple[int, ...], _order] = ()
-    unit: Annotated[Literal["rad", "deg", "m", "mm"], _choice(MOTOR_UNITS)] = "rad"
-    latency: Annotated[float, _number(-10.0, 10.0, "s")] = 0.0
-    names: tuple[str, ...] | None = None
-    gain: Annotated[float | None, _number(-1e6, 1e6)] = None
+    topic: Annotated[str, LINE]
+    order: Annotated[tuple[int, ...], ORDER] = ()
+    unit: Annotated[Literal["rad", "deg", "m", "mm"], choice(MOTOR_UNITS)] = "rad"
+    latency: Annotated[float, number(-10.0, 10.0, "s")] = 0.0
+    names: Annotated[tuple[str, ...] | None, NAMES] = None
+    gain: Annotated[float | None, number(-1e6, 1e6)] = None
 
 
 @dataclasses.dataclass(frozen=True)
@@ -488,10 +366,17 @@ class TableSource(_Settings):
         motor: title of a motor's angle, or of a tension, with `{}` in place of its number.
     """
 
-    rate: Annotated[float | None, _number(1e-6, 1e6, "Hz")] = None
+    rate: Annotated[float | None, number(1e-6, 1e6, "Hz")] = None
     position: Annotated[tuple[str, ...] | None, _templates(3)] = None
     quaternion: Annotated[tuple[str, ...] | None, _templates(4)] = None
-    motor: Annotated[str | None, _template] = None
+    motor: Annotated[str | None, TEMPLATE] = None
+
+
+def _title(value: Any) -> str | None:
+    return LINE.read(str(value).strip() if type(value) is int else value)
+
+
+BODY_TITLES = _titles(3, 7)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -508,12 +393,20 @@ class ColumnMap(_Settings):
         motors: titles of motors' angles.
     """
 
-    bodies: Annotated[tuple[tuple[str, tuple[str, ...]], ...], _bodies] = ()
-    time: Annotated[str | None, _time_title] = None
-    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, _choice(TIME_UNITS)] = None
+    bodies: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    time: Annotated[str | None, LINE._replace(read=_title, schema={"type": ["string", "integer"]})] = None
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, choice(TIME_UNITS)] = None
     tensions: Annotated[tuple[str, ...] | None, _titles()] = None
     commands: Annotated[tuple[str, ...] | None, _titles()] = None
     motors: Annotated[tuple[str, ...] | None, _titles()] = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        bodies = (
+            (self.accepted("body", name, LINE), self.accepted(str(name), titles, BODY_TITLES))
+            for name, titles in self.bodies
+        )
+        object.__setattr__(self, "bodies", tuple(bodies))
 
     @classmethod
     def from_dict(cls, values: dict[Any, Any]) -> Self:
@@ -521,6 +414,18 @@ class ColumnMap(_Settings):
         named = {field.name for field in dataclasses.fields(cls)} - {"bodies"}
         bodies = tuple((key, titles) for key, titles in values.items() if key not in named)
         return cls(bodies, **{key: value for key, value in values.items() if key in named})
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the map as plain values."""
+        values = super().to_dict()
+        return values | dict(values.pop("bodies"))
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """Return the JSON Schema of a map, whose other keys are names of bodies."""
+        schema = super().json_schema()
+        del schema["properties"]["bodies"]
+        return schema | {"additionalProperties": BODY_TITLES.schema}
 
 
 # configuration
@@ -562,40 +467,49 @@ class RecordingConfig(_Settings):
         initial_tension: tensions (N) before the first row, tendon 1 first; None: estimated from the rest.
         simulated: True if the robot was itself a simulation; None: not stated.
         description: one-line description of the recording.
+        remarks: remarks on the guesses of a proposal: comments in its file, and not read from there.
 
     Raises:
         RecordingError: a value is not allowed.
     """
 
-    markers: Annotated[tuple[MarkerSource, ...], _markers] = ()
-    tension: Annotated[TensionSource | None, _part(TensionSource)] = None
-    motors: Annotated[MotorSource | None, _part(MotorSource)] = None
-    command: Annotated[CommandSource | None, _part(CommandSource)] = None
-    sensors: Annotated[tuple[SensorSource, ...], _sensors] = ()
-    base: Annotated[BaseSource | None, _part(BaseSource)] = None
-    table: Annotated[TableSource | None, _part(TableSource)] = None
-    columns: Annotated[ColumnMap | None, _part(ColumnMap)] = None
+    markers: Annotated[tuple[MarkerSource, ...], parts(MarkerSource, "a list of markers")] = ()
+    tension: Annotated[TensionSource | None, part(TensionSource)] = None
+    motors: Annotated[MotorSource | None, part(MotorSource)] = None
+    command: Annotated[CommandSource | None, part(CommandSource)] = None
+    sensors: Annotated[tuple[SensorSource, ...], parts(SensorSource, "a list of sensors")] = ()
+    base: Annotated[BaseSource | None, part(BaseSource)] = None
+    table: Annotated[TableSource | None, part(TableSource)] = None
+    columns: Annotated[ColumnMap | None, part(ColumnMap)] = None
     tensions: Annotated[
-        Literal["measured", "commanded", "none"], _choice(("measured", "commanded", "none"))
+        Literal["measured", "commanded", "none"], choice(("measured", "commanded", "none"))
     ] = "measured"
-    position_unit: Annotated[Literal["m", "mm"], _choice(POSITION_UNITS)] = "m"
-    up: Annotated[str | None, _choice(UP)] = None
-    origin: Annotated[Vector, _numbers(3, "three numbers (m)")] = (0.0, 0.0, 0.0)
-    rotation: Annotated[Vector, _quaternion] = (1.0, 0.0, 0.0, 0.0)
-    clock: Annotated[Literal["header", "received"], _choice(("header", "received"))] = "header"
-    static: Annotated[bool, _flag] = False
-    repeats: Annotated[Literal["keep", "drop"], _choice(("keep", "drop"))] = "keep"
-    longest_gap: Annotated[float, _number(0.0, 60.0, "s")] = 0.1
+    position_unit: Annotated[Literal["m", "mm"], choice(POSITION_UNITS)] = "m"
+    up: Annotated[str | None, choice(UP)] = None
+    origin: Annotated[Vector, numbers(3, "three numbers (m)")] = (0.0, 0.0, 0.0)
+    rotation: Annotated[Vector, QUATERNION] = (1.0, 0.0, 0.0, 0.0)
+    clock: Annotated[Literal["header", "received"], choice(("header", "received"))] = "header"
+    static: Annotated[bool, FLAG] = False
+    repeats: Annotated[Literal["keep", "drop"], choice(("keep", "drop"))] = "keep"
+    longest_gap: Annotated[float, number(0.0, 60.0, "s")] = 0.1
     rest: Annotated[Vector | None, _interval(is_open=False)] = None
     trim: Annotated[tuple[float | None, float | None], _interval(is_open=True)] = (None, None)
-    simulated: Annotated[bool | None, _flag] = None
-    description: Annotated[str, _any_text] = ""
-    initial_tension: Vector | None = None
+    simulated: Annotated[bool | None, FLAG] = None
+    description: Annotated[str, TEXT] = ""
+    initial_tension: Annotated[Vector | None, numbers(None, "numbers (N), one of each tendon")] = None
+    remarks: tuple[str, ...] = dataclasses.field(default=(), compare=False)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not self.markers and not self.sensors:
-            raise _refused(self.markers, "markers", "a list of one marker or more, or sensors")
+            raise self.refusal("markers", self.markers, "a list of one marker or more, or sensors")
+        places, names = [marker.fraction for marker in self.markers], [marker.name for marker in self.markers]
+        if any(b <= a for a, b in itertools.pairwise(places)):
+            raise RecordingError(
+                f"markers have the fractions {shown(places)}; allowed is each above the last"
+            )
+        if len(set(names)) < len(names):
+            raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":
@@ -614,8 +528,7 @@ class RecordingConfig(_Settings):
             )
         if self.initial_tension is not None:
             words = f"{self.tendons} numbers (N), one of each tendon"
-            numbers = _numbers(self.tendons, words)(self.initial_tension, "initial_tension")
-            self._set("initial_tension", numbers)
+            self.accept("initial_tension", numbers(self.tendons, words))
         sources = (*self.markers, *self.sensors, self.base, self.measured, self.command)
         topics = [source.topic for source in sources if source]
         repeated = next((topic for topic in topics if topics.count(topic) > 1), None)
@@ -655,13 +568,6 @@ class RecordingConfig(_Settings):
     def _included(cls, name: str) -> Self:
         return cls.load(Path(__file__).parent / "data" / name)
 
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some settings changed. Raises `RecordingError`."""
-        names = [field.name for field in dataclasses.fields(self)]
-        for name in changes:
-            _require_known(name, names)
-        return dataclasses.replace(self, **changes)
-
     @classmethod
     def load(cls, path: str | Path) -> Self:
         """Read settings from a YAML file.
@@ -684,8 +590,8 @@ class RecordingConfig(_Settings):
 
     def to_yaml(self, *, brief: bool = False) -> str:
         """Return the settings as the text of a YAML file; `brief` leaves out those with default values."""
-        defaults = {field.name: _plain(field.default) for field in dataclasses.fields(self)}
-        lines = [f"format: {FORMAT}"]
+        defaults = {field.name: plain(field.default) for field in dataclasses.fields(self)}
+        lines = [*(f"# {remark}" for remark in self.remarks), f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
             if name in ("markers", "sensors"):
                 lines += [f"{name}:", *(f"  - {flow(source)}" for source in value)] if value else []
@@ -697,7 +603,7 @@ class RecordingConfig(_Settings):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the settings as plain values for JSON and YAML, without unset ones."""
-        return {name: value for name, value in _plain(self).items() if value not in (None, [None, None], "")}
+        return {name: value for name, value in super().to_dict().items() if value not in ([None, None], "")}
 
     @classmethod
     def from_dict(cls, values: dict[Any, Any]) -> Self:
@@ -709,23 +615,34 @@ class RecordingConfig(_Settings):
         values = dict(values)
         number = values.pop("format", FORMAT)
         if number != FORMAT or isinstance(number, bool):
-            raise _refused(number, "format", str(FORMAT))
+            raise cls.refusal("format", number, str(FORMAT))
         return super().from_dict(values if values.get("columns") is None else _with_mapped_sources(values))
+
+    @classmethod
+    def json_schema(cls) -> dict[str, Any]:
+        """Return the JSON Schema of a file of settings, for editors."""
+        schema = super().json_schema()
+        schema["properties"]["format"] = {"const": FORMAT}
+        for source in ("base", "tension", "command", "motors"):
+            # a map of columns names their topics
+            schema["properties"][source]["anyOf"][0]["required"] = []
+        return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "recording", **schema}
 
 
 def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
     """Return settings with the sources that follow from their map of columns. Raises `RecordingError`."""
     if not isinstance(values["columns"], dict):
-        raise _refused(values["columns"], "columns", "a mapping with time, tensions and the names of bodies")
-    columns = _part(ColumnMap)(values["columns"], "columns")
+        words = "a mapping with time, tensions and the names of bodies"
+        raise RecordingConfig.refusal("columns", values["columns"], words)
+    columns = RecordingConfig.accepted("columns", values["columns"], part(ColumnMap))
     values = {**values, "columns": columns}
-    for name, part in (("tensions", "tension"), ("commands", "command"), ("motors", "motors")):
-        titles, stated = getattr(columns, name), values.get(part) or {}
+    for name, source in (("tensions", "tension"), ("commands", "command"), ("motors", "motors")):
+        titles, stated = getattr(columns, name), values.get(source) or {}
         if titles is not None and isinstance(stated, dict):
-            values[part] = {"topic": MAPPED[name], "order": list(range(1, len(titles) + 1))} | stated
+            values[source] = {"topic": MAPPED[name], "order": list(range(1, len(titles) + 1))} | stated
     if columns.commands and not columns.tensions and not columns.motors:
         values.setdefault("tensions", "commanded")
-    if not any(values.get(part) for part in ("tension", "command", "motors")):
+    if not any(values.get(source) for source in ("tension", "command", "motors")):
         values.setdefault("tensions", "none")
     base = values.get("base")
     if isinstance(base, dict) or (base is None and "base" in dict(columns.bodies)):
@@ -739,17 +656,3 @@ def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
             "markers: [{name: …, fraction: …}, …], from base to tip"
         )
     return values | {"markers": values.get("markers") or [{"name": bodies[0], "fraction": 1.0}]}
-
-
-def _plain(value: Any) -> Any:
-    """Return a value as plain values for JSON and YAML; parts without unset settings."""
-    if isinstance(value, dict):
-        return {name: _plain(part) for name, part in value.items()}
-    if dataclasses.is_dataclass(value):
-        named = {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-        if isinstance(value, ColumnMap):
-            del named["bodies"]
-        if not isinstance(value, RecordingConfig):
-            named = {name: part for name, part in named.items() if part is not None}
-        return named | _plain(dict(value.bodies)) if isinstance(value, ColumnMap) else named
-    return [_plain(part) for part in value] if isinstance(value, tuple) else value

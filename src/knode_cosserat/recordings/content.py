@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from knode_cosserat._files.limits import MORE, allowed
-from knode_cosserat._files.reading import ReadError, read_bytes
+from knode_cosserat._files.reading import read_bytes
 from knode_cosserat.recordings.findings import RecordingError
 
 GZIP_MAGIC = b"\x1f\x8b"
@@ -37,27 +37,25 @@ def beginning(path: Path) -> bytes:
         with path.open("rb") as file:
             head = file.read(HEAD)
     except FileNotFoundError:
-        raise RecordingError(f"{path}: no such file") from None
+        raise RecordingError("no such file") from None
     except OSError as error:
-        raise RecordingError(f"{path}: cannot be read: {error.strerror}") from None
+        raise RecordingError(f"cannot be read: {error.strerror}") from None
     if not head.startswith(GZIP_MAGIC):
         return head
     try:
         return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, HEAD)
     except zlib.error as error:
-        raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
+        raise RecordingError(f"cannot be decompressed: {error}") from None
 
 
 def file_bytes(path: Path, limit: int) -> bytes:
     """Return a file's content, decompressed; `limit` is of the bytes before and after decompression.
 
     Raises:
-        RecordingError: the file cannot be read, or is too large.
+        ReadError: the file cannot be read, or is too large.
+        RecordingError: it cannot be decompressed, or is then too large.
     """
-    try:
-        data = read_bytes(path, limit)
-    except ReadError as error:
-        raise RecordingError(f"{path}: {error}") from None
+    data = read_bytes(path, limit)
     if not data.startswith(GZIP_MAGIC):
         return data
     ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
@@ -66,14 +64,12 @@ def file_bytes(path: Path, limit: int) -> bytes:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             content = file.read(most + 1)
     except EOFError:
-        raise RecordingError(f"{path}: cannot be decompressed: the file was cut") from None
+        raise RecordingError("cannot be decompressed: the file was cut") from None
     except (OSError, zlib.error) as error:
-        raise RecordingError(f"{path}: cannot be decompressed: {error}") from None
+        raise RecordingError(f"cannot be decompressed: {error}") from None
     if len(content) > most:
         words = f"{ratio} times the file and {allowance}" if most < allowed(limit) else str(most)
-        raise RecordingError(
-            f"{path}: it has more than {most} bytes when decompressed; allowed are {words}; {MORE}"
-        )
+        raise RecordingError(f"it has more than {most} bytes when decompressed; allowed are {words}; {MORE}")
     return content
 
 

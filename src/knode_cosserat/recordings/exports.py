@@ -54,7 +54,6 @@ Channels = tuple[Float[np.ndarray, " n"], Mapping[str, Float[np.ndarray, " n"]]]
 
 
 def export_table(
-    path: Path,
     time: Float[np.ndarray, " n"],
     tracks: Sequence[Track],
     *,
@@ -66,7 +65,7 @@ def export_table(
     """Return the table of an export. Bodies with orientations come before markers.
 
     Names of tracks that are there twice get the kind or a number. `up` is the axis of the file that points
-    up; `channels` have times of their own; `source` is the name of the take.
+    up; `channels` have times of their own; `source` names file and take.
 
     Raises:
         RecordingError: no body is there, or too many.
@@ -74,9 +73,9 @@ def export_table(
     import pandas as pd  # type: ignore[import-untyped]
 
     if not tracks:
-        raise RecordingError(f"{path}: it has no bodies and no markers with positions")
+        raise RecordingError("it has no bodies and no markers with positions")
     if reason := excess(3 * len(tracks), MOST_COLUMNS, "columns"):
-        raise RecordingError(f"{path}: {reason}")
+        raise RecordingError(f"{reason}")
     columns: dict[str, np.ndarray] = {TIME: time}
     remarks, names = list(findings), []
     for track in sorted(tracks, key=lambda track: track.quaternion is None):
@@ -107,8 +106,7 @@ def export_table(
     oriented = [name for name, has_orientation in names if has_orientation]
     known = [name for name, _ in names if not name.rpartition(":")[2].lower().startswith(_UNKNOWN)]
     bodies = oriented or known or [name for name, _ in names]
-    metadata = {"source": f"{path.name}: {source}"} if source else {}
-    return Table(metadata, table, tuple(remarks), tuple(bodies), up)
+    return Table({"source": source} if source else {}, table, tuple(remarks), tuple(bodies), up)
 
 
 def quaternions_of(
@@ -121,7 +119,7 @@ def quaternions_of(
     return quaternion
 
 
-def length_unit(word: str, path: Path, default: str, findings: list[Finding]) -> float:
+def length_unit(word: str, default: str, findings: list[Finding]) -> float:
     """Return a unit of length in m; a finding states that the default is taken for a missing one.
 
     Raises:
@@ -133,9 +131,7 @@ def length_unit(word: str, path: Path, default: str, findings: list[Finding]) ->
         )
         word = default
     if word.strip().lower() not in LENGTHS:
-        raise RecordingError(
-            f"{path}: the unit of length is {word.strip()!r}; allowed is m, cm, mm, in or ft"
-        )
+        raise RecordingError(f"the unit of length is {word.strip()!r}; allowed is m, cm, mm, in or ft")
     return LENGTHS[word.strip().lower()]
 
 
@@ -144,7 +140,7 @@ def text_lines(path: Path) -> list[str]:
     data = content.file_bytes(path, csv_rows.LARGEST_FILE)
     newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
     if reason := excess(newlines, csv_rows.MOST_LINES, "lines"):
-        raise RecordingError(f"{path}: {reason}")
+        raise RecordingError(f"{reason}")
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
@@ -156,7 +152,7 @@ def text_lines(path: Path) -> list[str]:
 Columns = Callable[[Sequence[int]], Float[np.ndarray, "n places"]]
 
 
-def cells_reader(lines: Sequence[str], titles: Sequence[str], delimiter: str, path: Path) -> Columns:
+def cells_reader(lines: Sequence[str], titles: Sequence[str], delimiter: str) -> Columns:
     """Return a function from places to columns of numbers, NaN where a cell is empty.
 
     Raises:
@@ -165,13 +161,13 @@ def cells_reader(lines: Sequence[str], titles: Sequence[str], delimiter: str, pa
     from knode_cosserat.recordings.formats.csv_table import cells_of
 
     if reason := excess(len(titles), MOST_COLUMNS, "columns"):
-        raise RecordingError(f"{path}: {reason}")
+        raise RecordingError(f"{reason}")
     rows = [line for line in lines if line.strip(f"{delimiter} \t")]
     if not rows:
-        raise RecordingError(f"{path}: no rows after the header")
+        raise RecordingError("no rows after the header")
     # cells that are empty at the end of a line may be left out
     rows[0] += delimiter * (len(titles) - 1 - rows[0].count(delimiter))
-    cells = cells_of("\n".join(rows), delimiter, str(path))
+    cells = cells_of("\n".join(rows), delimiter)
     titles = [*titles, *(f"column {k + 1}" for k in range(len(titles), cells.shape[1]))]
     table = numbers_of(cells.set_axis(titles[: cells.shape[1]], axis="columns"))
-    return lambda places: columns_of(table, places, str(path))
+    return lambda places: columns_of(table, places)

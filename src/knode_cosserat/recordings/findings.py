@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
+from pathlib import Path
 from typing import Literal
 
+from knode_cosserat._files.reading import ReadError
 from knode_cosserat.errors import KnodeCosseratError
 
 Severity = Literal["note", "warning", "problem"]
@@ -16,6 +20,15 @@ class RecordingError(KnodeCosseratError, ValueError):
     """Error for a recording that cannot be read or used; the message is one line with the reason."""
 
     code = "recording"
+
+
+@contextlib.contextmanager
+def naming(path: str | Path) -> Iterator[None]:
+    """Name a file in the errors about its content. Raises `RecordingError`."""
+    try:
+        yield
+    except (RecordingError, ReadError) as error:
+        raise RecordingError(f"{path}: {error}") from None
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from knode_cosserat.recordings.config import POSITION_UNITS, UP, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
 
 if TYPE_CHECKING:
+    from knode_cosserat.recordings.checks import Sensed
     from knode_cosserat.recordings.streams import Body
 
 #: ratio of a normal distribution's standard deviation to its median absolute value
@@ -65,23 +66,21 @@ def rest_of(bodies: Sequence[Body]) -> tuple[float, float] | None:
     return (float(start), float(end)) if end - start >= SHORTEST_REST and rows >= FEWEST_FRAMES else None
 
 
-def bodies_in_robot_frame(
-    bodies: Sequence[Body], base: Body | None, config: RecordingConfig
-) -> tuple[list[Body], Body | None, tuple[float, float] | None, list[Finding]]:
-    """Return the bodies (with the rod's orientations) and the base in the robot's frame, rest and findings.
+def in_robot_frame(
+    sensed: Sensed, config: RecordingConfig, findings: list[Finding]
+) -> tuple[Sensed, tuple[float, float] | None]:
+    """Return the streams in the robot's frame, with the rod's orientations, and the rest; add findings.
 
     The input bodies have their recorded positions and orientations.
     """
-    findings: list[Finding] = []
-    if not bodies:
-        rest = None if config.rest is None else (config.rest[0], config.rest[1])
-        return [], base, rest, findings
+    rest = None if config.rest is None else (config.rest[0], config.rest[1])
+    if not sensed.bodies:
+        return sensed, rest
     upright = Rotation.from_rotvec(UP[config.up or "z"])
     turn = Rotation.from_quat(config.rotation, scalar_first=True) * upright
     scale = POSITION_UNITS[config.position_unit]
-    recorded = [body.quaternion for body in bodies]
-    bodies = [_turned(body, turn, scale) for body in bodies]
-    origin = np.array(config.origin)
+    bodies = [_turned(body, turn, scale) for body in sensed.bodies]
+    base, origin = sensed.base, np.array(config.origin)
     if base is not None and config.base is not None:
         base = _turned(base, turn, scale)
         origin = base.position.mean(axis=0) - [0.0, 0.0, config.base.height]
@@ -91,18 +90,17 @@ def bodies_in_robot_frame(
             findings.append(Finding("warning", base.topic, what))
         base = dataclasses.replace(base, position=base.position - origin)
     bodies = [dataclasses.replace(body, position=body.position - origin) for body in bodies]
-    rest = rest_of(bodies) if config.rest is None else (config.rest[0], config.rest[1])
+    rest = rest or rest_of(bodies)
     findings += _judged(bodies, rest)
     placed = []
     directions = _frames_at_rest(bodies, rest)
-    for body, marker, quaternion, at_rest in zip(bodies, config.markers, recorded, directions, strict=True):
-        if quaternion is not None and not config.static:
-            misread = _misread_orientation(quaternion, turn, body, rest_mask(body.time, rest))
-            findings += [misread] if misread else []
-        body, lost = _of_the_rod(body, marker.rotation, rest, at_rest)
-        placed.append(body)
-        findings += [lost] if lost else []
-    return placed, base, rest, findings
+    for recorded, body, marker, at_rest in zip(
+        sensed.bodies, bodies, config.markers, directions, strict=True
+    ):
+        if recorded.quaternion is not None and not config.static:
+            _check_orientation(recorded.quaternion, turn, body, rest_mask(body.time, rest), findings)
+        placed.append(_of_the_rod(body, marker.rotation, rest, at_rest, findings))
+    return sensed._replace(bodies=placed, base=base), rest
 
 
 def _turned(body: Body, turn: Rotation, scale: float) -> Body:
@@ -145,11 +143,15 @@ def _frames_at_rest(bodies: Sequence[Body], rest: tuple[float, float] | None) ->
 
 
 def _of_the_rod(
-    body: Body, rotation: Sequence[float] | None, rest: tuple[float, float] | None, at_rest: Rotation
-) -> tuple[Body, Finding | None]:
+    body: Body,
+    rotation: Sequence[float] | None,
+    rest: tuple[float, float] | None,
+    at_rest: Rotation,
+    findings: list[Finding],
+) -> Body:
     """Return the body with the rod's local orientation in place of its own; a finding if it is unknown."""
     if body.quaternion is None:
-        return body, None
+        return body
     turned = Rotation.from_quat(body.quaternion, scalar_first=True)
     if rotation is not None:
         constant = Rotation.from_quat(rotation, scalar_first=True)
@@ -160,10 +162,11 @@ def _of_the_rod(
                 "how its axes are turned is not known, because it was not seen at rest; its orientations are "
                 "left out (the configuration can state the rest or the marker's rotation)"
             )
-            return dataclasses.replace(body, quaternion=None), Finding("problem", body.topic, what)
+            findings.append(Finding("problem", body.topic, what))
+            return dataclasses.replace(body, quaternion=None)
         constant = at_rest.inv() * turned[np.flatnonzero(still)].mean()
     quaternion = (turned * constant.inv()).as_quat(scalar_first=True)
-    return dataclasses.replace(body, quaternion=quaternion), None
+    return dataclasses.replace(body, quaternion=quaternion)
 
 
 def rest_mask(time: Float[np.ndarray, " n"], rest: tuple[float, float] | None) -> np.ndarray:
@@ -238,10 +241,14 @@ def leans_of(where: Float[np.ndarray, "M 3"]) -> Float[np.ndarray, " M"]:
 # orientations against positions
 
 
-def _misread_orientation(
-    quaternion: Float[np.ndarray, "n 4"], turn: Rotation, placed: Body, still: Bool[np.ndarray, " n"]
-) -> Finding | None:
-    """Return a finding if a body's quaternions agree with its positions in another reading only.
+def _check_orientation(
+    quaternion: Float[np.ndarray, "n 4"],
+    turn: Rotation,
+    placed: Body,
+    still: Bool[np.ndarray, " n"],
+    findings: list[Finding],
+) -> None:
+    """Add a finding if a body's quaternions agree with its positions in another reading only.
 
     An arc that leaves the clamped end along z determines the tangent at each position. The body's rotation
     since the rest has to turn the tangent at rest to it. `quaternion` is recorded, in the frame of motion
@@ -250,7 +257,7 @@ def _misread_orientation(
     distance = np.linalg.norm(placed.position, axis=1)
     seen = distance > 1e-9
     if seen.sum() <= _FIRST_ROWS:
-        return None
+        return
     chord = placed.position[seen] / distance[seen, None]
     tangent = 2.0 * chord[:, 2:] * chord - [0.0, 0.0, 1.0]
     start = np.flatnonzero(still[seen])
@@ -259,7 +266,7 @@ def _misread_orientation(
     first /= np.linalg.norm(first) or 1.0
     bend = _rms_angle(tangent, np.tile(first, (len(tangent), 1)))
     if bend < SMALLEST_BEND:
-        return None
+        return
 
     def error(numbers: np.ndarray) -> float:
         rotation = turn * Rotation.from_quat(numbers, scalar_first=True)
@@ -269,12 +276,12 @@ def _misread_orientation(
     errors = {words: error(read(quaternion[seen])) for words, read in _READINGS.items()}
     words = min(errors, key=errors.__getitem__)
     if errors[words] > min(BETTER * as_read, EXPLAINED * bend):
-        return None
+        return
     what = (
         f"its rotation contradicts its positions by {np.degrees(as_read):.0f} degrees; read as {words} it "
         f"agrees to {np.degrees(errors[words]):.0f} degrees: are its quaternions in this order?"
     )
-    return Finding("problem", placed.topic, what)
+    findings.append(Finding("problem", placed.topic, what))
 
 
 def _rms_angle(a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"]) -> float:

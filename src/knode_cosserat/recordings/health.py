@@ -118,15 +118,14 @@ def health_of(recording: Recording) -> Health:
     """Return the quality report of a recording."""
     streams = [_of_body(body, recording) for body in (*recording.bodies, recording.base) if body is not None]
     streams += [_stream(it.topic, it.output.fields[0], it.time, recording) for it in recording.sensors]
-    for what, tensions in (("measured tensions", recording.tension), ("commands", recording.command)):
-        if tensions is not None:
-            report = _stream(tensions.topic, what, tensions.time, recording)
-            if what == "commands":
-                report = dataclasses.replace(report, rate=None, jitter=None, missing=None, gaps=None)
-            else:
-                noise = _noise(tensions.time, tensions.tension, recording.rest)
-                report = dataclasses.replace(report, noise=noise)
-            streams.append(report)
+    if (tension := recording.tension) is not None:
+        noise = _noise(tension.time, tension.tension, recording.rest)
+        streams.append(_stream(tension.topic, "measured tensions", tension.time, recording, noise=noise))
+    if recording.command is not None:
+        none = {"rate": None, "jitter": None, "missing": None, "gaps": None}
+        streams.append(
+            _stream(recording.command.topic, "commands", recording.command.time, recording, **none)
+        )
     where = rest_positions(recording.bodies, recording.rest)
     lengths = () if where is None else tuple(rod_lengths(recording.bodies, where).tolist())
     latency = latency_of(recording)
@@ -152,27 +151,32 @@ def _of_body(body: Body, recording: Recording) -> StreamHealth:
         # cumulative sum of small rotations, whose differences are differences of angles
         turns = np.concatenate([np.zeros((1, 3)), np.cumsum(rotation_steps(body.quaternion), axis=0)])
         turn_noise = _noise(body.time, turns, recording.rest)
-    report = _stream(body.topic, body.name, body.time, recording)
     noise = _noise(body.time, body.position, recording.rest)
-    return dataclasses.replace(report, noise=noise, turn_noise=turn_noise)
+    return _stream(body.topic, body.name, body.time, recording, noise=noise, turn_noise=turn_noise)
 
 
-def _stream(topic: str, what: str, time: Float[np.ndarray, " n"], recording: Recording) -> StreamHealth:
+def _stream(
+    topic: str, what: str, time: Float[np.ndarray, " n"], recording: Recording, **known: Any
+) -> StreamHealth:
+    """Return the quality of a topic; `known` are numbers that its times do not tell."""
     steps, usual = np.diff(time), period(time)
     delay = recording.delays.get(topic, float("nan"))
-    report = StreamHealth(
-        topic, what, len(time), None, None, None, None, float(np.max(steps, initial=0.0)),
-        delay if np.isfinite(delay) else None, None, None,
-    )  # fmt: skip
-    if not usual > 0.0:
-        return report
-    expected = int(np.sum(np.round(steps / usual))) + 1
-    return dataclasses.replace(
-        report,
-        rate=round(1.0 / usual, 6),
-        jitter=float(np.std(steps[steps <= 1.5 * usual])),
-        missing=max(0.0, 1.0 - len(time) / expected),
-        gaps=int(np.sum(steps > 1.5 * usual)),
+    numbers: dict[str, Any] = dict.fromkeys(("rate", "jitter", "missing", "gaps", "noise", "turn_noise"))
+    if usual > 0.0:
+        expected = int(np.sum(np.round(steps / usual))) + 1
+        numbers |= {
+            "rate": round(1.0 / usual, 6),
+            "jitter": float(np.std(steps[steps <= 1.5 * usual])),
+            "missing": max(0.0, 1.0 - len(time) / expected),
+            "gaps": int(np.sum(steps > 1.5 * usual)),
+        }
+    return StreamHealth(
+        topic=topic,
+        what=what,
+        rows=len(time),
+        longest_gap=float(np.max(steps, initial=0.0)),
+        delay=delay if np.isfinite(delay) else None,
+        **numbers | known,
     )
 
 

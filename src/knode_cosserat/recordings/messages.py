@@ -19,8 +19,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from knode_cosserat._files.limits import MORE
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat.recordings.config import PLACE, MotorSource, TensionSource
+from knode_cosserat.recordings.config import PLACE, MotorSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.streams import OutgoingStream, Stream
 
@@ -81,12 +82,62 @@ class Bag:
     lost: int = 0
     damage: str = ""
     is_limited: bool = False
+    findings: tuple[Finding, ...] = ()
+    source: str = ""
 
     def topic(self, name: str, kind: str, digest: str = "") -> Topic | None:
         """Return the topic of that name, created if new; None if it exists with another type."""
         kind = kind if kind.count("/") != 1 else kind.replace("/", "/msg/")
         topic = self.topics.setdefault(name, Topic(name, kind, self.ros, digest))
         return topic if topic.type == kind else None
+
+    def completed(self, config: RecordingConfig) -> RecordingConfig:
+        """Return a configuration that has also what the bag states: that the robot was a simulation."""
+        used = [self.topics.get(topics_of(source)[0]) for source in roles_of(config)]
+        # messages contain text verbatim
+        first = (bytes(message) for topic in used if topic is not None for message in topic.raw[:100])
+        is_simulated = any(SIMULATED.encode() in message for message in first)
+        return config.replace(simulated=True) if config.simulated is None and is_simulated else config
+
+    def streams(self, config: RecordingConfig, findings: list[Finding]) -> dict[str, Stream]:
+        """Return the messages of each source of a configuration, by topic, and add findings.
+
+        Raises:
+            RecordingError: a topic is missing, its messages are not of a type for their role, or have no such
+                part.
+        """
+        unused = config.command if config.tensions == "measured" else config.measured
+        streams: dict[str, Stream] = {}
+        for source, role in roles_of(config).items():
+            missing = [name for name in topics_of(source) if name not in self.topics]
+            if not missing:
+                streams[source.topic] = decoded(self, source, role)
+            elif source is unused:
+                findings.append(Finding("note", missing[0], f"there is no such topic, and so no {role}s"))
+            else:
+                listed = ", ".join(sorted(self.topics)) or "none"
+                raise RecordingError(f"topic {missing[0]} ({role}) is missing; the bag has {listed}")
+        if self.damage:
+            received = np.concatenate([[0], *(stream.received for stream in streams.values())])[1:]
+            duration = np.ptp(received) * 1e-9 if len(received) else 0.0
+            lost = f", {self.lost} bytes could not be read" if self.lost else ""
+            more = f"; {MORE}" if self.is_limited else ""
+            what = f"{self.damage}: recovered up to {duration:.3f} s{lost}{more}"
+            findings.append(Finding("warning", "", what))
+        return streams
+
+
+def roles_of(config: RecordingConfig) -> dict[Any, Role]:
+    """Return the role of each source of a configuration."""
+    roles: dict[Any, Role] = dict.fromkeys((*config.markers, config.base), "pose")
+    roles |= dict.fromkeys(config.sensors, "sensor")
+    roles |= {config.measured: "tension", config.command: "command"}
+    return {source: role for source, role in roles.items() if source is not None}
+
+
+def topics_read(config: RecordingConfig) -> set[str]:
+    """Return the topics of a bag that a configuration reads."""
+    return {STATIC, *(topic for source in roles_of(config) for topic in topics_of(source))}
 
 
 def _xyz(v: Any) -> tuple[float, ...]:
@@ -176,7 +227,7 @@ def topics_of(source: Any) -> list[str]:
     return [topic_and_part(source.topic)[0]]
 
 
-def decoded(bag: Bag, source: Any, role: Role, path: str) -> Stream:
+def decoded(bag: Bag, source: Any, role: Role) -> Stream:
     """Return the numbers of a source of a configuration; messages that cannot be decoded are counted.
 
     Raises:
@@ -184,26 +235,26 @@ def decoded(bag: Bag, source: Any, role: Role, path: str) -> Stream:
     """
     names = topics_of(source)
     if PLACE in source.topic:
-        parts = [_simple(bag.topics[name], NUMBERS, role, path) for name in names]
+        parts = [_simple(bag.topics[name], NUMBERS, role) for name in names]
         return _merged(source.topic, parts, is_held=role == "command" or bool(getattr(source, "held", None)))
     topic, part = bag.topics[names[0]], topic_and_part(source.topic)[1]
     if role == "pose":
-        stream = _poses(bag, topic, part, path)
+        stream = _poses(bag, topic, part)
     elif role == "sensor":
-        stream = _simple(topic, SENSORS, role, path)
+        stream = _simple(topic, SENSORS, role)
     elif role == "command" and source.text is not None:
         kinds = {kind: functools.partial(_spoken, read, source.text) for kind, read in TEXTS.items()}
-        stream = _simple(topic, kinds, "command in text", path)
+        stream = _simple(topic, kinds, "command in text")
     elif topic.type == JOINTS:
-        stream = _joints(topic, source, path)
+        stream = _joints(topic, source)
     else:
-        stream = _simple(topic, NUMBERS, role, path)
+        stream = _simple(topic, NUMBERS, role)
     return dataclasses.replace(stream, topic=source.topic)
 
 
-def _simple(topic: Topic, readers: Mapping[str, Any], role: str, path: str) -> Stream:
+def _simple(topic: Topic, readers: Mapping[str, Any], role: str) -> Stream:
     """Return the numbers of a topic with one row a message."""
-    _require_type(topic, readers, role, path)
+    _require_type(topic, readers, role)
     rows: list[_Row] = []
     broken = 0
     for received, message in topic.messages():
@@ -218,36 +269,32 @@ def _simple(topic: Topic, readers: Mapping[str, Any], role: str, path: str) -> S
     return _stream(topic.name, rows, broken)
 
 
-def _require_type(topic: Topic, kinds: Collection[str], role: str, path: str) -> None:
+def _require_type(topic: Topic, kinds: Collection[str], role: str) -> None:
     name = topic.type.replace("/msg/", "/")
     if topic.type not in kinds:
         listed = ", ".join(kind.replace("/msg/", "/") for kind in kinds)
-        raise RecordingError(
-            f"{path}: topic {topic.name}: its messages are {name}; allowed for a {role} is {listed}"
-        )
+        raise RecordingError(f"topic {topic.name}: its messages are {name}; allowed for a {role} is {listed}")
     if topic.ros == 1 and topic.digest not in ("", "*", typestore(1).generate_msgdef(topic.type)[1]):
-        raise RecordingError(
-            f"{path}: topic {topic.name}: its {name} is not the type that ROS defines by this name"
-        )
+        raise RecordingError(f"topic {topic.name}: its {name} is not the type that ROS defines by this name")
 
 
 # poses
 
 
-def _poses(bag: Bag, topic: Topic, part: str, path: str) -> Stream:
-    _require_type(topic, (*POSES, POSE_ARRAY, *TRANSFORMS), "pose", path)
+def _poses(bag: Bag, topic: Topic, part: str) -> Stream:
+    _require_type(topic, (*POSES, POSE_ARRAY, *TRANSFORMS), "pose")
     if topic.type in TRANSFORMS:
-        return _frame(bag, topic, part, path)
+        return _frame(bag, topic, part)
     if topic.type in POSES:
         if part:
             raise RecordingError(
-                f"{path}: topic {topic.name}: a {topic.type.replace('/msg/', '/')} has no part [{part}]; "
+                f"topic {topic.name}: a {topic.type.replace('/msg/', '/')} has no part [{part}]; "
                 f"allowed is {topic.name}"
             )
-        return _simple(topic, POSES, "pose", path)
+        return _simple(topic, POSES, "pose")
     messages = list(topic.messages())
     most = max((len(message.poses) for _, message in messages if message is not None), default=0)
-    number = int(_required_part(part, list(map(str, range(most))), topic.name, path)) if most else 0
+    number = int(_required_part(part, list(map(str, range(most))), topic.name)) if most else 0
     # a source that leaves lost bodies out changes the numbers of the others: such a message is not used
     rows = [
         (_stamp(message), received, _pose(message.poses[number]))
@@ -257,18 +304,18 @@ def _poses(bag: Bag, topic: Topic, part: str, path: str) -> Stream:
     return _stream(topic.name, rows, len(messages) - len(rows))
 
 
-def _required_part(part: str, parts: Sequence[str], topic: str, path: str) -> str:
+def _required_part(part: str, parts: Sequence[str], topic: str) -> str:
     """Return the named part of a topic's messages; the only one if none is named."""
     if not part and len(parts) == 1:
         return parts[0]
     if part not in parts:
         words = ", ".join(f"{topic}[{name}]" for name in parts[:20])
         what = f"has no part [{part}]" if part else f"has {len(parts)} bodies"
-        raise RecordingError(f"{path}: topic {topic} {what}; allowed is {words or 'no part'}")
+        raise RecordingError(f"topic {topic} {what}; allowed is {words or 'no part'}")
     return part
 
 
-def _frame(bag: Bag, topic: Topic, part: str, path: str) -> Stream:
+def _frame(bag: Bag, topic: Topic, part: str) -> Stream:
     """Return the pose of a frame in the frame at the root of its tree."""
     edges: dict[str, tuple[str, list[_Row]]] = {}
     broken = 0
@@ -284,16 +331,16 @@ def _frame(bag: Bag, topic: Topic, part: str, path: str) -> Stream:
                     continue
                 if edges.setdefault(child, (parent, []))[0] != parent:
                     raise RecordingError(
-                        f"{path}: topic {topic.name}: the frame {child} has two parents, "
+                        f"topic {topic.name}: the frame {child} has two parents, "
                         f"{edges[child][0]} and {parent}; allowed is one"
                     )
                 edges[child][1].append((_stamp(transform), received, pose))
-    name = _required_part(part.strip("/"), sorted(edges), topic.name, path)
+    name = _required_part(part.strip("/"), sorted(edges), topic.name)
     stream, parent = _stream(topic.name, edges[name][1], broken), edges[name][0]
     above = [name]
     while parent in edges:
         if parent in above:
-            raise RecordingError(f"{path}: topic {topic.name}: the frames {', '.join(above)} are in a circle")
+            raise RecordingError(f"topic {topic.name}: the frames {', '.join(above)} are in a circle")
         above.append(parent)
         stream = _seen_from(_stream(topic.name, edges[parent][1], 0), stream)
         parent = edges[parent][0]
@@ -324,9 +371,9 @@ def _seen_from(parent: Stream, child: Stream) -> Stream:
 # numbers
 
 
-def _joints(topic: Topic, source: TensionSource | MotorSource, path: str) -> Stream:
+def _joints(topic: Topic, source: TensionSource | MotorSource) -> Stream:
     """Return the efforts, or the angles of motors, of named joints, in the order of the source."""
-    _require_type(topic, (JOINTS,), "tension", path)
+    _require_type(topic, (JOINTS,), "tension")
     rows: list[tuple[int, int, list[str], Any]] = []
     broken = 0
     for received, message in topic.messages():
@@ -338,7 +385,7 @@ def _joints(topic: Topic, source: TensionSource | MotorSource, path: str) -> Str
             broken += 1
         else:
             rows.append((_stamp(message), received, names, values))
-    reference, remark = joint_names(source, [names for _, _, names, _ in rows], f"{path}: topic {topic.name}")
+    reference, remark = joint_names(source, [names for _, _, names, _ in rows], topic.name)
     chosen: list[_Row] = []
     for stamp, received, names, values in rows:
         by_name = dict(zip(names, values, strict=True)) if reference else {}
@@ -350,7 +397,7 @@ def _joints(topic: Topic, source: TensionSource | MotorSource, path: str) -> Str
 
 
 def joint_names(
-    source: TensionSource | MotorSource, seen: Sequence[list[str]], where: str
+    source: TensionSource | MotorSource, seen: Sequence[list[str]], topic: str
 ) -> tuple[list[str], str]:
     """Return the joints in the order of the source's numbers, and a remark; no names if messages have none.
 
@@ -361,8 +408,9 @@ def joint_names(
         there = sorted({name for names in seen for name in names})
         missing = [name for name in source.names if name not in there]
         if missing and seen:
+            listed = ", ".join(there) or "not named"
             raise RecordingError(
-                f"{where}: no joint is called {missing[0]}; its joints are {', '.join(there) or 'not named'}"
+                f"topic {topic}: no joint is called {missing[0]}; its joints are {listed}"
                 f"{did_you_mean(missing[0], there)}"
             )
         return list(source.names), ""
@@ -371,7 +419,7 @@ def joint_names(
         return [], ""
     if len(set(first)) < len(first):
         raise RecordingError(
-            f"{where}: the joints {', '.join(first)} have the same names; allowed is each once"
+            f"topic {topic}: the joints {', '.join(first)} have the same names; allowed is each once"
         )
     listed = ", ".join(first)
     matches = [re.fullmatch(r"(.*?)(\d+)(\D*)", name) for name in first]
@@ -387,8 +435,8 @@ def joint_names(
         matched = sorted(first, key=lambda name: by_name[first.index(name)])
         return matched, f"its joints {listed} are matched by name"
     raise RecordingError(
-        f"{where}: its joints are {listed}, and the configuration's order is {list(source.order)}; allowed "
-        "is one that agrees with the names, or `names` with the joint of each number in the order"
+        f"topic {topic}: its joints are {listed}, and the configuration's order is {list(source.order)}; "
+        "allowed is one that agrees with the names, or `names` with the joint of each number in the order"
     )
 
 

@@ -36,7 +36,14 @@ from knode_cosserat.recordings.messages import (
     decoded,
     joint_names,
 )
-from knode_cosserat.recordings.table import TIME, Table, columns_of, position_titles, stated_time_unit
+from knode_cosserat.recordings.table import (
+    TIME,
+    Table,
+    columns_of,
+    configured,
+    position_titles,
+    stated_time_unit,
+)
 
 #: names of a body at the clamped end, of times, and of numbers that drive the robot
 _BASE = re.compile(r"base|clamp|root|ground|origin|mount|world", re.IGNORECASE)
@@ -76,6 +83,19 @@ class _Body(NamedTuple):
     titles: tuple[str, ...] = ()
 
 
+def default_config(content: Bag | Table) -> RecordingConfig:
+    """Return the configuration of a recording that is read without one.
+
+    Raises:
+        RecordingError: the content has another form.
+    """
+    if isinstance(content, Bag):
+        return RecordingConfig.paper_robot()
+    if content.bodies:
+        return config_of_table(content)
+    return configured(content.metadata, list(map(str, content.numbers.columns)))
+
+
 # bags
 
 
@@ -85,8 +105,8 @@ def useful_topics(bag: Bag) -> set[str]:
     return {name for name, topic in bag.topics.items() if topic.type in kinds}
 
 
-def config_of_bag(bag: Bag, path: str) -> tuple[RecordingConfig, tuple[str, ...]]:
-    """Return a configuration of a bag's topics, and remarks. Raises `RecordingError` without poses."""
+def config_of_bag(bag: Bag) -> RecordingConfig:
+    """Return a configuration of a bag's topics, with remarks. Raises `RecordingError` without poses."""
     names: dict[str, str] = {}
     for topic in bag.topics.values():
         messages = (message for _, message in topic.messages() if message is not None)
@@ -101,13 +121,13 @@ def config_of_bag(bag: Bag, path: str) -> tuple[RecordingConfig, tuple[str, ...]
             names |= {f"{topic.name}[{frame}]": frame for frame in frames}
     bodies: list[_Body] = []
     for name, word in names.items():
-        stream = decoded(bag, MarkerSource(word, name, 1.0), "pose", path)
+        stream = decoded(bag, MarkerSource(word, name, 1.0), "pose")
         if len(stream.values):
             is_new = word not in [body.name for body in bodies]
             bodies.append(_Body(word if is_new else name, name, stream.values[:, :3]))
     if not bodies:
         topics = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in bag.topics.values()]
-        raise RecordingError(f"{path}: no topic has poses; the bag has {', '.join(topics) or 'no topics'}")
+        raise RecordingError(f"no topic has poses; the bag has {', '.join(topics) or 'no topics'}")
     remarks: list[str] = []
     sources: dict[str, Any] = {}
     singles: dict[tuple[str, str], list[str]] = {}
@@ -121,7 +141,7 @@ def config_of_bag(bag: Bag, path: str) -> tuple[RecordingConfig, tuple[str, ...]
         elif count:
             order = tuple(range(1, count + 1))
             names_there = [list(getattr(first, "name", ()))]
-            joints, _ = joint_names(TensionSource(topic.name, order), names_there, path)
+            joints, _ = joint_names(TensionSource(topic.name, order), names_there, topic.name)
             _add_topic(sources, topic.name, order, tuple(joints) or None)
             if joints:
                 remarks.append(f"tendons 1 to {count} are taken to be the joints {', '.join(joints)}")
@@ -141,21 +161,21 @@ def _add_topic(
 # tables
 
 
-def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str, ...]]:
-    """Return a configuration of a table's columns, and remarks. Raises `RecordingError` without positions."""
+def config_of_table(table: Table) -> RecordingConfig:
+    """Return a configuration of a table's columns, with remarks. Raises `RecordingError` without poses."""
     titles, remarks = list(map(str, table.numbers.columns)), list[str]()
     if table.bodies:
         bodies = []
         for name in table.bodies:
             places = [titles.index(title) for title in position_titles(name, "m")]
-            bodies.append(_Body(name, name, columns_of(table.numbers, places, path)))
+            bodies.append(_Body(name, name, columns_of(table.numbers, places)))
         others = [title for title in titles if not re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)]
         mapped, sources = _number_columns(table, [title for title in others if title != TIME], remarks)
         columns = ColumnMap.from_dict(mapped) if mapped else None
         return _config(bodies, sources | {"columns": columns, "up": table.up}, remarks)
     time = next((title for title in titles if _TIME.match(title)), None)
     others = [title for title in titles if title != time]
-    bodies = _bodies(table, others, path)
+    bodies = _bodies(table, others)
     used = {title for body in bodies for title in body.titles}
     mapped, sources = _number_columns(table, [title for title in others if title not in used], remarks)
     if time is None:
@@ -169,7 +189,7 @@ def config_of_table(table: Table, path: str) -> tuple[RecordingConfig, tuple[str
     return _config(bodies, sources | settings, remarks)
 
 
-def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
+def _bodies(table: Table, titles: Sequence[str]) -> list[_Body]:
     """Return the bodies whose coordinates have titles that differ in x, y and z, or 0, 1 and 2, only."""
     columns = list(map(str, table.numbers.columns))
     spelling = {title.lower(): title for title in reversed(titles)}
@@ -186,13 +206,13 @@ def _bodies(table: Table, titles: Sequence[str], path: str) -> list[_Body]:
             name = re.sub(r"(^|[_ .-])(x?pos(ition)?|p|mm|m)(?=$|[_ .-])", "", name, flags=re.IGNORECASE)
             name = name.strip("_ .-") or "tip"
             if name not in bodies:
-                position = columns_of(table.numbers, [columns.index(axis) for axis in axes], path)
+                position = columns_of(table.numbers, [columns.index(axis) for axis in axes])
                 turned = _quaternion(before, titles, len(bodies))
                 bodies[name] = _Body(name, name, position, (*axes, *turned))
                 break
     if not bodies:
         raise RecordingError(
-            f"{path}: the columns are {', '.join(columns)}; none look like a body's position x, y, z; "
+            f"the columns are {', '.join(columns)}; none look like a body's position x, y, z; "
             "no map can be proposed. Write `columns: {time: …, tensions: […], tip: [x, y, z]}` in a YAML file"
         )
     return list(bodies.values())
@@ -258,9 +278,7 @@ def _number_columns(
 # places on the rod
 
 
-def _config(
-    bodies: Sequence[_Body], settings: dict[str, Any], remarks: list[str]
-) -> tuple[RecordingConfig, tuple[str, ...]]:
+def _config(bodies: Sequence[_Body], settings: dict[str, Any], remarks: list[str]) -> RecordingConfig:
     """Return the configuration of bodies whose places are guessed from distances at the start.
 
     `settings` are those that are known: sources, columns, the unit of positions and the axis that points up.
@@ -299,7 +317,7 @@ def _config(
         kinds = "measured"
     if kinds == "none":
         remarks.append("no tensions were found: `tensions: none` makes a recording of poses only")
-    config = RecordingConfig(
+    return RecordingConfig(
         markers=tuple(
             MarkerSource(body.name, body.topic, fraction)
             for body, fraction in zip(others, fractions, strict=True)
@@ -307,9 +325,9 @@ def _config(
         base=BaseSource(base.topic) if base else None,
         tensions=kinds,  # type: ignore[arg-type]
         rotation=(1.0, 0.0, 0.0, 0.0) if rotation is None else rotation,
+        remarks=tuple(remarks),
         **settings,
     )
-    return config, tuple(remarks)
 
 
 def _rotation(axis: Float[np.ndarray, " 3"]) -> tuple[float, ...] | None:

@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from knode_cosserat._reprs import count_of
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.findings import Finding, counted
+from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 
 #: largest disagreement of equal clocks, and smallest jump of a clock (s)
 DISAGREEMENT = 0.5
@@ -141,11 +141,63 @@ def _offset(stream: Stream) -> float:
     return float(np.median((stream.received - stream.stamped)[known])) * 1e-9
 
 
-def measurement_times(
-    streams: Sequence[Stream], clock: str
-) -> tuple[dict[str, Int[np.ndarray, " n"]], list[Finding]]:
-    """Return the measurement times (ns) by topic, on the better of the two clocks, and the findings."""
-    findings: list[Finding] = []
+@dataclasses.dataclass
+class Rows:
+    """Rows of a topic, times (s) and numbers, from which errors are removed with findings on them."""
+
+    topic: str
+    time: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, "n size"]
+    findings: list[Finding]
+
+    def add(self, message: str, severity: Severity, rows: Bool[np.ndarray, " n"]) -> None:
+        """Add a finding on rows."""
+        self.findings.append(Finding(severity, self.topic, message, tuple(self.time[rows][:1000].tolist())))
+
+    def keep(self, mask: Bool[np.ndarray, " n"]) -> None:
+        """Remove the rows that are not in a mask."""
+        self.time, self.values = self.time[mask], self.values[mask]
+
+
+def rows_on_one_clock(
+    streams: Mapping[str, Stream], config: RecordingConfig, findings: list[Finding]
+) -> dict[str, Rows]:
+    """Return the rows of each topic, by increasing times from the first pose or tension, and add findings.
+
+    Raises:
+        RecordingError: there are no poses and no measured tensions.
+    """
+    for stream in streams.values():
+        findings += stream.remarks
+        if stream.broken:
+            what = f"{stream.broken} messages could not be understood, and are left out"
+            findings.append(Finding("warning", stream.topic, what))
+    clocks: list[Finding] = []
+    times = _measurement_times(list(streams.values()), config.clock, clocks)
+    kept = {topic: _ordered(topic, times[topic], clocks) for topic in streams}
+    # commands may start much earlier than anything is measured
+    command = config.command.topic if config.command is not None and config.measured is not None else None
+    zero = min(
+        (times[topic][rows[0]] for topic, rows in kept.items() if len(rows) and topic != command),
+        default=None,
+    )
+    if zero is None:
+        raise RecordingError("no poses and no tensions in this recording")
+    for finding in clocks:
+        seconds = tuple((time - zero) * 1e-9 for time in finding.times)
+        findings.append(dataclasses.replace(finding, times=seconds))
+    return {
+        topic: Rows(
+            topic, np.round((times[topic][rows] - zero) * 1e-9, 9), streams[topic].values[rows], findings
+        )
+        for topic, rows in kept.items()
+    }
+
+
+def _measurement_times(
+    streams: Sequence[Stream], clock: str, findings: list[Finding]
+) -> dict[str, Int[np.ndarray, " n"]]:
+    """Return the measurement times (ns) by topic, on the better of the two clocks, and add findings."""
     late = offsets(streams)
     known = [delay for delay in late.values() if np.isfinite(delay)]
     one_clock = not known or max(known) - min(known) <= DISAGREEMENT
@@ -165,13 +217,15 @@ def measurement_times(
             )
             findings.append(Finding("warning", stream.topic, what))
         else:
-            times[stream.topic], about_jumps = _without_jumps(stream)
-            findings += about_jumps
-    return times, [*findings, *_about_drift(streams, times)]
+            times[stream.topic] = _without_jumps(stream, findings)
+    _add_drift(streams, times, findings)
+    return times
 
 
-def _about_drift(streams: Sequence[Stream], times: Mapping[str, Int[np.ndarray, " n"]]) -> list[Finding]:
-    """Return a finding on the topic whose clock drifts most against the others'."""
+def _add_drift(
+    streams: Sequence[Stream], times: Mapping[str, Int[np.ndarray, " n"]], findings: list[Finding]
+) -> None:
+    """Add a finding on the topic whose clock drifts most against the others'."""
     drifts: dict[str, float] = {}
     noise = 0.0
     for stream in streams:
@@ -181,7 +235,7 @@ def _about_drift(streams: Sequence[Stream], times: Mapping[str, Int[np.ndarray, 
             drifts[stream.topic] = float(np.median(delay[-fifth:]) - np.median(delay[:fifth]))
             noise = max(noise, float(np.median(np.abs(delay[:fifth] - np.median(delay[:fifth])))))
     if not drifts or max(drifts.values()) - min(drifts.values()) <= max(DRIFT, 3.0 * noise):
-        return []
+        return
     usual = float(np.median(list(drifts.values())))
     topic = max(drifts, key=lambda name: abs(drifts[name] - usual))
     off = max(abs(drifts[topic] - drift) for drift in drifts.values())
@@ -189,11 +243,11 @@ def _about_drift(streams: Sequence[Stream], times: Mapping[str, Int[np.ndarray, 
         f"its clock drifts by {1e3 * off:.0f} ms against the others' during the recording; "
         "`clock: received` in the configuration takes the times of recording"
     )
-    return [Finding("warning", topic, what)]
+    findings.append(Finding("warning", topic, what))
 
 
-def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]]:
-    """Return the stamps and findings; if the stamps' clock jumped, recording times less the median delay."""
+def _without_jumps(stream: Stream, findings: list[Finding]) -> Int[np.ndarray, " n"]:
+    """Return the stamps; if their clock jumped, recording times less the median delay, and a finding."""
     stamps, received = np.diff(stream.stamped) * 1e-9, np.diff(stream.received) * 1e-9
     usual = np.median(stamps) if len(stamps) else 0.0
     # the clock whose step differs more from the usual step has jumped
@@ -208,18 +262,18 @@ def _without_jumps(stream: Stream) -> tuple[Int[np.ndarray, " n"], list[Finding]
         if len(after) >= 3 and abs(float(np.median(after) - np.median(before))) > JUMP:
             stays.append(int(row))
     if not stays:
-        return stream.stamped, []
+        return stream.stamped
     sizes = ", ".join(f"{stamps[row] - received[row]:+.3f} s" for row in stays[:3])
     more = f" and {len(stays) - 3} more" if len(stays) > 3 else ""
     when = tuple(float(stream.received[row + 1]) for row in stays)
     delay = np.int64(np.median((stream.received - stream.stamped)[: stays[0] + 1]))
     what = f"the clock of its stamps jumped ({sizes}{more}); the times of recording are used"
-    return stream.received - delay, [Finding("warning", stream.topic, what, when)]
+    findings.append(Finding("warning", stream.topic, what, when))
+    return stream.received - delay
 
 
-def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " kept"], list[Finding]]:
-    """Return the indices of the rows to keep, in order of increasing time, and the findings."""
-    findings: list[Finding] = []
+def _ordered(topic: str, time: Int[np.ndarray, " n"], findings: list[Finding]) -> Int[np.ndarray, " kept"]:
+    """Return the indices of the rows to keep, in order of increasing time, and add findings."""
     order = np.argsort(time, kind="stable")
     backwards = np.diff(time) < 0
     if backwards.any():
@@ -240,4 +294,4 @@ def ordered(topic: str, time: Int[np.ndarray, " n"]) -> tuple[Int[np.ndarray, " 
         messages = counted(int((~near).sum()), "message is", "messages are")
         what = f"{messages} more than {FAR:g} s from the others, and left out"
         findings.append(Finding("warning", topic, what))
-    return order[near], findings
+    return order[near]

@@ -73,6 +73,58 @@ class Table(NamedTuple):
     bodies: tuple[str, ...] = ()
     up: str = "z"
 
+    @property
+    def source(self) -> str:
+        """Description and origin of the recording; empty if they are not stated."""
+        return self.metadata.get("source", "")
+
+    def completed(self, config: RecordingConfig) -> RecordingConfig:
+        """Return a configuration that has also what the table states. Raises `RecordingError`."""
+        simulated = self.metadata.get("simulated")
+        if simulated not in (None, "true", "false"):
+            raise RecordingError(f"simulated is {shown(simulated)}; allowed is true or false")
+        if self.bodies:
+            config = config.replace(position_unit="m", up=config.up or self.up)
+        if config.simulated is None and simulated is not None:
+            config = config.replace(simulated=simulated == "true")
+        return config
+
+    def streams(self, config: RecordingConfig, findings: list[Finding]) -> dict[str, Stream]:
+        """Return the measured rows of each topic, and add findings on unread columns and rows without times.
+
+        Raises:
+            RecordingError: a column is missing, or the times are not plausible seconds.
+        """
+        columns = list(self.numbers.columns)
+        titles = _titles_by_topic(config, columns)
+        unused = config.command if config.tensions == "measured" else config.measured
+        templates, mapped = config.table or TableSource(), config.columns or ColumnMap()
+        time = _times(self.numbers, templates, mapped)
+        has_rate = templates.rate is not None and mapped.time is None
+        read = set[int]() if has_rate else {_place(mapped.time or TIME, columns)}
+        streams = {}
+        for topic, named in titles.items():
+            # tensions that do not drive the robot may be missing
+            if unused is not None and topic == unused.topic and not set(named) & set(columns):
+                continue
+            places = [_place(title, columns) for title in named]
+            read |= set(places)
+            values = columns_of(self.numbers, places)
+            there = np.isfinite(time) & np.isfinite(values).any(axis=1)
+            stamps = np.round(time[there] * 1e9).astype(np.int64)
+            # received times may be negative, because a table may begin before zero
+            streams[topic] = Stream(topic, stamps, stamps, values[there])
+        rows = (np.flatnonzero(~np.isfinite(time)) + 1).tolist()
+        if rows:
+            what = f"{numbered(rows, 'row has no time', 'rows have no time')}; left out"
+            findings.append(Finding("warning", "", what))
+        others = [title for k, title in enumerate(columns) if k not in read]
+        if others:
+            listed = ", ".join(others[:MOST_LISTED]) + (", …" if len(others) > MOST_LISTED else "")
+            verb = "column is" if len(others) == 1 else "columns are"
+            findings.append(Finding("note", "", f"{len(others)} {verb} not read: {listed}"))
+        return streams
+
 
 def numbered(numbers: Sequence[int], one: str, several: str) -> str:
     """Return a count of lines or rows, and the first of their numbers."""
@@ -100,7 +152,7 @@ def _is_missing(cells: pd.Series) -> pd.Series:
     return cells.astype(str).str.strip().str.lower().isin(("nan", "none", "null", "na", "n/a", "-nan", ""))
 
 
-def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[np.ndarray, "n places"]:
+def columns_of(table: pd.DataFrame, places: Sequence[int]) -> Float[np.ndarray, "n places"]:
     """Return columns of numbers by their places. Raises `RecordingError` for one that has text."""
     import pandas as pd
 
@@ -110,7 +162,7 @@ def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[n
             numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
             row = int(np.argmax(~np.isfinite(numbers) & ~_is_missing(cells).to_numpy()))
             raise RecordingError(
-                f"{path}: row {row + 1}: {table.columns[place]} is {shown(str(cells.iloc[row]).strip())}; "
+                f"row {row + 1}: {table.columns[place]} is {shown(str(cells.iloc[row]).strip())}; "
                 "allowed is a finite number"
             )
     return table.iloc[:, list(places)].to_numpy(dtype=float)
@@ -119,7 +171,7 @@ def columns_of(table: pd.DataFrame, places: Sequence[int], path: str) -> Float[n
 # meaning of the columns
 
 
-def configured(metadata: Mapping[str, str], columns: list[str], path: str) -> RecordingConfig:
+def configured(metadata: Mapping[str, str], columns: list[str]) -> RecordingConfig:
     """Return the configuration derived from a table's titles and metadata. Raises `RecordingError`."""
     others = [name for name in columns if name != TIME]
     tendons = {
@@ -127,7 +179,7 @@ def configured(metadata: Mapping[str, str], columns: list[str], path: str) -> Re
     }
     if tendons[TENSION] and tendons[HELD]:
         raise RecordingError(
-            f"{path}: there are {TENSION}_1 (at the row's time) and {HELD}_1 (from its row to the next); "
+            f"there are {TENSION}_1 (at the row's time) and {HELD}_1 (from its row to the next); "
             "allowed is one of them"
         )
     measured = HELD if tendons[HELD] else TENSION
@@ -138,37 +190,34 @@ def configured(metadata: Mapping[str, str], columns: list[str], path: str) -> Re
         known += position_titles(body, "m") + (oriented if oriented[0] in columns else [])
     wrong = TIME not in columns or not bodies or not any(tendons.values()) or len(set(columns)) < len(columns)
     if wrong or sorted(known) != sorted(others):
-        raise RecordingError(f"{path}: the columns are {', '.join(columns)}; allowed is {ALLOWED}, once each")
+        raise RecordingError(f"the columns are {', '.join(columns)}; allowed is {ALLOWED}, once each")
     markers = []
     for body in bodies:
         key = f"fraction {body}"
         if key not in metadata and len(bodies) > 1:
             raise RecordingError(
-                f"{path}: where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a "
+                f"where on the rod {body} is, is not said; allowed is a line '# {key}: ' with a "
                 "number from 0 to 1, or a configuration"
             )
-        (fraction,) = _metadata_numbers(key, metadata, path) or (1.0,)
+        (fraction,) = _metadata_numbers(key, metadata) or (1.0,)
         markers.append(MarkerSource(body, body, fraction, rotation=(1.0, 0.0, 0.0, 0.0)))
     order = {prefix: tuple(range(1, count + 1)) for prefix, count in tendons.items()}
-    (latency,) = _metadata_numbers("latency", metadata, path) or (0.0,)
+    (latency,) = _metadata_numbers("latency", metadata) or (0.0,)
     tension = command = None
-    try:
-        if order[measured]:
-            tension = TensionSource(measured, order[measured], held=True if measured == HELD else None)
-        if order[COMMAND]:
-            command = CommandSource(COMMAND, order[COMMAND], latency=latency)
-        return RecordingConfig(
-            markers=tuple(sorted(markers, key=lambda marker: marker.fraction)),
-            tension=tension,
-            command=command,
-            tensions="measured" if tension else "commanded",
-            initial_tension=_metadata_numbers(INITIAL, metadata, path),
-        )
-    except RecordingError as error:
-        raise RecordingError(f"{path}: {error}") from None
+    if order[measured]:
+        tension = TensionSource(measured, order[measured], held=True if measured == HELD else None)
+    if order[COMMAND]:
+        command = CommandSource(COMMAND, order[COMMAND], latency=latency)
+    return RecordingConfig(
+        markers=tuple(sorted(markers, key=lambda marker: marker.fraction)),
+        tension=tension,
+        command=command,
+        tensions="measured" if tension else "commanded",
+        initial_tension=_metadata_numbers(INITIAL, metadata),
+    )
 
 
-def _metadata_numbers(key: str, metadata: Mapping[str, str], path: str) -> tuple[float, ...] | None:
+def _metadata_numbers(key: str, metadata: Mapping[str, str]) -> tuple[float, ...] | None:
     """Return the numbers of the metadata under a key, one except of tensions; None without the key."""
     if key not in metadata:
         return None
@@ -177,7 +226,7 @@ def _metadata_numbers(key: str, metadata: Mapping[str, str], path: str) -> tuple
         return tuple(map(float, words))
     except ValueError:
         kind = "numbers (N)" if key == INITIAL else "a number"
-        raise RecordingError(f"{path}: {key} is {shown(metadata[key])}; allowed is {kind}") from None
+        raise RecordingError(f"{key} is {shown(metadata[key])}; allowed is {kind}") from None
 
 
 def position_titles(body: str, unit: str) -> list[str]:
@@ -195,44 +244,7 @@ def tension_titles(topic: str, unit: str, count: int) -> list[str]:
     return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
 
 
-def streams_of(
-    table: pd.DataFrame, config: RecordingConfig, path: str
-) -> tuple[dict[str, Stream], list[Finding]]:
-    """Return the measured rows of each topic, and findings on rows without times and on unread columns.
-
-    Raises:
-        RecordingError: a column is missing, or the times are not plausible seconds.
-    """
-    columns, titles = list(table.columns), _titles_by_topic(config, list(table.columns), path)
-    unused = config.command if config.tensions == "measured" else config.measured
-    streams = {}
-    templates, mapped = config.table or TableSource(), config.columns or ColumnMap()
-    has_rate = templates.rate is not None and mapped.time is None
-    time = _times(table, templates, mapped, path)
-    read = set[int]() if has_rate else {_place(mapped.time or TIME, columns, path)}
-    for topic, named in titles.items():
-        # tensions that do not drive the robot may be missing
-        if unused is not None and topic == unused.topic and not any(title in columns for title in named):
-            continue
-        places = [_place(title, columns, path) for title in named]
-        read |= set(places)
-        values = columns_of(table, places, path)
-        there = np.isfinite(time) & np.isfinite(values).any(axis=1)
-        stamps = np.round(time[there] * 1e9).astype(np.int64)
-        # received times may be negative, because a table may begin before zero
-        streams[topic] = Stream(topic, stamps, stamps, values[there])
-    rows = (np.flatnonzero(~np.isfinite(time)) + 1).tolist()
-    what = f"{numbered(rows, 'row has no time', 'rows have no time')}; left out"
-    findings = [Finding("warning", "", what)] if rows else []
-    others = [title for k, title in enumerate(columns) if k not in read]
-    if others:
-        listed = ", ".join(others[:MOST_LISTED]) + (", …" if len(others) > MOST_LISTED else "")
-        verb = "column is" if len(others) == 1 else "columns are"
-        findings.append(Finding("note", "", f"{len(others)} {verb} not read: {listed}"))
-    return streams, findings
-
-
-def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> dict[str, list[str]]:
+def _titles_by_topic(config: RecordingConfig, columns: list[str]) -> dict[str, list[str]]:
     """Return the titles of each topic: from the map of columns, from templates, or the usual ones."""
     mapped, templates = config.columns or ColumnMap(), config.table or TableSource()
     titles: dict[str, list[str]] = {}
@@ -249,7 +261,7 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> 
             titles[topic] = list(dict(mapped.bodies).get(topic, usual))
     for sensor in config.sensors:
         if sensor.columns is None:
-            raise RecordingError(f"{path}: the columns of the sensor {sensor.topic} are missing; name them")
+            raise RecordingError(f"the columns of the sensor {sensor.topic} are missing; name them")
         titles[sensor.topic] = list(sensor.columns)
     for tendons, named in (
         (config.tension, mapped.tensions), (config.motors, mapped.motors), (config.command, mapped.commands),
@@ -261,14 +273,14 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str], path: str) -> 
                 usual = [templates.motor.replace(PLACE, str(k + 1)) for k in range(count)]
             if named is not None and len(named) != count:
                 raise RecordingError(
-                    f"{path}: {len(named)} columns are mapped and order has {count} tendons; allowed is the "
+                    f"{len(named)} columns are mapped and order has {count} tendons; allowed is the "
                     "same number"
                 )
             titles[tendons.topic] = list(named or usual)
     return titles
 
 
-def _place(title: str, columns: Sequence[str], path: str) -> int:
+def _place(title: str, columns: Sequence[str]) -> int:
     """Return the index of a title; a number that is no title counts from 1. Raises `RecordingError`."""
     if columns.count(title) == 1:
         return columns.index(title)
@@ -276,24 +288,22 @@ def _place(title: str, columns: Sequence[str], path: str) -> int:
         return int(title) - 1
     wrong = "there twice" if title in columns else "missing"
     hint = "; name it by its number, counted from 1" if title in columns else did_you_mean(title, columns)
-    raise RecordingError(f"{path}: the column {title} is {wrong}; the columns are {', '.join(columns)}{hint}")
+    raise RecordingError(f"the column {title} is {wrong}; the columns are {', '.join(columns)}{hint}")
 
 
-def _times(
-    table: pd.DataFrame, templates: TableSource, mapped: ColumnMap, path: str
-) -> Float[np.ndarray, " n"]:
+def _times(table: pd.DataFrame, templates: TableSource, mapped: ColumnMap) -> Float[np.ndarray, " n"]:
     """Return the rows' times (s). Raises `RecordingError` if they are not plausible seconds."""
     columns, title = list(table.columns), mapped.time or TIME
     if templates.rate is not None and mapped.time is None:
         time = np.arange(len(table)) / templates.rate
     elif mapped.time is None and columns.count(TIME) != 1:
         raise RecordingError(
-            f"{path}: the columns are {', '.join(columns)}; required is {TIME}, once (the configuration "
+            f"the columns are {', '.join(columns)}; required is {TIME}, once (the configuration "
             "names another title by `columns: {time: …}`, and the rate of rows without times by "
             "`table: {rate: …}`)"
         )
     else:
-        time = columns_of(table, [_place(title, columns, path)], path)[:, 0]
+        time = columns_of(table, [_place(title, columns)])[:, 0]
         time = time * TIME_UNITS[mapped.time_unit or stated_time_unit(title) or "s"]
     late = np.abs(time) > _LATEST
     known = np.sort(time[np.isfinite(time)])
@@ -305,7 +315,7 @@ def _times(
             what = f"row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}"
             most = abs(time[row]) / _LATEST
         unit = next((unit for unit, size in (("ms", 1e3), ("µs", 1e6)) if most <= size), "ns")
-        raise RecordingError(f"{path}: {what}. Are the times in {unit}?")
+        raise RecordingError(f"{what}. Are the times in {unit}?")
     return time
 
 

@@ -25,7 +25,7 @@ from knode_cosserat._files.limits import MORE, excess
 from knode_cosserat._files.writing import replacing, temporary_folder
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.content import EXPANDED, Decompression
-from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.findings import RecordingError, naming
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.messages import Bag, Topic, encoder_of, message_type, typestore
 from knode_cosserat.recordings.streams import Outgoing, OutgoingStream
@@ -68,14 +68,14 @@ class _Scan:
             topic.received.append(received)
             topic.raw.append(self.chunks.records(raw, "zstd") if raw[:4] == ZSTD_MAGIC else raw)
 
-    def result(self, what: str, path: Path, size: int, damage: str) -> Bag:
+    def result(self, what: str, size: int, damage: str) -> Bag:
         """Return the bag. Raises `RecordingError` if it has no topics."""
         self.bag.is_limited = self.chunks.is_limited
         self.bag.damage = EXPANDED if self.bag.is_limited else damage
         if not self.bag.topics:
             more = f"; {MORE}" if self.bag.is_limited else ""
             reason = f": {damage}" if what == "SQLite file" and damage else f"; it has {size} bytes"
-            raise RecordingError(f"{path}: no topic in this {what} can be read{reason}{more}")
+            raise RecordingError(f"no topic in this {what} can be read{reason}{more}")
         return self.bag
 
 
@@ -87,7 +87,7 @@ def read_ros1(path: Path, wanted: Collection[str]) -> Bag:
     data = content.file_bytes(path, content.LARGEST_BAG)
     if data.startswith(ROS1_MAGIC) and not data.startswith(ROS1_VERSION):
         version = data[len(ROS1_MAGIC) :].split(b"\n", 1)[0][:20].decode("ascii", "replace")
-        raise RecordingError(f"{path}: a bag of version {version!r}; allowed is 2.0")
+        raise RecordingError(f"a bag of version {version!r}; allowed is 2.0")
     typestore(1)
     file = _Scan(Bag(1), wanted, Decompression(len(data)))
     _scan_ros1(file, data, len(ROS1_VERSION) if data.startswith(ROS1_VERSION) else 0)
@@ -97,7 +97,7 @@ def read_ros1(path: Path, wanted: Collection[str]) -> Bag:
         damage = CUT
     else:
         damage = DAMAGED if file.bag.lost or file.index is None else ""
-    return file.result("bag", path, len(data), damage)
+    return file.result("bag", len(data), damage)
 
 
 def _scan_ros1(file: _Scan, data: bytes, position: int, in_chunk: bool = False) -> None:
@@ -171,7 +171,7 @@ def read_mcap(path: Path, wanted: Collection[str], data: bytes | None = None) ->
     damage = DAMAGED if file.bag.lost and file.finished else ""
     if not file.finished:
         damage = "the recorder was stopped or the file was cut"
-    return file.result("MCAP file", path, len(data), damage)
+    return file.result("MCAP file", len(data), damage)
 
 
 def _scan_mcap(file: _Scan, data: bytes, position: int, in_chunk: bool = False) -> None:
@@ -220,7 +220,7 @@ def read_sqlite(path: Path, wanted: Collection[str], data: bytes | None = None) 
     """Return the same as `read_ros1` for a SQLite file, or for its bytes. Raises `RecordingError`."""
     size = path.stat().st_size if data is None else len(data)
     if reason := excess(size, content.LARGEST_BAG, "bytes"):
-        raise RecordingError(f"{path}: {reason}")
+        raise RecordingError(f"{reason}")
     # without a journal beside it the file is only read; with one, SQLite has to look into both
     journal = path.with_name(path.name + "-wal").exists()
     address = f"file:{urllib.parse.quote(str(path))}?mode=ro" + ("" if journal else "&immutable=1")
@@ -229,7 +229,7 @@ def read_sqlite(path: Path, wanted: Collection[str], data: bytes | None = None) 
         if data is not None:
             connection.deserialize(data)
     except sqlite3.Error as error:
-        raise RecordingError(f"{path}: cannot be read: {error}") from None
+        raise RecordingError(f"cannot be read: {error}") from None
     file = _Scan(Bag(2), wanted, Decompression(size))
     # no text and no blob is longer than the file
     connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, 1 << 16))
@@ -246,7 +246,7 @@ def read_sqlite(path: Path, wanted: Collection[str], data: bytes | None = None) 
         connection.close()
     if not (damage or file.bag.topics):
         damage = "it has no tables of topics and messages"
-    return file.result("SQLite file", path, size, damage)
+    return file.result("SQLite file", size, damage)
 
 
 def _read_tables(connection: sqlite3.Connection, file: _Scan, size: int) -> str:
@@ -289,7 +289,7 @@ def read_ros2(path: Path, wanted: Collection[str]) -> Bag:
         file = Decompression(len(packed))
         head = data = file.records(packed, "zstd")
         if file.is_limited:
-            raise RecordingError(f"{path}: {EXPANDED}; {MORE}")
+            raise RecordingError(f"{EXPANDED}; {MORE}")
     is_sqlite = head.startswith(SQLITE_MAGIC) or (path.suffix == ".db3" and not head.startswith(MCAP_MAGIC))
     return (read_sqlite if is_sqlite else read_mcap)(path, wanted, data)
 
@@ -298,11 +298,13 @@ def read_folder(folder: Path, wanted: Collection[str]) -> Bag:
     """Return the files of a bag's folder in one bag. Raises `RecordingError`."""
     files = [path for path in folder.iterdir() if path.name.removesuffix(_PACKED).endswith(_STORAGE)]
     if not files:
-        raise RecordingError(f"{folder}: this folder holds no bag; allowed is one with .mcap or .db3 files")
+        raise RecordingError("this folder holds no bag; allowed is one with .mcap or .db3 files")
+    bags = []
     # the recorder numbers them: _0, _1 … _10
-    first, *others = [
-        read_ros2(path, wanted) for path in sorted(files, key=lambda path: (len(path.name), path.name))
-    ]
+    for path in sorted(files, key=lambda path: (len(path.name), path.name)):
+        with naming(path.name):
+            bags.append(read_ros2(path, wanted))
+    first, *others = bags
     for bag in others:
         first.lost += bag.lost
         first.is_limited |= bag.is_limited

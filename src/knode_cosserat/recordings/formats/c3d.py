@@ -39,22 +39,21 @@ def read_c3d(path: Path, wanted: Collection[str] = ()) -> Table:
     """Return the markers and analog channels of a file. Raises `RecordingError`."""
     data = content.file_bytes(path, csv_rows.LARGEST_FILE)
     try:
-        return _C3D(data, path).table()
+        return _C3D(data).table()
     except (struct.error, IndexError, ValueError) as error:
         if isinstance(error, RecordingError):
             raise
-        raise RecordingError(f"{path}: this C3D file is damaged: {error}") from None
+        raise RecordingError(f"this C3D file is damaged: {error}") from None
 
 
 class _C3D:
-    def __init__(self, data: bytes, path: Path) -> None:
-        self.data, self.path = data, path
+    def __init__(self, data: bytes) -> None:
+        self.data = data
         begin = (data[0] - 1) * _BLOCK
         _, _, blocks, processor = data[begin : begin + 4]
         if processor not in _PROCESSORS:
             raise RecordingError(
-                f"{path}: this C3D file is of the processor {processor}; allowed is 84 (Intel), 85 (DEC) or "
-                "86 (MIPS)"
+                f"this C3D file is of the processor {processor}; allowed is 84 (Intel), 85 (DEC) or 86 (MIPS)"
             )
         self.processor = _PROCESSORS[processor]
         self.order = "<" if self.processor == "dec" else self.processor
@@ -65,16 +64,14 @@ class _C3D:
         words = struct.unpack_from(f"{self.order}5H", self.data, 2)
         points = self._number("POINT:USED", words[0])
         if reason := excess(3 * points, MOST_COLUMNS, "columns"):
-            raise RecordingError(f"{self.path}: {reason}")
+            raise RecordingError(f"{reason}")
         per_frame, analog = struct.unpack_from(f"{self.order}H", self.data, 18)[0], words[1]
         scale = self._number("POINT:SCALE", self._floats(self.data[12:16])[0], float)
         rate = self._number("POINT:RATE", self._floats(self.data[20:24])[0], float)
         if not rate > 0.0:
-            raise RecordingError(
-                f"{self.path}: this C3D file has the rate {rate:g}; required is one above 0 Hz"
-            )
+            raise RecordingError(f"this C3D file has the rate {rate:g}; required is one above 0 Hz")
         if points == 0:
-            raise RecordingError(f"{self.path}: this C3D file has no markers")
+            raise RecordingError("this C3D file has no markers")
         first, stated = self._frames(words[2], words[3])
         is_float = scale < 0.0
         size = (4 * points + analog) * (4 if is_float else 2)
@@ -92,7 +89,7 @@ class _C3D:
         )
         rows = numbers.reshape(count, 4 * points + analog)
         measured = rows[:, : 4 * points].reshape(count, points, 4).astype(float)
-        length = length_unit(self._texts("POINT:UNITS", 1)[0], self.path, "mm", self.findings)
+        length = length_unit(self._texts("POINT:UNITS", 1)[0], "mm", self.findings)
         position = measured[:, :, :3] * length * (1.0 if is_float else scale)
         position[(measured[:, :, 3] < 0.0) | ~np.isfinite(position).all(axis=2)] = np.nan
         time = (first - 1 + np.arange(count)) / rate
@@ -101,7 +98,7 @@ class _C3D:
         channels = (
             self._channels(rows[:, 4 * points :], time, rate, per_frame) if analog and per_frame else []
         )
-        return export_table(self.path, time, tracks, up=self._up(), channels=channels, findings=self.findings)
+        return export_table(time, tracks, up=self._up(), channels=channels, findings=self.findings)
 
     def _channels(self, rows: np.ndarray, time: np.ndarray, rate: float, per_frame: int) -> list[Channels]:
         """Return the analog channels in their units."""

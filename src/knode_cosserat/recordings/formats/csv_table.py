@@ -31,25 +31,25 @@ DELIMITERS, _SAMPLE = (",", ";", "\t"), 20
 _POINT, _COMMA = r"[+-]?\d*\.?\d*(?:[eE][+-]?\d+)?", r"[+-]?\d*,?\d*(?:[eE][+-]?\d+)?"
 
 
-def read_csv(data: bytes, path: str) -> Table:
+def read_csv(data: bytes) -> Table:
     """Return a CSV file's metadata and its columns of numbers. The caller limits the number of bytes.
 
     Raises:
         RecordingError: the bytes are no table of numbers, or have too many lines or columns.
     """
     newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
-    _require(excess(newlines, csv_rows.MOST_LINES, "lines"), path)
+    _require(excess(newlines, csv_rows.MOST_LINES, "lines"))
     try:
         text = data.decode("utf-8-sig")
     except UnicodeDecodeError:
-        raise RecordingError(f"{path}: not a recording: no bag, and no CSV text: it is not UTF-8") from None
+        raise RecordingError("not a recording: no bag, and no CSV text: it is not UTF-8") from None
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     metadata, first = _comments(lines)
     delimiter = delimiter_of(lines[first : first + 10 * _SAMPLE])
     # a quoted cell can have line breaks, so that the header may not be one of the lines
     columns = 1 + max((line.count(delimiter) for line in itertools.islice(lines, first, None)), default=0)
-    _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"), path)
-    table, about_units = _titled(cells_of(text, delimiter, path), path)
+    _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"))
+    table, about_units = _titled(cells_of(text, delimiter))
     return Table(metadata, numbers_of(table), (*_about_comments(lines, first), *about_units))
 
 
@@ -68,10 +68,10 @@ def delimiter_of(lines: Sequence[str]) -> str:
     )
 
 
-def _require(reason: str, path: str) -> None:
+def _require(reason: str) -> None:
     """Raise `RecordingError` if there is a reason to refuse a file."""
     if reason:
-        raise RecordingError(f"{path}: {reason}")
+        raise RecordingError(f"{reason}")
 
 
 def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:
@@ -102,7 +102,7 @@ def _about_comments(lines: Sequence[str], header: int) -> tuple[Finding, ...]:
     return tuple(findings)
 
 
-def cells_of(text: str, delimiter: str, path: str) -> pd.DataFrame:
+def cells_of(text: str, delimiter: str) -> pd.DataFrame:
     """Return all cells as text, with decimal points."""
     import pandas as pd
 
@@ -111,10 +111,10 @@ def cells_of(text: str, delimiter: str, path: str) -> pd.DataFrame:
             io.StringIO(text), sep=delimiter, comment="#", header=None, dtype=str, skipinitialspace=True
         )
     except pd.errors.EmptyDataError:
-        raise RecordingError(f"{path}: the file is empty; allowed is a header {ALLOWED}") from None
+        raise RecordingError(f"the file is empty; allowed is a header {ALLOWED}") from None
     except (pd.errors.ParserError, ValueError) as error:
         reason = (str(error).strip().splitlines() or ["it cannot be parsed"])[-1]
-        raise RecordingError(f"{path}: not a CSV table: {reason}") from None
+        raise RecordingError(f"not a CSV table: {reason}") from None
     if delimiter == ",":
         return cells
     has_point = (
@@ -136,7 +136,7 @@ def _are(cells: pd.Series, pattern: str) -> bool:
     return bool(cells.dropna().str.strip().str.fullmatch(pattern).all())
 
 
-def _titled(cells: pd.DataFrame, path: str) -> tuple[pd.DataFrame, tuple[Finding, ...]]:
+def _titled(cells: pd.DataFrame) -> tuple[pd.DataFrame, tuple[Finding, ...]]:
     """Return the rows under titles, without a line of units, and findings."""
     import pandas as pd
 
@@ -155,7 +155,7 @@ def _titled(cells: pd.DataFrame, path: str) -> tuple[pd.DataFrame, tuple[Finding
         :, [bool(title) or bool(table.iloc[:, k].notna().any()) for k, title in enumerate(titles)]
     ]
     if table.empty:
-        raise RecordingError(f"{path}: no rows after the header")
+        raise RecordingError("no rows after the header")
     return table, findings
 
 
@@ -171,7 +171,7 @@ register(
     RecordingFormat(
         "CSV table",
         recognise=lambda head: False,
-        read=lambda path, wanted: read_csv(content.file_bytes(path, csv_rows.LARGEST_FILE), str(path)),
+        read=lambda path, wanted: read_csv(content.file_bytes(path, csv_rows.LARGEST_FILE)),
         suffixes=(".csv", ".csv.gz"),
         write=write_csv,
         written=(".csv",),

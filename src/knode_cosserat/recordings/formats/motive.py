@@ -45,14 +45,14 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
     above = [row for row in header[1:axes_row] if any(row)]
     if len(above) < 3:
         raise RecordingError(
-            f"{path}: the header of this export of Motive is incomplete; required are rows of kinds, names, "
+            "the header of this export of Motive is incomplete; required are rows of kinds, names, "
             "Rotation and Position, and Frame,Time (Seconds),X,Y,Z,… (export with its header)"
         )
     axes = header[axes_row]
     kinds, names, measures = ([*row, *[""] * len(axes)] for row in (above[0], above[1], above[-1]))
     identities = [*next((row for row in above[2:-1] if "Parent" not in row), []), *[""] * len(axes)]
     findings: list[Finding] = []
-    scale = exports.length_unit(meta.get("Length Units", ""), path, "m", findings)
+    scale = exports.length_unit(meta.get("Length Units", ""), "m", findings)
     if meta.get("Coordinate Space", "Global") != "Global":
         what = (
             f"the coordinate space is {meta['Coordinate Space']}: are bodies in one frame? (export as Global)"
@@ -60,7 +60,7 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         findings.append(Finding("warning", "", what))
     # the data begin after the row of axes, whose cells have no line breaks
     first = next(k for k, line in enumerate(lines) if line.startswith(("Frame", '"Frame"')))
-    cells = exports.cells_reader(lines[first + 1 :], axes, delimiter, path)
+    cells = exports.cells_reader(lines[first + 1 :], axes, delimiter)
     places: dict[tuple[str, str, str], dict[str, dict[str, int]]] = {}
     for k in range(2, len(axes)):
         if measures[k] in ("Position", "Rotation"):
@@ -75,7 +75,7 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         if set("XYZW") <= set(turned):
             quaternion = cells([turned[axis] for axis in "WXYZ"])
         elif set("XYZ") <= set(turned):
-            quaternion = _of_angles(cells, turned, meta.get("Rotation Type", "XYZ"), path)
+            quaternion = _of_angles(cells, turned, meta.get("Rotation Type", "XYZ"))
         position = scale * cells([where[axis] for axis in "XYZ"])
         tracks.append(exports.Track(name, position, quaternion, kind.lower() or "marker"))
     if any(set(columns.get("Rotation", {})) == set("XYZ") for columns in places.values()):
@@ -84,19 +84,17 @@ def read_motive(path: Path, wanted: Collection[str] = ()) -> Table:
         )
         findings.append(Finding("note", "", what))
     tracks.sort(key=lambda track: [*map(str.lower, _KINDS), track.kind].index(track.kind))
-    return exports.export_table(
-        path, cells([1])[:, 0], tracks, up="y", findings=findings, source=meta.get("Take Name", "")
-    )
+    take = meta.get("Take Name", "")
+    source = f"{path.name}: {take}" if take else ""
+    return exports.export_table(cells([1])[:, 0], tracks, up="y", findings=findings, source=source)
 
 
-def _of_angles(cells: exports.Columns, places: dict[str, int], order: str, path: Path) -> np.ndarray:
+def _of_angles(cells: exports.Columns, places: dict[str, int], order: str) -> np.ndarray:
     """Return quaternions of Euler angles (degrees) about the moving axes in an order such as XYZ."""
     from scipy.spatial.transform import Rotation
 
     if sorted(order.upper()) != list("XYZ"):
-        raise RecordingError(
-            f"{path}: the rotation type is {order!r}; allowed is Quaternion, or an order as XYZ"
-        )
+        raise RecordingError(f"the rotation type is {order!r}; allowed is Quaternion, or an order as XYZ")
     angles = cells([places[axis] for axis in order.upper()])
     return exports.quaternions_of(
         angles, lambda known: Rotation.from_euler(order.upper(), known, degrees=True)

@@ -53,14 +53,14 @@ class _Section(NamedTuple):
 
 def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
     """Return the bodies, markers and channels of an export. Raises `RecordingError`."""
-    sections = list(_sections(exports.text_lines(path), path))
+    sections = list(_sections(exports.text_lines(path)))
     # several samples of a device are taken during one frame
     slow = [section.rate for section in sections if not section.sample.any()]
     rate = slow[0] if slow else sections[0].rate / (1.0 + float(np.nanmax(sections[0].sample)))
     time, tracks, channels, findings = None, [], [], list[Finding]()
     for section in sections:
         at = section.frame / rate + section.sample / section.rate
-        bodies, others = _tracks(section, findings, path)
+        bodies, others = _tracks(section, findings)
         if bodies and (time is None or np.array_equal(at, time)):
             time = at
             tracks += bodies
@@ -69,11 +69,11 @@ def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
             findings.append(Finding("warning", "", f"{names:.200}: of another rate than the first; left out"))
         channels.append((at, others))
     return exports.export_table(
-        path, np.zeros(0) if time is None else time, tracks, up="z", channels=channels, findings=findings
+        np.zeros(0) if time is None else time, tracks, up="z", channels=channels, findings=findings
     )
 
 
-def _sections(lines: list[str], path: Path) -> Iterator[_Section]:
+def _sections(lines: list[str]) -> Iterator[_Section]:
     starts = [k for k in range(len(lines) - 1) if _BEGIN.match(lines[k]) and _RATE.match(lines[k + 1])]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         name = lines[start].strip('", ;\t')
@@ -81,8 +81,7 @@ def _sections(lines: list[str], path: Path) -> Iterator[_Section]:
         rows = next((k for k in range(start + 2, end) if not lines[k].strip(" ,;\t")), end)
         if rows < start + 6:
             raise RecordingError(
-                f"{path}: the section {name} is incomplete; required are names, titles, units and "
-                "rows of numbers"
+                f"the section {name} is incomplete; required are names, titles, units and rows of numbers"
             )
         rate = float(_RATE.match(lines[start + 1])[1].replace(",", "."))  # type: ignore[index]
         delimiter = delimiter_of(lines[start + 3 : start + 6])
@@ -91,20 +90,18 @@ def _sections(lines: list[str], path: Path) -> Iterator[_Section]:
         )
         if titles[:2] != ["Frame", "Sub Frame"] or rate <= 0.0:
             raise RecordingError(
-                f"{path}: the section {name} has the titles {', '.join(titles)[:80]} and the rate {rate:g}; "
+                f"the section {name} has the titles {', '.join(titles)[:80]} and the rate {rate:g}; "
                 "required are Frame, Sub Frame, … and a rate above 0 Hz"
             )
         groups, units = ([*row, *[""] * len(titles)][: len(titles)] for row in (groups, units))
         for k in range(3, len(groups)):
             groups[k] = groups[k] or groups[k - 1]
-        cells = exports.cells_reader(lines[start + 5 : rows], titles, delimiter, path)
+        cells = exports.cells_reader(lines[start + 5 : rows], titles, delimiter)
         frame, sample = np.nan_to_num(cells([0, 1])).T
         yield _Section(rate, frame, sample, cells, groups, titles, units)
 
 
-def _tracks(
-    section: _Section, findings: list[Finding], path: Path
-) -> tuple[list[exports.Track], dict[str, np.ndarray]]:
+def _tracks(section: _Section, findings: list[Finding]) -> tuple[list[exports.Track], dict[str, np.ndarray]]:
     """Return the bodies and markers of a section, and its other columns by title."""
     from scipy.spatial.transform import Rotation
 
@@ -129,9 +126,7 @@ def _tracks(
             elif rotated and all(axis in places for axis in rotated):
                 size = _ANGLES.get(unit["RX"].rstrip("s"))
                 if size is None:
-                    raise RecordingError(
-                        f"{path}: the unit of RX of {name} is {unit['RX']!r}; allowed is deg or rad"
-                    )
+                    raise RecordingError(f"the unit of RX of {name} is {unit['RX']!r}; allowed is deg or rad")
                 vectors = size * section.cells([places[axis] for axis in rotated])
                 quaternion = exports.quaternions_of(vectors, Rotation.from_rotvec)
                 what = "rotations RX, RY, RZ are read as rotation vectors (helical angles)"

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from knode_cosserat._files import parquet_file
-from knode_cosserat._files.reading import ReadError
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import shown
 from knode_cosserat.recordings.findings import RecordingError
@@ -23,38 +22,33 @@ def read_parquet(path: Path) -> Table:
     """Return a Parquet file's metadata and its columns of numbers.
 
     Raises:
-        RecordingError: the file cannot be read, a column has no numbers, or a limit is exceeded.
+        ReadError: the file cannot be read, or a limit is exceeded.
+        RecordingError: a column has no numbers.
         ImportError: pyarrow is not installed.
     """
     types = _pyarrow().types
     import pandas as pd  # type: ignore[import-untyped]
 
-    try:
-        with parquet_file.open_parquet(path) as file:
-            for k in range(file.metadata.num_columns):
-                column = file.metadata.schema.column(k)
-                flat = column.max_repetition_level == 0 and column.path == column.name
-                logical = column.logical_type.type
-                if not flat or column.physical_type not in _NUMBERS or logical not in _PLAIN:
-                    kind = (column.physical_type if logical in _PLAIN else logical).lower()
-                    raise RecordingError(
-                        f"{path}: the column {shown(column.path)} has {kind if flat else 'lists'}; allowed "
-                        "are numbers"
-                    )
-            parquet_file.require_limited_expansion(file.metadata, path)
-            table = file.read()
-            metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
-    except ReadError as error:
-        raise RecordingError(f"{path}: {error}") from None
+    with parquet_file.open_parquet(path) as file:
+        for k in range(file.metadata.num_columns):
+            column = file.metadata.schema.column(k)
+            flat = column.max_repetition_level == 0 and column.path == column.name
+            logical = column.logical_type.type
+            if not flat or column.physical_type not in _NUMBERS or logical not in _PLAIN:
+                kind = (column.physical_type if logical in _PLAIN else logical).lower()
+                raise RecordingError(
+                    f"the column {shown(column.path)} has {kind if flat else 'lists'}; allowed are numbers"
+                )
+        parquet_file.require_limited_expansion(file.metadata, path)
+        table = file.read()
+        metadata = {key.decode(): value.decode() for key, value in (table.schema.metadata or {}).items()}
     numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_null)
     for field in table.schema:
         if not any(is_kind(field.type) for is_kind in numbers):
-            raise RecordingError(
-                f"{path}: the column {shown(field.name)} has {field.type}; allowed are numbers"
-            )
+            raise RecordingError(f"the column {shown(field.name)} has {field.type}; allowed are numbers")
     frame = pd.DataFrame({name: table.column(k).to_numpy() for k, name in enumerate(table.column_names)})
     if frame.empty:
-        raise RecordingError(f"{path}: no rows")
+        raise RecordingError("no rows")
     return Table(metadata, numbers_of(frame))
 
 

@@ -33,7 +33,7 @@ def read_trc(path: Path, wanted: Collection[str] = ()) -> Table:
     )
     if not lines[0].startswith(_START) or names[:1] != ["Frame#"]:
         raise RecordingError(
-            f"{path}: the header of this TRC file is damaged; required are PathFileType, the lines of "
+            "the header of this TRC file is damaged; required are PathFileType, the lines of "
             "DataRate and its values, and Frame#, Time and the markers' names"
         )
     stated = dict(zip(keys, values, strict=False))
@@ -46,14 +46,14 @@ def read_trc(path: Path, wanted: Collection[str] = ()) -> Table:
     if stated.get("NumMarkers", "") != str(len(markers)):
         what = f"NumMarkers is {stated.get('NumMarkers') or 'missing'}, and {len(markers)} markers have names"
         findings.append(Finding("warning", "", what))
-    scale = length_unit(stated.get("Units", ""), path, "mm", findings)
+    scale = length_unit(stated.get("Units", ""), "mm", findings)
     findings.append(
         Finding("note", "", "TRC files do not state which axis points up; y is taken (`up` states it)")
     )
     titles = ["Frame#", "Time", *(f"{name} {axis}" for name in markers for axis in "XYZ")]
-    cells = cells_reader(lines[5 if has_axes else 4 :], titles, "\t", path)
+    cells = cells_reader(lines[5 if has_axes else 4 :], titles, "\t")
     tracks = [Track(name, scale * cells([3 * k + 2, 3 * k + 3, 3 * k + 4])) for k, name in enumerate(markers)]
-    return export_table(path, cells([1])[:, 0], tracks, up="y", findings=findings)
+    return export_table(cells([1])[:, 0], tracks, up="y", findings=findings)
 
 
 register(
