@@ -384,7 +384,7 @@ class EliminationCode(RodCode):
     def _write_linearise(self) -> None:
         """Rates, slopes and factors at y."""
         e = self.equations
-        self.linearised = f = self._function("linearised")
+        self.linearise = f = self._function("linearise")
         memory = f.arguments[0]
         self._write_places(self.rates_and_slopes, self.y, self.H, slopes=True)
         self._write_ends(self.slope, self.slope_end)

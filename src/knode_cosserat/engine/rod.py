@@ -388,7 +388,7 @@ class RodCode(Memory):
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
             self._put(value - self._get(self.tip_offset, i), self.tip, i)
 
-    def _evaluated_at(self, y: Array) -> StateArrays:
+    def _state_arrays(self, y: Array) -> StateArrays:
         """Return the arrays of the state that was evaluated last, from y at the points."""
         return StateArrays(y if self.far is None else self.far, self.between, self.z, self.f)
 

@@ -125,7 +125,7 @@ class _TangentCode(StepMap):
         """The derivatives of a step at its solution."""
         e = self.equations
         self.derivatives = f = self._function("derivatives")
-        f.call(self.linearised, f.arguments[0])
+        f.call(self.linearise, f.arguments[0])
         for name, state in self._end_states():
             for array, nonzeros in (
                 (self.by_history[name], e.by_history[name]), (self.by_control[name], e.by_control[name])
@@ -142,7 +142,7 @@ class _TangentCode(StepMap):
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
         self._write_shift(self.records, self._count("used"))
-        for i, j, newest in self._numbers_of(self._evaluated_at(self.y), "used between"):
+        for i, j, newest in self._numbers_of(self._state_arrays(self.y), "used between"):
             self._write_wide(newest, self.records[0], i, j)
             if self.settings.uses_rate:
                 self._write_wide(c0 * newest + self._wide(self.H, i, j), self.rate, i, j)
