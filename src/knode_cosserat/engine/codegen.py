@@ -648,7 +648,7 @@ class Function:
         return self.apply(operation, *(values[each] for each in arguments))
 
     def _loop(self, program: Program, node: int, values: dict[int, Any], lanes: int) -> None:
-        loop = program.loops[program.operations[node][1]]
+        loop = program.loops[node]
         inner: dict[int, Value] = {}
         for name, outer in loop.inputs:
             inner[loop.program.input(name, 1)] = values[outer]

@@ -42,6 +42,12 @@ class Array:
         return self.offset + j * self.place + i * self.component
 
 
+def aligned_zeros(size: int) -> np.ndarray:
+    """Return zeros, aligned to 64 bytes."""
+    raw = np.zeros(size + 8)
+    return raw[(-raw.ctypes.data // 8) % 8 :][:size]
+
+
 class Memory:
     """Arrays of a run, and the function that is being written."""
 

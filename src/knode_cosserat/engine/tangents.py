@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Index, Value, Variable
-from knode_cosserat.engine.equations import Nonzeros
 from knode_cosserat.engine.linear import Add, Columns, Number, write
-from knode_cosserat.engine.memory import Array
+from knode_cosserat.engine.memory import Array, aligned_zeros
+from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.engine.step_map import COLUMNS, STATE, StepMap
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.settings import Settings
@@ -375,7 +375,7 @@ class TangentCore(_TangentCode):
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
             self._put_in(moved, self.dparameters, directions[:, None, None])
-        states = _aligned(blocks * self.state_size).reshape(blocks, -1)
+        states = aligned_zeros(blocks * self.state_size).reshape(blocks, -1)
         d_records, d_rate = d_states
         columns = filled(np.concatenate([d_records, d_rate[None]])).reshape(-1, *d_rate.shape[:2], blocks, L)
         self._lasting(states, L)[:] = self._by_strand(self.records[0], columns.transpose(3, 4, 0, 1, 2))
@@ -564,9 +564,3 @@ class CotangentCore(_TangentCode):
 
 def _nodes(nonzeros: Nonzeros) -> list[int]:
     return [node for *_, node in nonzeros]
-
-
-def _aligned(size: int) -> np.ndarray:
-    """Return zeros, aligned to 64 bytes."""
-    raw = np.zeros(size + 8)
-    return raw[(-raw.ctypes.data // 8) % 8 :][:size]
