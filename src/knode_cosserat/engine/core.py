@@ -750,7 +750,7 @@ class Core(EliminationCode):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
             table[[0, -1]] = c0, t
-            self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), most)
+            self._functions.run("evaluate", memory, table, control, most)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
             pieces = slice(counts["pieces"])

@@ -385,7 +385,7 @@ class TangentCore(_TangentCode):
         shapes = (self.counts["nodes"], self.packed.size), (k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
         arrays = *begun, moved, states, filled(weights), filled(d_controls), d_rows, d_unknowns
-        self._functions["run"](*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
+        self._functions.run("run", *arrays, count, len(directions), blocks * L)
         motion = (self._numbers(begun[0][None], each)[0, 0] for each in (*self.records, self.rate))
         *records, rate = (self._joined(self.rate, each, places) for each in motion)
         columns = self._joined(self.rate, self._lasting(states, L, -count), places).transpose(2, 3, 4, 0, 1)
@@ -557,7 +557,7 @@ class CotangentCore(_TangentCode):
         size = sum(map(self._size_of, self._packed(self._kept)))
         kept = np.empty((count, size))
         arrays = *begun, kept, states, d_controls, d_rows, d_unknowns
-        self._functions["run"](*(each.ctypes.data for each in arrays), size, count, m)
+        self._functions.run("run", *arrays, size, count, m)
         before = self._joined(self.rate, self._lasting(states, 1, count)[:, 0], places).transpose(1, 2, 3, 0)
         return self._numbers(states, self.parameter)[:, 0, 0].T, d_controls, before[:-1], before[-1]
 
