@@ -45,7 +45,7 @@ def interpreted(program, outputs, inputs):
         elif name == "result":
             found[node] = found[rest[0]][rest[1]]
         elif name == "loop":
-            found[node] = looped(program.loops[rest[0]], found)
+            found[node] = looped(program.loops[node], found)
         elif name == "stack":
             found[node] = np.array([found[each] for each in rest])
         elif name == "inputs":
@@ -372,7 +372,8 @@ def test_loops_are_not_differentiated():
     assert values(out, 3.0) == 192.0
     with pytest.raises(EngineError, match=r"test_program.py:\d+: a while loop is differentiated"):
         program.jacobian([int(out)], [int(x)])
-    assert program.loops[0].kinds == ["f"]
+    [loop] = program.loops.values()
+    assert loop.kinds == ["f"]
 
 
 def test_indices_and_shapes():

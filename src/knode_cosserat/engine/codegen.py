@@ -14,7 +14,7 @@ import functools
 import itertools
 import operator
 import struct
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from knode_cosserat.engine import elementary
@@ -202,7 +202,7 @@ class Module:
             found = Variable(f, elementary.FUNCTIONS[operation](f, x))
             if operation in elementary.OF_ANGLES:
                 with f.if_(f.any(f.apply("abs", x) > elementary.LARGEST_ANGLE)):
-                    found.set(f.by_library(operation, [x]))
+                    found.set(f.call_library(operation, [x]))
             f.returned = found.get()
             self._functions.append(f)
         return name
@@ -402,52 +402,31 @@ class Function:
 
     def apply(self, operation: str, *arguments: Any) -> Value:
         """Return an operation of a program (`program.Program`)."""
-        if operation in ("add", "sub", "mul", "div"):
-            return self.binary(operation, *arguments)
-        if operation in COMPARISONS:
-            return self.compare(operation, *arguments)
-        if operation in ("and", "or"):
-            return self.logical(operation, *arguments)
-        if operation == "not":
-            return self.logical("xor", arguments[0], True)
-        if operation == "select":
-            condition, no, yes = arguments
-            return self.select(condition, yes, no)
-        if operation == "hold":
-            return arguments[0]
+        if operation in OPERATIONS:
+            return OPERATIONS[operation](self, *arguments)
         values, lanes = self._same(*arguments)
-        kind = values[0].type
-        if operation == "neg":
-            return self.result(f"fneg {kind} {values[0].name}", lanes=lanes)
-        if operation == "sign":
-            x = values[0]
-            return self.select(x > 0.0, 1.0, self.select(x < 0.0, -1.0, 0.0))
-        if operation == "isfinite":
-            return self.apply("abs", values[0]) < float("inf")
-        if operation == "logistic":
-            return 1.0 / (1.0 + self.apply("exp", -values[0]))
         if lanes > 1 and operation in elementary.FUNCTIONS:
-            return self._called(self.module.elementary(operation, lanes), values)
+            return self._call(self.module.elementary(operation, lanes), values)
         if operation in INTRINSICS:
             return self.intrinsic(INTRINSICS[operation], *values)
-        return self.by_library("fmod" if operation == "rem" else operation, values)
+        return self.call_library("fmod" if operation == "rem" else operation, values)
 
     def intrinsic(self, name: str, *values: Value) -> Value:
         """Return a function that LLVM provides, of numbers in the same lanes."""
         kind, lanes = values[0].type, values[0].lanes
         full = f"llvm.{name}.{'f64' if lanes == 1 else f'v{lanes}f64'}"
         self.module.declarations.add(f"declare {kind} @{full}({', '.join([kind] * len(values))})")
-        return self._called(full, values)
+        return self._call(full, values)
 
-    def by_library(self, name: str, values: Sequence[Value]) -> Value:
+    def call_library(self, name: str, values: Sequence[Value]) -> Value:
         """Return a function of the C library, by a call for every lane."""
         if name not in LIBRARY:
             raise EngineError(f"engine: no machine code for {name!r}")
         self.module.declarations.add(f"declare double @{name}({', '.join(['double'] * len(values))})")
         lanes = range(values[0].lanes)
-        return self.joined([self._called(name, [self.lane(each, k) for each in values]) for k in lanes])
+        return self.joined([self._call(name, [self.lane(each, k) for each in values]) for k in lanes])
 
-    def _called(self, name: str, values: Sequence[Value]) -> Value:
+    def _call(self, name: str, values: Sequence[Value]) -> Value:
         given = ", ".join(f"{each.type} {each.name}" for each in values)
         return self.result(f"call {values[0].type} @{name}({given})", lanes=values[0].lanes)
 
@@ -648,7 +627,7 @@ class Function:
         return self.apply(operation, *(values[each] for each in arguments))
 
     def _loop(self, program: Program, node: int, values: dict[int, Any], lanes: int) -> None:
-        loop = program.loops[program.operations[node][1]]
+        loop = program.loops[node]
         inner: dict[int, Value] = {}
         for name, outer in loop.inputs:
             inner[loop.program.input(name, 1)] = values[outer]
@@ -678,3 +657,27 @@ class Function:
             operation = program.operations[later]
             if operation[0] == "result" and operation[1] == node:
                 values[later] = state[operation[2]].get()
+
+
+def _negate(f: Function, x: Value) -> Value:
+    return f.result(f"fneg {x.type} {x.name}", lanes=x.lanes)
+
+
+def _by(method: Callable[..., Value], names: Iterable[str]) -> dict[str, Callable[..., Value]]:
+    """Return the operations that a method of functions writes by their name."""
+    return {name: lambda f, *values, name=name: method(f, name, *values) for name in names}
+
+
+#: operations of programs that are instructions of their own, or formulas
+OPERATIONS: dict[str, Callable[..., Value]] = {
+    **_by(Function.binary, ("add", "sub", "mul", "div")),
+    **_by(Function.compare, COMPARISONS),
+    **_by(Function.logical, ("and", "or")),
+    "not": lambda f, x: f.logical("xor", x, True),
+    "select": lambda f, p, no, yes: f.select(p, yes, no),
+    "hold": lambda f, x: x,
+    "neg": _negate,
+    "sign": lambda f, x: f.select(x > 0.0, 1.0, f.select(x < 0.0, -1.0, 0.0)),
+    "isfinite": lambda f, x: f.apply("abs", x) < float("inf"),
+    "logistic": lambda f, x: 1.0 / (1.0 + f.apply("exp", -x)),
+}

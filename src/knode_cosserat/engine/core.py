@@ -13,7 +13,7 @@ import itertools
 import math
 import operator
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from knode_cosserat.schemes.problem import Evaluated
 from knode_cosserat.schemes.semi_discrete import has_friction
 from knode_cosserat.schemes.settings import NewtonOptions, Settings
 
-#: numbers of a solved stage, for each robot
+#: numbers of the outcome of a stage, for each robot
 USABLE, ERROR, CORRECTIONS, LINEARISATIONS, POSITION, ANGLE, TIME, ALIVE = range(8)
 #: largest correction that may be left at a solution, relative to the state and its natural units
 LARGEST_CORRECTION = 1e-5
@@ -42,6 +42,16 @@ LARGEST_CORRECTION = 1e-5
 SURELY_SMALL = 1e-2
 #: index of `acceptable` in Newton's options
 ACCEPTABLE = [field.name for field in dataclasses.fields(NewtonOptions)].index("acceptable")
+#: the factors by which Newton's method corrects: none that are usable; those of an earlier step; those of the
+#: present iterate, before its first correction and after it; those of an earlier iterate of this step
+NONE, OLD, NEW, FRESH, KEPT = map(float, range(5))
+
+
+class Point(NamedTuple):
+    """Unknowns of a step, or a change of them: y at all points, and the unknowns at the bases."""
+
+    y: Array
+    unknowns: Array
 
 
 #: size of a state, and the arrays of each of its parts
@@ -64,10 +74,10 @@ class Core(EliminationCode):
         self.has_friction = self.is_linear_step and has_friction(system)
         e = self.equations
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
-        # Newton's method: its options, a trial point, and the correction from the last accepted one
+        # Newton's method: its options, the iterate and its correction, a trial point and the correction there
         self.options = a(len(dataclasses.fields(NewtonOptions)))
-        self.trial, self.direction = a(ny, "ends"), a(ny, "ends")
-        self.trial_unknowns, self.direction_unknowns = a(k), a(k)
+        self.iterate, self.step = Point(self.y, self.unknowns), Point(self.dy, self.step_unknowns)
+        self.trial, self.direction, self.better = (Point(a(ny, "ends"), a(k)) for _ in range(3))
         # the motion: records of earlier states and their rate, states for the first guess, errors of records
         memory = range(settings.memory)
         self.records, self.rate = [a(numbers, "count") for _ in memory], a(numbers, "count")
@@ -81,12 +91,11 @@ class Core(EliminationCode):
         ]  # fmt: skip
         self.shape = [[self.y]]
         #: of the stage solved last (`USABLE` and the next)
-        self.numbers = a(8)
+        self.outcome = a(8)
         #: for sizes relative to the state: one over the natural unit plus |y|
         self.weights_of_y = a(ny, "points")
         # corrected motions: history terms, defects
         self.dH, self.own_dH = (a(numbers, "used") for _ in range(2))
-        self.better, self.better_unknowns = a(ny, "ends"), a(k)
         self.defect, self.own_defect, self.rest = (a(ny, "pieces") for _ in range(3))
         self.tip_rest = a(k)
         # products of derivatives, for the error of the time scheme
@@ -120,125 +129,100 @@ class Core(EliminationCode):
     # Newton's method
 
     def _write_newton(self) -> None:
-        """Solve one step from y and the unknowns; results in y, the rates belong to y."""
-        e = self.equations
-        self.solve = f = self._function("solve", "numbers")
-        memory, numbers = f.arguments
-        options = range(self.options.size)
-        tolerance, acceptable, most, patience, least_damping = (self._get(self.options, i) for i in options)
-        P, infinity = self.P, float("inf")
+        """Newton's method for a step (docs/engine.md), from y and the unknowns; the rates belong to y."""
+        self.solve = f = self._function("solve")
+        memory, infinity = f.arguments[0], math.inf
+        options = (self._get(self.options, i) for i in range(self.options.size))
+        tolerance, acceptable, most, patience, least_damping = options
+        is_alive = self._get(self.outcome, ALIVE) > 0.0
+        factors = self._variable(f.select(self._get(self.outcome, USABLE) > 0.0, OLD, NONE))
+        is_finished = self._variable(False)
+        error, size, relative_size = (self._variable(infinity) for _ in range(3))
+        damping, corrections, linearisations = (self._variable(each) for each in (1.0, 0.0, 0.0))
+        self._write_point(self.direction, lambda: 0.0)
 
-        def plain(value: float) -> Variable:
-            return Variable(f, f.splat(f.value(value), P))
+        def is_in(*states: float) -> Value:
+            return functools.reduce(operator.or_, (f.compare("eq", factors.get(), each) for each in states))
 
-        def truth(value: bool) -> Variable:
-            return Variable(f, f.splat(f.value(value), P))
+        def is_active() -> Value:
+            needed = linearisations.get() + f.select(is_in(NONE), 1.0, 0.0)
+            return is_alive & ~is_finished.get() & (needed <= most)
 
-        error, size, left, damping = plain(infinity), plain(infinity), plain(infinity), plain(1.0)
-        corrections, linearisations = plain(0.0), plain(0.0)
-        usable = f.load(numbers, USABLE * P, P) > 0.0
-        alive = f.load(numbers, ALIVE * P, P) > 0.0
-        renew, first, fresh, old, done = (truth(False) for _ in range(5))
-        renew.set(~usable)
-        old.set(usable)
-        for i, j in self._components(e.ny, self._count("points")):
-            self._write_wide(0.0, self.direction, i, j)
-        for i in range(e.k):
-            self._put(0.0, self.direction_unknowns, i)
-
-        def active() -> Value:
-            count = linearisations.get() + f.select(renew.get(), 1.0, 0.0)
-            return alive & ~done.get() & (count <= most)
-
-        with f.while_(lambda: f.any(active())):
-            going = active()
-            anew = Variable(f, f.any(renew.get() & going))
-            with f.if_(anew.get()):
-                f.call(self.linearised, memory)
+        with f.while_(lambda: f.any(is_active())):
+            active = is_active()
+            linearises = f.any(active & is_in(NONE))
+            with f.if_(linearises):
+                f.call(self.linearise, memory)
                 f.call(self.weigh, memory)
-                now = active()
-                damping.set(f.select(now, 1.0, damping.get()))
-                size.set(f.select(now, infinity, size.get()))
-                old.set(old.get() & ~now)
-                first.set(now | first.get())
-                fresh.set(fresh.get() & ~now)
-                renew.set(renew.get() & ~now)
-                linearisations.set(linearisations.get() + f.select(now, 1.0, 0.0))
-                self._copy_wide(self.y, self.trial, self._count("points"))
+                for variable, value in (factors, NEW), (damping, 1.0), (size, infinity):
+                    variable.set(f.select(active, value, variable.get()))
+                linearisations.set(linearisations.get() + f.select(active, 1.0, 0.0))
+                self._write_point(self.trial, lambda y: y, self.iterate)
                 f.call(self.defects, memory)
-            with f.if_(~anew.get()):
-                step = self._spread(damping.get())
-                for i, j in self._components(e.ny, self._count("points")):
-                    moved = self._wide(self.y, i, j) + step * self._wide(self.direction, i, j)
-                    self._write_wide(moved, self.trial, i, j)
-                for i in range(e.k):
-                    moved = self._get(self.unknowns, i) + damping.get() * self._get(
-                        self.direction_unknowns, i
-                    )
-                    self._put(moved, self.trial_unknowns, i)
-                self._write_base(self.trial_unknowns, self.trial, self.H)
+            with f.if_(~linearises):
+                points = self.iterate, self.direction
+                self._write_point(
+                    self.trial, lambda part, y, dy: y + part * dy, *points, weight=damping.get()
+                )
+                self._write_base(self.trial.unknowns, self.trial.y, self.H)
                 f.call(self.residual, memory)
-            with f.if_(anew.get()):
-                for i in range(e.k):
-                    self._put(self._get(self.unknowns, i), self.trial_unknowns, i)
-            now_error = f.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
+            new_error = self._residual_norm()
             # by the same factors, the correction shrinks as the residual does: a tiny one is not computed
-            expected = left.get() * now_error
-            enough = expected <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
-            sure = (now_error <= tolerance) & (size.get() < infinity) & enough
-            lengths = plain(0.0), plain(0.0)
-            with f.if_(f.any(going & ~sure)):
+            is_tiny = relative_size.get() * new_error <= SURELY_SMALL * LARGEST_CORRECTION * error.get()
+            is_tiny &= (new_error <= tolerance) & (size.get() < infinity)
+            sizes = self._variable(0.0), self._variable(0.0)
+            with f.if_(f.any(active & ~is_tiny)):
                 f.call(self.correct, memory)
                 norms = self._norms(self.dy, self._count("points"), self.weights_of_y)
-                for length, norm in zip(lengths, norms, strict=True):
-                    length.set(norm)
-            now_size, now_left = (each.get() for each in lengths)
-            was_first, was_fresh, was_old = first.get(), fresh.get(), old.get()
-            was_damping, was_size, was_error = damping.get(), size.get(), error.get()
-            good = (now_error <= tolerance) & (now_left <= LARGEST_CORRECTION)
-            shorter = (now_size <= (1.0 - was_damping * 0.25) * was_size) & (now_size < infinity)
-            accept = good | shorter
-            ratio = f.apply("max", was_size / now_size, 1.0 + 1e-6)
-            rate = f.apply("log", ratio)
-            slow = f.apply("log", now_error / tolerance) > rate * patience
-            slow = shorter & ~was_first & (was_size < infinity) & (slow | (was_damping < 1.0))
-            shorten = ~accept & was_fresh & ~was_first & (was_damping > least_damping)
-            rounding = ~accept & (was_error <= acceptable) & ~was_old & ~was_first
-            dead = rounding | (~accept & (was_first | was_fresh) & ~shorten)
-            again = ~good & ~dead & (slow | (~accept & ~shorten))
-            longer = f.select(was_first, 1.0, f.apply("min", 1.0, 4.0 * was_damping))
-            accept = accept & going
-            error.set(f.select(accept, now_error, was_error))
-            size.set(f.select(accept, now_size, was_size))
-            left.set(f.select(accept, now_left, left.get()))
-            damping.set(f.select(going, f.select(accept, longer, was_damping * 0.25), was_damping))
-            renew.set(f.select(going, again, renew.get()))
-            fresh.set(f.select(accept, was_first, was_fresh))
-            first.set(was_first & ~going)
-            done.set(done.get() | ((good | dead) & going))
-            more = going & ~(good | dead | again)
-            corrections.set(corrections.get() + f.select(more, 1.0, 0.0))
-            wide_accept = self._spread(accept)
-            for i, j in self._components(e.ny, self._count("points")):
-                for source, target in ((self.trial, self.y), (self.dy, self.direction)):
-                    value = f.select(wide_accept, self._wide(source, i, j), self._wide(target, i, j))
-                    self._write_wide(value, target, i, j)
-            for i in range(e.k):
-                for source, target in (
-                    (self.trial_unknowns, self.unknowns),
-                    (self.step_unknowns, self.direction_unknowns),
-                ):
-                    self._put(f.select(accept, self._get(source, i), self._get(target, i)), target, i)
-        last = f.select(
-            left.get() <= LARGEST_CORRECTION,
-            error.get(),
-            f.apply("max", error.get(), f.apply("min", left.get(), 1.0)),
-        )
-        keeps = (last <= acceptable) & ~renew.get()
-        f.store(f.select(keeps, 1.0, 0.0), numbers, USABLE * P, P)
-        f.store(last, numbers, ERROR * P, P)
-        f.store(corrections.get(), numbers, CORRECTIONS * P, P)
-        f.store(linearisations.get(), numbers, LINEARISATIONS * P, P)
+                for variable, norm in zip(sizes, norms, strict=True):
+                    variable.set(norm)
+            new_size, new_relative_size = (each.get() for each in sizes)
+            is_converged = (new_error <= tolerance) & (new_relative_size <= LARGEST_CORRECTION)
+            is_shorter = (new_size <= (1.0 - damping.get() * 0.25) * size.get()) & (new_size < infinity)
+            is_accepted = is_converged | is_shorter
+            rate = f.apply("log", f.apply("max", size.get() / new_size, 1.0 + 1e-6))
+            is_slow = f.apply("log", new_error / tolerance) > rate * patience
+            is_slow = is_shorter & (size.get() < infinity) & (is_slow | (damping.get() < 1.0))
+            can_shorten = is_in(FRESH) & (damping.get() > least_damping)
+            is_rounding = (error.get() <= acceptable) & is_in(FRESH, KEPT)
+            has_failed = ~is_accepted & (is_rounding | (is_in(NEW, FRESH) & ~can_shorten))
+            finishes = is_converged | has_failed
+            renews = ~finishes & (is_slow | ~(is_accepted | can_shorten))
+            accepts = is_accepted & active
+            new_damping = f.select(accepts, f.apply("min", 1.0, 4.0 * damping.get()), damping.get() * 0.25)
+            damping.set(f.select(active, new_damping, damping.get()))
+            for variable, value in (
+                (error, new_error), (size, new_size), (relative_size, new_relative_size),
+                (factors, f.select(is_in(NEW), FRESH, f.select(is_in(FRESH), KEPT, factors.get()))),
+            ):  # fmt: skip
+                variable.set(f.select(accepts, value, variable.get()))
+            factors.set(f.select(active & renews, NONE, factors.get()))
+            is_finished.set(is_finished.get() | (finishes & active))
+            corrections.set(corrections.get() + f.select(active & ~(finishes | renews), 1.0, 0.0))
+            for target, source in (self.iterate, self.trial), (self.direction, self.step):
+                self._write_point(target, f.select, source, target, weight=accepts)
+        left = f.apply("max", error.get(), f.apply("min", relative_size.get(), 1.0))
+        left = f.select(relative_size.get() <= LARGEST_CORRECTION, error.get(), left)
+        is_usable = (left <= acceptable) & ~is_in(NONE)
+        for k, value in (
+            (USABLE, f.select(is_usable, 1.0, 0.0)), (ERROR, left), (CORRECTIONS, corrections.get()),
+            (LINEARISATIONS, linearisations.get()),
+        ):  # fmt: skip
+            self._put(value, self.outcome, k)
+
+    def _residual_norm(self) -> Value:
+        """Return the largest residual of pieces and tip, in natural units."""
+        return self._now.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
+
+    def _write_point(
+        self, target: Point, formula: Callable[..., Any], *sources: Point, weight: Value | None = None
+    ) -> None:
+        """Write a formula of a weight, if there is one, and of points, number by number, to a point."""
+        wide, plain = ([], []) if weight is None else ([self._spread(weight)], [weight])
+        self._write_each(target.y, "points", lambda *y: formula(*wide, *y), *(each.y for each in sources))
+        for i in range(target.unknowns.size):
+            numbers = (self._get(each.unknowns, i) for each in sources)
+            self._put(formula(*plain, *numbers), target.unknowns, i)
 
     # the corrected motion
 
@@ -261,26 +245,29 @@ class Core(EliminationCode):
     def _write_check(self) -> None:
         """The solution's records, and its residual."""
         e = self.equations
-        self.check = f = self._function("check", "n_estimates", "numbers", "coefficients")
-        memory, estimates, numbers, coefficients = f.arguments
+        self.check = f = self._function("check", "n_estimates", "coefficients")
+        memory, estimates, coefficients = f.arguments
         f.call(self.recorded, memory, estimates, coefficients)
         f.call(self.weigh, memory)
-        largest = f.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
-        f.store(f.apply("max", largest, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
+        self._raise_error(self._residual_norm())
         # the residual of the solution is no part of its errors
         self._copy_wide(self.r, self.rest, self._count("pieces"))
         for i in range(e.k):
             self._put(self._get(self.tip, i), self.tip_rest, i)
         # no residual has the strains of the tip; y_s is part of a record if B is not zero
-        total = Variable(f, f.splat(f.value(0.0), self.L))
+        total = self._wide_variable(0.0)
         with self._places(self._count("count")) as j:
             for i in range(e.ny, e.numbers):
                 size = f.apply("abs", self._wide(self.records[0], i, j))
                 total.set(total.get() + self._before(self._count("count"), j, size))
-        finite = self._largest(f.select(total.get() < float("inf"), 0.0, float("inf")))
-        f.store(f.apply("max", finite, f.load(numbers, ERROR * self.P, self.P)), numbers, ERROR * self.P)
+        self._raise_error(self._largest(f.select(total.get() < math.inf, 0.0, math.inf)))
 
-    def _write_corrected(
+    def _raise_error(self, least: Value) -> None:
+        """Replace the error of the outcome by a larger one."""
+        error = self._now.apply("max", least, self._get(self.outcome, ERROR))
+        self._put(error, self.outcome, ERROR)
+
+    def _write_estimate(
         self, name: str, errors: list[Array], history: Array, has_defect: bool, number: int
     ) -> Function:
         """The corrected motion: from its own history, and with defects or, without, those of the solution.
@@ -292,96 +279,82 @@ class Core(EliminationCode):
         and these add up where the motion turns. Corrections go on until the next one is small relative
         to the change of the error in this step.
         """
-        e = self.equations
-        f = self._function(name, "numbers")
-        memory, numbers = f.arguments
-        for i, j in self._components(e.ny, self._count("pieces")):
-            defect = self._wide(self.defect, i, j) if has_defect else 0.0
-            self._write_wide(defect - self._wide(self.rest, i, j), self.own_defect, i, j)
-        for i, j in self._components(e.ny, self._count("ends")):
-            start = 2.0 * self._wide(errors[0], i, j) - self._wide(errors[1], i, j)
-            self._write_wide(self._wide(self.y, i, j) + start, self.better, i, j)
+        e, better = self.equations, self.better
+        f = self._function(name)
+        memory = f.arguments[0]
+        is_alive = self._get(self.outcome, ALIVE) > 0.0
+        defects = [self.rest, *[self.defect] * has_defect]
+        self._write_each(self.own_defect, "pieces", lambda rest, defect=0.0: defect - rest, *defects)
+        last = errors[:2]
+        self._write_each(better.y, "ends", lambda y, new, old: y + (2.0 * new - old), self.y, *last)
         with self._places(self._count("used")) as j:
             for i in e.used_history:
                 value = self._wide(self.H, i, j) + self._wide(history, i, j)
                 self._write_wide(value, self.own_dH, i, j)
         for k, (i, base) in enumerate(self._unknown_numbers()):
-            change = 2.0 * self._get(errors[0], i, base) - self._get(errors[1], i, base)
-            self._put(self._get(self.unknowns, k) + change, self.better_unknowns, k)
+            new, old = (self._get(each, i, base) for each in last)
+            self._put(self._get(self.unknowns, k) + (2.0 * new - old), better.unknowns, k)
 
-        def evaluated() -> Value:
-            self._write_base(self.better_unknowns, self.better, self.own_dH)
+        def write_residual() -> Value:
+            self._write_base(better.unknowns, better.y, self.own_dH)
             f.call(self.residual_of_better, memory)
-            for i, j in self._components(e.ny, self._count("pieces")):
-                value = self._wide(self.r, i, j) + self._wide(self.own_defect, i, j)
-                self._write_wide(value, self.r, i, j)
+            self._write_each(self.r, "pieces", lambda r, own: r + own, self.r, self.own_defect)
             for i in range(e.k):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
-            return f.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
+            return self._residual_norm()
 
-        alive = f.load(numbers, ALIVE * self.P, self.P) > 0.0
-        largest = Variable(f, f.splat(f.value(0.0), self.P))
-        left = Variable(f, f.splat(f.value(float("inf")), self.P))
-        turns = Variable(f, f.value(0.0))
-        largest.set(evaluated())
+        left, turns = self._variable(math.inf), Variable(f, f.value(0.0))
+        residual = self._variable(0.0)
+        residual.set(write_residual())
 
-        def going() -> Value:
-            found = Variable(f, f.splat(f.value(0.0), self.L))
+        def is_active() -> Value:
+            largest = self._wide_variable(0.0)
             for i, j in self._components(e.ny, self._count("points")):
-                y = self._wide(self.y, i, j)
-                change = self._wide(self.better, i, j) - y - self._wide(errors[0], i, j)
+                change = self._wide(better.y, i, j) - self._wide(self.y, i, j) - self._wide(errors[0], i, j)
                 size = f.apply("abs", change) * self._wide(self.weights_of_y, i, j)
                 size = self._before(self._count("points"), j, size)
-                found.set(f.apply("max", found.get(), size))
-            far = left.get() > ESTIMATE_TOLERANCE * self._largest(found.get()) + ROUNDING
-            return f.any(far & alive) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
+                largest.set(f.apply("max", largest.get(), size))
+            is_large = left.get() > ESTIMATE_TOLERANCE * self._largest(largest.get()) + ROUNDING
+            return f.any(is_large & is_alive) & (turns.get() < float(ESTIMATE_TURNS)) | (turns.get() < 1.0)
 
-        with f.while_(going):
+        with f.while_(is_active):
             f.call(self.correct, memory)
-            for i, j in self._components(e.ny, self._count("points")):
-                value = self._wide(self.better, i, j) + self._wide(self.dy, i, j)
-                self._write_wide(value, self.better, i, j)
-            for i in range(e.k):
-                value = self._get(self.better_unknowns, i) + self._get(self.step_unknowns, i)
-                self._put(value, self.better_unknowns, i)
+            self._write_point(better, operator.add, better, self.step)
             _, size = self._norms(self.dy, self._count("points"), self.weights_of_y)
-            before = largest.get()
-            largest.set(evaluated())
-            left.set(size * largest.get() / before)
+            before = residual.get()
+            residual.set(write_residual())
+            left.set(size * residual.get() / before)
             turns.set(turns.get() + 1.0)
         off, angle = self._errors_of_poses()
-        known = self._spread(f.select(off <= self._get(self.length, 0), 1.0, float("nan")))
+        known = f.select(off <= self._get(self.length, 0), 1.0, math.nan)
+        wide_known = self._spread(known)
         self._write_shift(errors, self._count("used"))
-        for i, j, value in self._numbers_of(self._evaluated_at(self.better), "used between"):
-            self._write_wide((value - self._wide(self.records[0], i, j)) * known, errors[0], i, j)
-        f.store(f.select(off <= self._get(self.length, 0), off, float("nan")), numbers, number * self.P)
+        for i, j, value in self._numbers_of(self._state_arrays(better.y), "used between"):
+            self._write_wide((value - self._wide(self.records[0], i, j)) * wide_known, errors[0], i, j)
+        self._put(off * known, self.outcome, number)
         if has_defect:
-            f.store(angle, numbers, ANGLE * self.P)
+            self._put(angle, self.outcome, ANGLE)
         return f
 
-    def _write_static_errors(self) -> None:
+    def _write_static_estimate(self) -> None:
         """Errors of an equilibrium: the correction that its defects ask for."""
-        self.corrected_at_rest = f = self._function("corrected_at_rest", "numbers")
-        memory, numbers = f.arguments
-        ny = self.equations.ny
+        self.estimate_at_rest = f = self._function("estimate_at_rest")
         self._copy_wide(self.defect, self.r, self._count("pieces"))
         for i in range(self.equations.k):
             self._put(0.0, self.tip, i)
-        f.call(self.correct, memory)
-        for i, j in self._components(ny, self._count("points")):
-            self._write_wide(self._wide(self.y, i, j) + self._wide(self.dy, i, j), self.better, i, j)
+        f.call(self.correct, f.arguments[0])
+        self._write_each(self.better.y, "points", operator.add, self.y, self.dy)
         for number, value in zip((POSITION, ANGLE), self._errors_of_poses(), strict=True):
-            f.store(value, numbers, number * self.P)
+            self._put(value, self.outcome, number)
 
     def _errors_of_poses(self) -> tuple[Value, Value]:
         """Return the largest error of positions (m) and of orientations (rad), of the better y."""
         f, layout = self._now, self.equations.strand.y_layout
-        offs, angles = (Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(2))
-        total = Variable(f, f.splat(f.value(0.0), self.L))
+        offs, angles, total = (self._wide_variable(0.0) for _ in range(3))
         with self._places(self._count("points")) as j:
 
             def change(i: int) -> Value:
-                return self._wide(self.better, i, j) - self._wide(self.y, i, j)
+                return self._wide(self.better.y, i, j) - self._wide(self.y, i, j)
 
             def largest(found: Variable, value: Value) -> None:
                 value = self._before(self._count("points"), j, value)
@@ -400,10 +373,9 @@ class Core(EliminationCode):
                 along = _sum(a * b for a, b in zip(d, h, strict=True)) / square
                 across = [a - b * along for a, b in zip(d, h, strict=True)]
                 largest(angles, _sum(a * a for a in across) / square)
-        finite = f.compare("lt", total.get(), float("inf"))
+        finite = total.get() < math.inf
         off, angle = (
-            f.apply("sqrt", self._largest(f.select(finite, each.get(), float("inf"))))
-            for each in (offs, angles)
+            f.apply("sqrt", self._largest(f.select(finite, each.get(), math.inf))) for each in (offs, angles)
         )
         return off, 2.0 * angle
 
@@ -435,8 +407,7 @@ class Core(EliminationCode):
         e = self.equations
         self.moved = f = self._function("moved")
         memory = f.arguments[0]
-        for i, j in self._components(e.ny, self._count("points")):
-            self._write_wide(0.0, self.dy, i, j)
+        self._write_each(self.dy, "points", lambda: 0.0)
         f.call(self.products, memory)
         state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
         moved = self._evaluated(e.products["base"], 0, False, state)
@@ -450,15 +421,15 @@ class Core(EliminationCode):
     def _write_linear_step(self) -> None:
         """The map of a linearised step at y, from changes of history to those of records (`LinearStep`)."""
         names = ["memory", "coefficients", "control"]
-        f = self._now = self.module.function("linearise", names, exported=True)
+        f = self._now = self.module.function("linearise_step", names, exported=True)
         memory, coefficients, control = f.arguments
         f.call(self.setup, memory)
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         for k, (i, base) in enumerate(self._unknown_numbers()):
             self._put(self._get(self.y, i, base), self.unknowns, k)
-        f.call(self.linearised, memory)
+        f.call(self.linearise, memory)
         names = ["memory", "changes", "n_columns", "n_size"]
-        f = self._now = self.module.function("move", names, exported=True)
+        f = self._now = self.module.function("map_changes", names, exported=True)
         memory, changes, columns, size = f.arguments
         with f.loop(columns) as column:
             own = f.pointer(changes, column.value * size)
@@ -474,7 +445,7 @@ class Core(EliminationCode):
         """Products of derivatives with `dy` at the points and `move` of the history: defects, tip, record."""
         e = self.equations
         self.products = self._function("products")
-        (far, between, *_), tangents = self._evaluated_at(self.y), self.tangents
+        (far, between, *_), tangents = self._state_arrays(self.y), self.tangents
         self._copy_wide(self.dy, tangents.far, self._count("points"))
         if self.far is not None:
             with self._places(self._count("pieces")) as j:
@@ -526,10 +497,10 @@ class Core(EliminationCode):
 
     def _write_records(self) -> None:
         """Shift the records by one step; the rate and the scheme's defect need the old ones."""
-        e, f = self.equations, self._now
+        f = self._now
         coefficients = f.arguments[-1]
         c0 = f.load(coefficients, 0)
-        newest = self._evaluated_at(self.y)
+        newest = self._state_arrays(self.y)
         if self.time_defect:
             with f.if_(f.arguments[1] > 1):
                 for i, j, value in self._numbers_of(newest, "used between"):
@@ -540,9 +511,7 @@ class Core(EliminationCode):
         for i, j, value in self._numbers_of(newest, "between"):
             self._write_wide(value, self.records[0], i, j)
         if self.settings.uses_rate:
-            for i, j in self._components(e.numbers, self._count("count")):
-                value = c0 * self._wide(self.records[0], i, j) + self._wide(self.H, i, j)
-                self._write_wide(value, self.rate, i, j)
+            self._write_each(self.rate, "count", lambda new, H: c0 * new + H, self.records[0], self.H)
 
     # the time loop
 
@@ -558,27 +527,25 @@ class Core(EliminationCode):
         self.steps = f = self._function("steps", *names[1:])
         memory, controls, coefficients, extrapolations, rows, infos, reached = f.arguments[:7]
         steps, stages, estimates = f.arguments[7:]
-        numbers = self._pointer(self.numbers, 0)
-        f.store(1.0, numbers, ALIVE * P, P)
+        self._put(1.0, self.outcome, ALIVE)
         grid, time = ((POSITION, ANGLE), (*self.errors, self.error_rate)), ((TIME,), self.time_errors)
         for least, (places, arrays) in ((1, grid), (2, time)):
             with f.if_(estimates < least):
                 for k in places:
-                    f.store(math.nan, numbers, k * P, P)
+                    self._put(math.nan, self.outcome, k)
                 for array in arrays:
-                    for i, j in self._components(array.size, self._count("used")):
-                        self._write_wide(math.nan, array, i, j)
+                    self._write_each(array, "used", lambda: math.nan)
         step, nodes = Variable(f, f.value(0, "i64")), self._count("nodes")
 
-        def going() -> Value:
-            return (step.get() < steps) & f.any(f.load(numbers, ALIVE * P, P) > 0.0)
+        def is_active() -> Value:
+            return (step.get() < steps) & f.any(self._get(self.outcome, ALIVE) > 0.0)
 
-        with f.while_(going):
+        with f.while_(is_active):
             with f.loop(stages) as stage:
                 number = step.get() * stages + stage.value
                 table = f.pointer(coefficients, number * (self.settings.memory + 3))
                 control = f.pointer(controls, number * (e.nc * P))
-                f.call(self.stage, memory, estimates, numbers, table, control)
+                f.call(self.stage, memory, estimates, table, control)
                 with f.if_(self._is_moving(table)):
                     f.call(self.guesses, memory, f.pointer(extrapolations, stage.value * 18))
                 with f.loop(nodes) as node:
@@ -590,11 +557,11 @@ class Core(EliminationCode):
                         f.store(value, target, (q * e.numbers + i) * P, P)
                 info = f.pointer(infos, number * ((8 + e.k) * P))
                 for k in range(8):
-                    f.store(f.load(numbers, k * P, P), info, k * P, P)
+                    f.store(self._get(self.outcome, k), info, k * P, P)
                 for k in range(e.k):
                     f.store(self._get(self.unknowns, k), info, (8 + k) * P, P)
-            alive = f.load(numbers, ALIVE * P, P) > 0.0
-            f.store(f.load(reached, 0, P) + f.select(alive, 1.0, 0.0), reached, 0, P)
+            solved = f.select(self._get(self.outcome, ALIVE) > 0.0, 1.0, 0.0)
+            f.store(f.load(reached, 0, P) + solved, reached, 0, P)
             step.set(step.get() + 1)
 
     def _is_moving(self, coefficients: Value) -> Value:
@@ -606,50 +573,40 @@ class Core(EliminationCode):
 
         An equilibrium is solved from y as it is, and has no history.
         """
-        e, P = self.equations, self.P
-        self.stage = f = self._function("stage", "n_estimates", "numbers", "coefficients", "controls")
-        memory, estimates, numbers, coefficients, controls = f.arguments
-        c0, *earlier, d1, t = (f.load(coefficients, i) for i in range(self.settings.memory + 3))
+        self.stage = f = self._function("stage", "n_estimates", "coefficients", "controls")
+        memory, estimates, coefficients, controls = f.arguments
+        c0, *weights, t = (f.load(coefficients, i) for i in range(self.settings.memory + 3))
         self._write_inputs(c0, t + self._get(self.t0, 0), controls)
 
-        def history(states: list[Array], rate: Array, target: Array, count: Value) -> None:
-            for i, j in self._components(e.numbers, count):
-                value = _sum(c * self._wide(state, i, j) for c, state in zip(earlier, states, strict=True))
-                if self.settings.uses_rate:
-                    value = value + d1 * self._wide(rate, i, j)
-                self._write_wide(value, target, i, j)
+        def write_history(states: list[Array], rate: Array, target: Array, where: str) -> None:
+            numbers = [*states, *[rate] * self.settings.uses_rate]
+            self._write_each(target, where, lambda *x: _sum(map(operator.mul, weights, x)), *numbers)
 
         with f.if_(self._is_moving(coefficients)):
-            history(self.records, self.rate, self.H, self._count("count"))
-            weights = [self._wide(self.weights, k) for k in range(3)]
-            for i, j in self._components(e.ny, self._count("points")):
-                guess = weights[0] * self._wide(self.past[0], i, j)
-                for k in (1, 2):
-                    guess = guess + weights[k] * self._wide(self.past[k], i, j)
-                self._write_wide(guess, self.y, i, j)
+            write_history(self.records, self.rate, self.H, "count")
+            trusts = [self._wide(self.weights, k) for k in range(3)]
+            self._write_each(self.y, "points", lambda *y: _sum(map(operator.mul, trusts, y)), *self.past)
         for k, (i, base) in enumerate(self._unknown_numbers()):
             self._put(self._get(self.y, i, base), self.unknowns, k)
         self._write_base(self.unknowns, self.y, self.H)
-        f.call(self.solve, memory, numbers)
-        f.call(self.check, memory, estimates, numbers, coefficients)
+        f.call(self.solve, memory)
+        f.call(self.check, memory, estimates, coefficients)
         if self.time_defect:
             with f.if_(estimates > 1):
                 f.call(self.time_history, memory, coefficients)
         with f.if_(estimates > 0), f.if_(~self._is_moving(coefficients)):
-            f.call(self.corrected_at_rest, memory, numbers)
+            f.call(self.estimate_at_rest, memory)
         with f.if_(estimates > 0), f.if_(self._is_moving(coefficients)):
-            history(self.errors, self.error_rate, self.dH, self._count("used"))
-            f.call(self.corrected, memory, numbers)
+            write_history(self.errors, self.error_rate, self.dH, "used")
+            f.call(self.estimate_of_grid, memory)
             if self.settings.uses_rate:
-                for i, j in self._components(e.numbers, self._count("used")):
-                    value = c0 * self._wide(self.errors[0], i, j) + self._wide(self.dH, i, j)
-                    self._write_wide(value, self.error_rate, i, j)
+                newest = self.errors[0], self.dH
+                self._write_each(self.error_rate, "used", lambda new, H: c0 * new + H, *newest)
         if self.time_defect:
             with f.if_(estimates > 1):
-                f.call(self.in_time, memory, numbers)
-        solved = f.load(numbers, ERROR * P, P) <= self._get(self.options, ACCEPTABLE)
-        alive = f.load(numbers, ALIVE * P, P)
-        f.store(f.select(solved, alive, 0.0), numbers, ALIVE * P, P)
+                f.call(self.estimate_of_time, memory)
+        solved = self._get(self.outcome, ERROR) <= self._get(self.options, ACCEPTABLE)
+        self._put(f.select(solved, self._get(self.outcome, ALIVE), 0.0), self.outcome, ALIVE)
 
     def _write_guesses(self) -> None:
         """Weights of the extrapolations in the next first guess, and the shift of earlier states.
@@ -663,14 +620,12 @@ class Core(EliminationCode):
             [[f.load(table, 9 * half + 3 * row + k) for k in range(3)] for row in range(3)]
             for half in range(2)
         )
-        misfits = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in range(3)]
+        misfits = [self._wide_variable(0.0) for _ in range(3)]
         for i, j in self._components(e.ny, self._count("points")):
             past = [self._wide(each, i, j) for each in self.past]
             unit, y = self._unit(i, j), self._wide(self.y, i, j)
             for order, (misfit, weights) in enumerate(zip(misfits, this, strict=True)):
-                guess = past[0] * weights[0]
-                for k in range(1, order + 1):
-                    guess = guess + past[k] * weights[k]
+                guess = _sum(map(operator.mul, past[: order + 1], weights))
                 size = f.apply("abs", guess - y) * unit
                 size = self._before(self._count("points"), j, size)
                 misfit.set(f.apply("max", misfit.get(), size))
@@ -712,7 +667,7 @@ class Core(EliminationCode):
             with f.loop(self.params.size * P, 0, P) as i:
                 value = f.load(parameters, k * (self.params.size * P) + i.value, P)
                 f.store(value, self._pointer(self.params, 0), i.value, P)
-            self._put(0.0, self.numbers, USABLE)
+            self._put(0.0, self.outcome, USABLE)
             f.call(self.setup, memory)
             result = f.pointer(results, k * (rows + infos + 2 * P))
             info, acting = f.pointer(result, rows), f.pointer(controls, k * (solves * (e.nc * P)))
@@ -743,11 +698,11 @@ class Core(EliminationCode):
         self._write_terms()
         self.rates = self._write_rates("rates")
         self.rates_and_slopes = self._write_rates("rates_and_slopes", [(self.slope, self.equations.nonzeros)])
-        self.residual = self._write_residual("residual", self.trial, self.H)
+        self.residual = self._write_residual("residual", self.trial.y, self.H)
         self.residual_of_y = self._write_residual("residual_of_y", self.y, self.H)
-        self.residual_of_better = self._write_residual("residual_of_better", self.better, self.own_dH)
+        self.residual_of_better = self._write_residual("residual_of_better", self.better.y, self.own_dH)
         self.defects = self._function("defects")
-        self._write_defects(self.trial, self.H)
+        self._write_defects(self.trial.y, self.H)
         if not self.batch:
             self.solved = self._write_solved()
         self._write_factor()
@@ -759,12 +714,13 @@ class Core(EliminationCode):
         self._write_newton()
         self._write_recorded()
         self._write_check()
-        self.corrected = self._write_corrected("corrected", self.errors, self.dH, True, POSITION)
-        self._write_static_errors()
+        self.estimate_of_grid = self._write_estimate("estimate_of_grid", self.errors, self.dH, True, POSITION)
+        self._write_static_estimate()
         if self.time_defect:
             self._write_products()
             self._write_moved()
-            self.in_time = self._write_corrected("in_time", self.time_errors, self.time_dH, False, TIME)
+            time = self.time_errors, self.time_dH
+            self.estimate_of_time = self._write_estimate("estimate_of_time", *time, False, TIME)
             self._write_time_history()
         self._write_stage()
         self._write_guesses()
@@ -794,7 +750,7 @@ class Core(EliminationCode):
                 self._put_in(memory[None], array, self._by_strand(array, np.asarray(values))[None, None])
             table, control = np.zeros(self.settings.memory + 3), np.array(control, dtype=float)
             table[[0, -1]] = c0, t
-            self._functions["evaluate"](*(each.ctypes.data for each in (memory, table, control)), most)
+            self._functions.run("evaluate", memory, table, control, most)
             arrays = self.y, self.records[0], self.r, self.scale_y, self.tip
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
             pieces = slice(counts["pieces"])

@@ -50,21 +50,12 @@ class EliminationCode(RodCode):
         self.own = k // self.strands
         unknown = system.y_layout.indices(system.base_unknowns)
         self.pivots = [int(index) for index in unknown[: self.own]]
-        #: nonzero slopes of base and tip: row, column, node
-        self.base_slopes, self.tip_slopes = (
-            [
-                (i, c, int(slopes[i, c]))
-                for i, c in np.ndindex(slopes.shape)
-                if not e.program.is_constant(int(slopes[i, c]), 0.0)
-            ]
-            for slopes in (e.base_slopes, e.tip_slopes)
-        )
-        if any(i // ny != c // self.own for i, c, _ in self.base_slopes):
+        if any(i // ny != c // self.own for i, c, _ in self.equations.base_slopes):
             raise EngineError("engine: the base of a strand depends on the unknowns of another")
         #: structural nonzeros of X, of a change of the unknowns, and of M
         self.nonzero_X, self.nonzero_T = self._filled()
         self.nonzero_M = np.zeros((k, ny), dtype=bool)
-        for i, c, _ in self.tip_slopes:
+        for i, c, _ in self.equations.tip_slopes:
             self.nonzero_M[i, c % ny] = True
         self.factor = a(len(self.elimination.factors), "pieces")
         #: true if B⁻¹ A is formed; the recursion along the rod solves by B in every piece if it is not
@@ -109,7 +100,7 @@ class EliminationCode(RodCode):
             np.zeros((self.equations.ny, self.own), dtype=bool),
             np.eye(self.own) > 0,
         )
-        for i, c, _ in self.base_slopes:
+        for i, c, _ in self.equations.base_slopes:
             X[i % ny, c % self.own] = True
         for _ in range(self.own + ny):
             T = T @ T | X[self.pivots]
@@ -384,19 +375,19 @@ class EliminationCode(RodCode):
     def _write_linearise(self) -> None:
         """Rates, slopes and factors at y."""
         e = self.equations
-        self.linearised = f = self._function("linearised")
+        self.linearise = f = self._function("linearise")
         memory = f.arguments[0]
         self._write_places(self.rates_and_slopes, self.y, self.H, slopes=True)
         self._write_ends(self.slope, self.slope_end)
         f.call(self.factored, memory)
         state = self._base_state(self.unknowns, self.H)
-        values = self._evaluated([node for *_, node in self.base_slopes], 0, False, state)
-        for (i, c, _), value in zip(self.base_slopes, values, strict=True):
+        values = self._evaluated([node for *_, node in self.equations.base_slopes], 0, False, state)
+        for (i, c, _), value in zip(self.equations.base_slopes, values, strict=True):
             strand, row = divmod(i, e.ny)
             self._put(value, self.X, self._of_X(row, c % self.own), self.bases[strand])
         state = self._tip_state(self.y, self.H)
-        values = self._evaluated([node for *_, node in self.tip_slopes], 0, False, state)
-        for (i, c, _), value in zip(self.tip_slopes, values, strict=True):
+        values = self._evaluated([node for *_, node in self.equations.tip_slopes], 0, False, state)
+        for (i, c, _), value in zip(self.equations.tip_slopes, values, strict=True):
             strand, column = divmod(c, e.ny)
             self._put(value, self.M, column * self._padded(e.k) + i, strand)
         f.call(self.along, memory)

@@ -8,14 +8,14 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.engine.program import LARGEST_PRODUCT, PRODUCTS, Program
+from knode_cosserat.engine.program import LARGEST_PRODUCT, PRODUCTS, Nonzeros, Program
 from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.schemes import semi_discrete
@@ -139,7 +139,13 @@ class Equations(Sizes):
             scales = own.scales()
             return 1.0 / scales.y, 1.0 / scales.tip, jnp.asarray(own.length)[None]
 
-        one, step = np.zeros(()), (leaves, 1.0, 0.0, np.zeros(self.nc))
+        step, known = (leaves, 1.0, 0.0, np.zeros(self.nc)), [*folded, self.c0, self.t, self.control]
+
+        def results(function: Callable[..., Any], *inputs: np.ndarray) -> list[np.ndarray]:
+            """Return the results of a function of a step and of inputs."""
+            traced = jax.make_jaxpr(function)(step, *(np.zeros(nodes.shape) for nodes in inputs))
+            return program.evaluate(traced, [*known, *inputs])
+
         # of the parameters alone: inverse scales, and the length, of which places and pieces are parts
         self.geometry = [
             np.broadcast_to(nodes, size)
@@ -150,44 +156,33 @@ class Equations(Sizes):
             )
         ]
         self.length = int(self.geometry[2][0])
-        known = [*folded, self.c0, self.t, self.control]
-        traced = jax.make_jaxpr(rates)(step, one, np.ones(self.ny), np.zeros(self.numbers))
-        self.f, self.z = program.evaluate(traced, [*known, self.s, self.y, self.history])
-        record = np.zeros(len(whole_history))
-        traced = jax.make_jaxpr(base)(step, np.zeros(self.k), record)
-        [self.base] = program.evaluate(traced, [*known, self.unknowns, whole_history])
-        traced = jax.make_jaxpr(tip)(step, np.ones(len(whole_y)), record)
-        [self.tip] = program.evaluate(traced, [*known, whole_y, whole_history])
+        self.f, self.z = results(rates, self.s, self.y, self.history)
+        [self.base] = results(base, self.unknowns, whole_history)
+        [self.tip] = results(tip, whole_y, whole_history)
         #: y on the far side of the discontinuities that act, and the nonzeros of its derivative, less 1
         count = len(system.discontinuities.places)
-        self.acting, self.far, self.jumping = program.inputs("acting", (count,), STATE), self.y, []
+        self.acting, self.far = program.inputs("acting", (count,), STATE), self.y
+        self.jumping: Nonzeros = []
         if system.discontinuities.jump is not None:
-            shapes = np.zeros(count), np.ones(self.ny), np.zeros(self.numbers)
-            traced = jax.make_jaxpr(jump)(step, *shapes)
-            [self.far] = program.evaluate(traced, [*known, self.acting, self.y, self.history])
+            [self.far] = results(jump, self.acting, self.y, self.history)
             slopes = program.jacobian(self.far, self.y)
-            for i, j in np.ndindex(slopes.shape):
-                if i == j:
-                    slopes[i, i] = program.apply("sub", int(slopes[i, i]), program.constant(1.0))
-                if not program.is_constant(int(slopes[i, j]), 0.0):
-                    self.jumping.append((i, j, int(slopes[i, j])))
-        self.slopes = program.jacobian(self.f, self.y)
-        self.base_slopes = program.jacobian(self.base, self.unknowns)
-        self.tip_slopes = program.jacobian(self.tip, whole_y)
+            for i in range(self.ny):
+                slopes[i, i] = program.apply("sub", int(slopes[i, i]), program.constant(1.0))
+            self.jumping = program.nonzeros_of(slopes)
+        slopes = program.jacobian(self.f, self.y)
+        base_slopes = program.jacobian(self.base, self.unknowns)
+        tip_slopes = program.jacobian(self.tip, whole_y)
+        self.base_slopes, self.tip_slopes = map(program.nonzeros_of, (base_slopes, tip_slopes))
         #: structural nonzeros of the Jacobian
-        self.pattern = [
-            (i, j)
-            for i, j in np.ndindex(self.slopes.shape)
-            if not program.is_constant(int(self.slopes[i, j]), 0.0)
-        ]
-        self.nonzeros = [int(self.slopes[at]) for at in self.pattern]
+        self.pattern = [(i, j) for i, j, _ in program.nonzeros_of(slopes)]
+        self.nonzeros = [node for *_, node in program.nonzeros_of(slopes)]
         needed = set(program.needed([*self.f, *self.z, *self.far, *self.base, *self.tip]))
         #: entries of a record that the equations need as history
         self.used_history = [
             i for i in range(self.numbers) if any(int(nodes[i]) in needed for nodes in self.strand_history)
         ]
-        outputs = [*self.f, *self.z, *self.slopes.reshape(-1), *self.base, *self.tip]
-        outputs += [*self.base_slopes.reshape(-1), *self.tip_slopes.reshape(-1)]
+        outputs = [*self.f, *self.z, *slopes.reshape(-1), *self.base, *self.tip]
+        outputs += [*base_slopes.reshape(-1), *tip_slopes.reshape(-1)]
         outputs += [*self.far, *(node for *_, node in self.jumping)]
         #: tangents of y and of the history of all strands, and the products of derivatives with them
         self.dy, self.dhistory = (
@@ -250,10 +245,6 @@ class Equations(Sizes):
         return sorted(node for node in found if program.operations[node][0] != "inputs")
 
 
-#: nonzeros of a matrix: row, column and node of each
-Nonzeros = list[tuple[int, int, int]]
-
-
 class TangentEquations(Equations):
     """Programs of a system with all derivatives of rates and strains, jumps, tip and base."""
 
@@ -269,11 +260,13 @@ class TangentEquations(Equations):
             "rates": [*self.f, *self.z], "far": [*self.far] if system.discontinuities.jump else [],
             "tip": [*self.tip], "base": [*self.base],
         }  # fmt: skip
-        self.z_by_y = self._nonzeros(self.z, self.y)
+        self.z_by_y = self.program.nonzeros(self.z, self.y)
         #: by the history of all strands in turn; that of a point is the first
         whole = np.concatenate(self.strand_history)
-        self.by_history = {name: self._nonzeros(nodes, whole) for name, nodes in results.items()}
-        self.by_control = {name: self._nonzeros(nodes, self.control) for name, nodes in results.items()}
+        self.by_history = {name: self.program.nonzeros(nodes, whole) for name, nodes in results.items()}
+        self.by_control = {
+            name: self.program.nonzeros(nodes, self.control) for name, nodes in results.items()
+        }
         for nonzeros in (self.z_by_y, *self.by_history.values(), *self.by_control.values()):
             self._outputs += [node for *_, node in nonzeros]
         self._hoist()
@@ -363,14 +356,6 @@ class TangentEquations(Equations):
             todo += program.arguments(node) if node in program.shapes else ()
             found |= set() if node in program.shapes else {node}
         return found
-
-    def _nonzeros(self, outputs: Any, variables: Any) -> Nonzeros:
-        slopes = self.program.jacobian(outputs, variables)
-        return [
-            (i, j, int(slopes[i, j]))
-            for i, j in np.ndindex(slopes.shape)
-            if not self.program.is_constant(int(slopes[i, j]), 0.0)
-        ]
 
 
 class Elimination:

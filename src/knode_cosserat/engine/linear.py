@@ -124,8 +124,8 @@ class _Sums:
         self._memory: Any = memory
         self._lanes = lanes
         self._waiting: dict[Any, list[Straight]] = {}
-        #: numbers that wait for the present value of a number
-        self._readers: dict[Any, set[Any]] = {}
+        #: numbers that wait for the present value of a number, in order: code is the same in every process
+        self._readers: dict[Any, dict[Any, None]] = {}
         #: values of numbers without an array; zero until they are set
         self._values: dict[Any, Value | None] = {}
 
@@ -134,8 +134,8 @@ class _Sums:
         target = operation.target.key
         if not isinstance(operation, Scale):
             self._write(operation.source.key)
-            self._readers.setdefault(operation.source.key, set()).add(target)
-        for reader in self._readers.pop(target, ()):
+            self._readers.setdefault(operation.source.key, {})[target] = None
+        for reader in self._readers.pop(target, {}):
             self._write(reader)
         if isinstance(operation, Scale) and operation.coefficient is None:
             self._waiting.pop(target, None)

@@ -57,13 +57,11 @@ class LinearStep:
         self._evaluate(c0, 0.0, self._control, -c0 * self.still.records, self.still.y)
         table = np.zeros(self._core.settings.memory + 3)
         table[0] = c0
-        arrays = self._memory, table, self._control
-        self._core._functions["linearise"](*(each.ctypes.data for each in arrays))
+        self._core._functions.run("linearise_step", self._memory, table, self._control)
 
     def __call__(self, changes: Float[np.ndarray, "n m"]) -> Float[np.ndarray, "n m"]:
         """Return the changes of the record (used x, m) by those of the record before, side by side."""
         columns = np.zeros((changes.shape[1], self._size))
         columns[:, self._at] = -self._c0 * changes.T
-        arrays = self._memory, columns
-        self._core._functions["move"](*(each.ctypes.data for each in arrays), len(columns), self._size)
+        self._core._functions.run("map_changes", self._memory, columns, len(columns), self._size)
         return columns[:, self._at].T

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import llvmlite.binding as llvm
+import numpy as np
 
 from knode_cosserat._jax import cache_directory
 from knode_cosserat._program_cache import ProgramCache
@@ -101,6 +102,10 @@ class MachineCode:
             # machine code is valid while its engine lives
             function.engine, functions[name] = engine, function
         self._functions = functions
+
+    def run(self, name: str, *operands: np.ndarray | int) -> None:
+        """Run a function on arrays and whole numbers."""
+        self[name](*(x.ctypes.data if isinstance(x, np.ndarray) else x for x in operands))
 
     def __getitem__(self, name: str) -> Any:
         """Return a function, for one call."""

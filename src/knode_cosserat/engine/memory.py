@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Index, Module, Stores, Value, vector_lanes
+from knode_cosserat.engine.codegen import Function, Index, Module, Stores, Value, Variable, vector_lanes
 from knode_cosserat.engine.counts import Counts, GridCounts
 
 
@@ -40,6 +40,12 @@ class Array:
     def at(self, i: int, j: int) -> int:
         """Return the offset of component i at place j."""
         return self.offset + j * self.place + i * self.component
+
+
+def aligned_zeros(size: int) -> np.ndarray:
+    """Return zeros, aligned to 64 bytes."""
+    raw = np.zeros(size + 8)
+    return raw[(-raw.ctypes.data // 8) % 8 :][:size]
 
 
 class Memory:
@@ -283,6 +289,18 @@ class Memory:
                 values += [zero] * (L - len(values))
                 for value, at in zip(f.transposed(values), then, strict=False):
                     f.store(value, *at)
+
+    def _variable(self, value: Any) -> Variable:
+        """Return a plain variable."""
+        return Variable(self._now, self._now.splat(self._now.value(value), self.P))
+
+    def _wide_variable(self, value: Any) -> Variable:
+        return Variable(self._now, self._now.splat(self._now.value(value), self.L))
+
+    def _write_each(self, target: Array, where: str, formula: Callable[..., Any], *sources: Array) -> None:
+        """Write a formula of arrays, number by number, to an array at the places of a count."""
+        for i, j in self._components(target.size, self._count(where)):
+            self._write_wide(formula(*(self._wide(each, i, j) for each in sources)), target, i, j)
 
     def _copy_wide(self, source: Array, target: Array, count: Any, shift: int = 0) -> None:
         """Copy values at places, to places that are earlier by a shift."""

@@ -178,14 +178,8 @@ class Motions:
         core, (_, count, stages, *_) = self.core, acting.shape
         own = (each[first:] for each in (self.motions, self._parameters, acting))
         arrays = self._memory, *own, table, core._guesses, results
-        core._functions["run"](
-            *(each.ctypes.data for each in arrays),
-            self._packed_size,
-            len(results),
-            count,
-            stages,
-            self._estimates,
-        )
+        counts = self._packed_size, len(results), count, stages, self._estimates
+        core._functions.run("run", *arrays, *counts)
         if not core.batch and 0 < (done := int(results[0, -2])) < count:
             # again, for the state before the step that failed
             again = np.zeros((1, sum(map(math.prod, self._shapes_of(done, stages)))))

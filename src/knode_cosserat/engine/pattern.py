@@ -176,8 +176,7 @@ class _PlaceCode:
         """Return results at places (n, ...), of parameters and control in one vector."""
         places = np.pad(s, (0, -len(s) % self.lanes), mode="edge")
         found = np.empty((self.size, len(places)))
-        arrays = data, places, found
-        self._functions["run"](*(each.ctypes.data for each in arrays), len(places))
+        self._functions.run("run", data, places, found, len(places))
         shapes, structure = jax.tree.flatten(self.result)
         ends = np.cumsum([int(np.prod(each.shape)) for each in shapes])[:-1]
         parts = np.split(found[:, : len(s)].T, ends, axis=1)

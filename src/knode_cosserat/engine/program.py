@@ -42,6 +42,8 @@ PIVOTED = 6
 #: an array of nodes
 Nodes = np.ndarray
 Tangents = dict[int, dict[Any, int]]
+#: nonzeros of a matrix: row, column and node of each
+Nonzeros = list[tuple[int, int, int]]
 
 
 class EngineError(KnodeCosseratError, NotImplementedError):
@@ -158,6 +160,13 @@ PRODUCTS = frozenset({"mul", "neg"})
 COMMUTATIVE = frozenset({"add", "mul", "max", "min", "and", "or", "eq", "ne"})
 COMPARISONS = frozenset({"lt", "le", "gt", "ge", "eq", "ne"})
 BOOLEANS = COMPARISONS | {"and", "or", "not", "isfinite"}
+#: constants that change nothing, and those that are the result whatever the other argument is
+NEUTRAL: dict[str, Any] = {"add": 0.0, "mul": 1.0, "and": True, "or": False}
+ABSORBING: dict[str, Any] = {"mul": 0.0, "and": False, "or": True}
+#: operations that return either of two equal arguments
+IDEMPOTENT = frozenset({"and", "or", "max", "min"})
+#: number of nodes among the operands of an operation, which come first; all operands of other operations are
+NODES = {"constant": 0, "input": 0, "inputs": 0, "view": 1, "entry": 1, "spread": 1, "sum": 1, "result": 1}
 
 
 class Program:
@@ -166,13 +175,14 @@ class Program:
     def __init__(self, limit: float = math.inf) -> None:
         #: largest number of operations
         self.limit = limit
-        #: ("constant",), ("input", name), ("add", a, b), …, ("loop", k, *arguments), ("result", loop node, k)
+        #: ("constant",), ("input", name), ("add", a, b), …, ("loop", *arguments), ("result", loop node, k)
         self.operations: list[tuple[Any, ...]] = []
         #: values of constants, None of all others
         self.values: list[Any] = []
         #: 0 of constants, given for inputs, and otherwise the largest of the arguments
         self.levels: list[int] = []
-        self.loops: list[_Loop] = []
+        #: loops by node
+        self.loops: dict[int, _Loop] = {}
         #: derivative rules of "hold" nodes, by node; None: the derivative is zero
         self.rules: dict[int, _Rule | None] = {}
         #: shapes of arrays; other nodes are scalars
@@ -264,8 +274,16 @@ class Program:
             spread = self._spread(operation, arguments)
             if spread is not None:
                 return spread
-        simplify = getattr(self, f"_simple_{operation}", None)
-        return None if simplify is None else simplify(*arguments)
+        if operation in COMMUTATIVE:
+            for x, y in (arguments, arguments[::-1]):
+                if self.is_constant(x) and self.values[x] == NEUTRAL.get(operation):
+                    return y
+                if self.is_constant(x) and self.values[x] == ABSORBING.get(operation):
+                    return x
+            if operation in IDEMPOTENT and arguments[0] == arguments[1]:
+                return arguments[0]
+        rewrite = REWRITES.get(operation)
+        return None if rewrite is None else rewrite(self, *arguments)
 
     def _spread(self, operation: str, arguments: tuple[int, ...]) -> int | None:
         """Return an operation of constants and one choice of constants: a choice of results."""
@@ -285,8 +303,6 @@ class Program:
 
     def _simple_add(self, a: int, b: int) -> int | None:
         for x, y in ((a, b), (b, a)):
-            if self.is_constant(x, 0.0):
-                return y
             negated = self._negated(y)
             if negated is not None:
                 return self.apply("sub", x, negated)
@@ -312,18 +328,13 @@ class Program:
 
     def _simple_mul(self, a: int, b: int) -> int | None:
         for x, y in ((a, b), (b, a)):
-            value = self.values[x]
-            if value == 0.0:
-                return x
-            if value == 1.0:
-                return y
-            if value == -1.0:
+            if self.is_constant(x, -1.0):
                 return self.apply("neg", y)
             negated = self._negated(y)
             if negated is not None:
                 return self.apply("neg", self.apply("mul", x, negated))
             name, *factors = self.operations[y]
-            if value is not None and name == "mul":
+            if self.is_constant(x) and name == "mul":
                 for c, rest in (factors, factors[::-1]):
                     if self.is_constant(c):
                         return self.apply("mul", self.apply("mul", x, c), rest)
@@ -378,22 +389,8 @@ class Program:
             return self.apply("not", p)
         return None
 
-    def _simple_and(self, a: int, b: int, neutral: bool = True) -> int | None:
-        for x, y in ((a, b), (b, a)):
-            if self.is_constant(x):
-                return y if self.values[x] == neutral else x
-        return a if a == b else None
-
-    def _simple_or(self, a: int, b: int) -> int | None:
-        return self._simple_and(a, b, neutral=False)
-
     def _simple_not(self, a: int) -> int | None:
         return self.operations[a][1] if self.operations[a][0] == "not" else None
-
-    def _simple_max(self, a: int, b: int) -> int | None:
-        return a if a == b else None
-
-    _simple_min = _simple_max
 
     def _simple_hold(self, a: int) -> int:
         stopped = self.operations[a][0] == "hold" and self.rules[a] is None
@@ -435,8 +432,7 @@ class Program:
         key = ("loop", program, nested, tuple(loop.next), loop.condition, tuple(arguments))
         if key not in self._memo:
             level = max((self.levels[a] for a in arguments), default=0)
-            self._new(key, ("loop", len(self.loops), *arguments), level, False)
-            self.loops.append(loop)
+            self.loops[self._new(key, ("loop", *arguments), level, False)] = loop
         node = self._memo[key]
         results = [("result", node, k) for k in range(len(loop.kinds))]
         return [
@@ -540,7 +536,7 @@ class Program:
                 found = self._chosen(factor, other)
                 if found is not None:
                     return found
-        return self._array(("sum", node), self.shapes[node][:-1], self.levels[node], False)
+        return self._array(("sum", node, count), self.shapes[node][:-1], self.levels[node], False)
 
     def spread(self, node: int, positions: Positions, shape: tuple[int, ...]) -> int:
         """Return an array of zeros to which the entries of another are added at positions in it."""
@@ -581,14 +577,8 @@ class Program:
 
     def arguments(self, node: int) -> tuple[int, ...]:
         """Return the nodes that a node depends on directly."""
-        name, *rest = self.operations[node]
-        if name in ("constant", "input", "inputs"):
-            return ()
-        if name in ("view", "entry", "spread"):
-            return (rest[0],)
-        if name == "loop":
-            return tuple(rest[1:])
-        return (rest[0],) if name == "result" else tuple(rest)
+        name, *operands = self.operations[node]
+        return tuple(operands[: NODES.get(name)])
 
     def needed(self, outputs: Iterable[int], known: Any = frozenset()) -> list[int]:
         """Return the nodes that the outputs depend on, in order, with known ones but not beyond them."""
@@ -644,6 +634,15 @@ class Program:
         rows = [found.get(int(node), {}) for node in outputs]
         entries = [[row.get(k, zero) for k in range(len(variables))] for row in rows]
         return np.array(entries, dtype=np.int64).reshape(len(rows), len(variables))
+
+    def nonzeros(self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes) -> Nonzeros:
+        """Return the structural nonzeros of the derivatives (outputs, variables)."""
+        return self.nonzeros_of(self.jacobian(outputs, variables))
+
+    def nonzeros_of(self, matrix: Nodes) -> Nonzeros:
+        """Return the entries of a matrix that are not the constant 0."""
+        entries = ((*at, int(matrix[at])) for at in np.ndindex(matrix.shape))
+        return [entry for entry in entries if not self.is_constant(entry[2], 0.0)]
 
     def gradient(
         self, outputs: Sequence[int] | Nodes, cotangents: Sequence[int] | Nodes,
@@ -705,6 +704,9 @@ class Program:
                 for argument, partial in zip(arguments, PARTIALS[name], strict=True):
                     if argument in dependent:
                         add(argument, self.apply("mul", self._partial(partial, node), own), shape)
+            elif name in LINEAR:
+                argument, *parameters = arguments
+                add(argument, *LINEAR[name].transpose(self, own, self.shapes.get(argument), *parameters))
             elif name == "hold" and linear:
                 add(arguments[0], own)
             elif name == "entry":
@@ -712,14 +714,6 @@ class Program:
             elif name == "stack":
                 for each, cotangent in zip(arguments, self.entries(own, shape), strict=True):
                     add(each, int(cotangent))
-            elif name == "sum":
-                positions = np.arange(math.prod(shape)).reshape(*shape, 1)
-                whole = self.shapes[arguments[0]]
-                add(arguments[0], self.view(own, np.broadcast_to(positions, whole)))
-            elif name == "view":
-                add(arguments[0], self._view_cotangent(own, arguments[1], self.shapes[arguments[0]]))
-            elif name == "spread":
-                add(arguments[0], self.view(own, arguments[1].all()), arguments[1].shape)
             elif name == "result":
                 raise self._loop_error(arguments[0])
         return [
@@ -728,16 +722,6 @@ class Program:
             else found.get(node, zero)
             for node in map(int, variables)
         ]
-
-    def _view_cotangent(self, node: int, positions: Positions, shape: tuple[int, ...]) -> int:
-        """Return the cotangent of an array of this shape from that of a view: repeated entries are added."""
-        first, strides, counts = positions
-        for axis in reversed(range(len(counts))):
-            if strides[axis] == 0:
-                order = np.moveaxis(np.arange(math.prod(counts)).reshape(counts), axis, -1)
-                node = self.total(self.view(node, order), counts[axis])
-                strides, counts = (each[:axis] + each[axis + 1 :] for each in (strides, counts))
-        return self.spread(node, Positions(first, strides, counts), shape)
 
     def dependent(
         self, outputs: Sequence[int] | Nodes, variables: Sequence[int] | Nodes, linear: bool = False
@@ -761,7 +745,7 @@ class Program:
 
     def _loop_error(self, node: int) -> EngineError:
         return EngineError(
-            f"{self.loops[self.operations[node][1]].source}: a while loop is differentiated; state its "
+            f"{self.loops[node].source}: a while loop is differentiated; state its "
             "derivative by jax.custom_jvp, or stop the gradient of its inputs and add one Newton correction "
             "after it"
         )
@@ -776,28 +760,20 @@ class Program:
         for node in self._order(outputs, sources):
             if node in found:
                 continue
-            name, *rest = self.operations[node]
+            name, *operands = self.operations[node]
             if name == "select":
                 found[node] = self._selected(node, found)
             elif name in PARTIALS:
                 found[node] = self._chained(node, found)
+            elif name in LINEAR:
+                argument, *parameters = operands
+                tangents = found.get(argument, {}).items()
+                images = {key: LINEAR[name].image(self, each, *parameters) for key, each in tangents}
+                found[node] = self._nonzero(images)
             elif name in ("stack", "inputs"):
                 found[node] = self._stacked(self.entries(node), found)
-            elif name == "view":
-                positions = rest[1].all()
-                found[node] = {
-                    key: self.view(each, positions) for key, each in found.get(rest[0], {}).items()
-                }
-            elif name == "spread":
-                found[node] = {
-                    key: self.spread(each, *rest[1:]) for key, each in found.get(rest[0], {}).items()
-                }
-            elif name == "sum":
-                count = self.shapes[rest[0]][-1]
-                sums = {key: self.total(each, count) for key, each in found.get(rest[0], {}).items()}
-                found[node] = self._nonzero(sums)
             elif name == "entry":
-                found[node] = self._of_entry(rest[0], rest[1], found)
+                found[node] = self._of_entry(*operands, found)
             elif (rule := self.rules.get(node)) is not None:
                 self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):
@@ -940,12 +916,8 @@ class Program:
         arguments = [new.get(each, each) for each in self.arguments(node)]
         if name == "stack":
             return self.array(np.array(arguments, dtype=np.int64))
-        if name == "view":
-            return self.view(arguments[0], rest[1].all())
-        if name == "spread":
-            return self.spread(arguments[0], *rest[1:])
-        if name == "sum":
-            return self.total(arguments[0], self.shapes[rest[0]][-1])
+        if name in LINEAR:
+            return LINEAR[name].image(self, arguments[0], *rest[1:])
         if name == "entry":
             return int(self.entries(arguments[0], self.shapes[rest[0]]).flat[rest[1]])
         return self.apply(name, *arguments)
@@ -961,6 +933,56 @@ class _Component(NamedTuple):
     """Variable of a derivative: a scalar in an array."""
 
     node: int
+
+
+class _Linear(NamedTuple):
+    """A linear operation on an array: it for another argument, and its transpose.
+
+    Both have the operation's parameters. The transpose of a result's cotangent has the shape of the argument
+    before them, and returns a cotangent for the entries of some shape.
+    """
+
+    image: Callable[..., int]
+    transpose: Callable[..., tuple[int, tuple[int, ...]]]
+
+
+def _transposed_view(
+    program: Program, own: int, shape: tuple[int, ...], positions: Positions
+) -> tuple[int, tuple[int, ...]]:
+    first, strides, counts = positions
+    # repeated entries are added
+    for axis in reversed(range(len(counts))):
+        if strides[axis] == 0:
+            order = np.moveaxis(np.arange(math.prod(counts)).reshape(counts), axis, -1)
+            own = program.total(program.view(own, order), counts[axis])
+            strides, counts = (each[:axis] + each[axis + 1 :] for each in (strides, counts))
+    return program.spread(own, Positions(first, strides, counts), shape), shape
+
+
+def _transposed_sum(
+    program: Program, own: int, shape: tuple[int, ...], _: int
+) -> tuple[int, tuple[int, ...]]:
+    rows = np.arange(math.prod(shape[:-1])).reshape(*shape[:-1], 1)
+    return program.view(own, np.broadcast_to(rows, shape)), shape
+
+
+#: linear operations on arrays
+LINEAR = {
+    "view": _Linear(lambda program, x, positions: program.view(x, positions.all()), _transposed_view),
+    "sum": _Linear(lambda program, x, count: program.total(x, count), _transposed_sum),
+    "spread": _Linear(
+        lambda program, x, positions, shape: program.spread(x, positions, shape),
+        lambda program, own, _, positions, shape: (program.view(own, positions.all()), positions.shape),
+    ),
+}
+
+#: rules that return an equal node that is simpler than an operation, or None
+REWRITES: dict[str, Callable[..., int | None]] = {
+    "add": Program._simple_add, "sub": Program._simple_sub, "neg": Program._simple_neg,
+    "mul": Program._simple_mul, "div": Program._simple_div, "abs": Program._simple_abs,
+    "pow": Program._simple_pow, "select": Program._simple_select, "not": Program._simple_not,
+    "hold": Program._simple_hold,
+}  # fmt: skip
 
 
 def _arithmetic(

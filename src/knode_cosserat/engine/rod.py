@@ -14,7 +14,7 @@ from knode_cosserat.engine.arrays import Stored
 from knode_cosserat.engine.codegen import Function, Index, Stores, Sums, Value, Variable
 from knode_cosserat.engine.counts import Counts
 from knode_cosserat.engine.equations import Equations
-from knode_cosserat.engine.memory import Array, Memory
+from knode_cosserat.engine.memory import Array, Memory, aligned_zeros
 from knode_cosserat.schemes.space import Stage
 
 
@@ -88,8 +88,7 @@ class RodCode(Memory):
 
     def _empty_memory(self) -> np.ndarray:
         """Return the memory before a run: zeros but for those of the grid; aligned to 64 bytes."""
-        raw, counts = np.zeros(self._size + 8), self.counts
-        found = raw[(-raw.ctypes.data // 8) % 8 :][: self._size]
+        found, counts = aligned_zeros(self._size), self.counts
         numbers = (self.s_parts, counts.along[:, None]), (self.h_parts, counts.lengths[:, None])
         for array, values in (*numbers, (self.acting, counts.grid.acting)):
             if array.size:
@@ -388,7 +387,7 @@ class RodCode(Memory):
         for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
             self._put(value - self._get(self.tip_offset, i), self.tip, i)
 
-    def _evaluated_at(self, y: Array) -> StateArrays:
+    def _state_arrays(self, y: Array) -> StateArrays:
         """Return the arrays of the state that was evaluated last, from y at the points."""
         return StateArrays(y if self.far is None else self.far, self.between, self.z, self.f)
 

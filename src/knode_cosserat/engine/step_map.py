@@ -18,9 +18,10 @@ import numpy as np
 
 from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.elimination import EliminationCode
-from knode_cosserat.engine.equations import Nonzeros, TangentEquations
+from knode_cosserat.engine.equations import TangentEquations
 from knode_cosserat.engine.linear import Add, Columns, Loop, Number, Operation, Scale, Show, write
 from knode_cosserat.engine.memory import Array
+from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.settings import Settings
 
@@ -395,7 +396,7 @@ class StepMap(EliminationCode):
             for i in range(t.base.size)
         )
         found.append(Loop(0, self.strands, self._strand_ahead))
-        for i, c, _ in self.tip_slopes:
+        for i, c, _ in e.tip_slopes:
             strand, component = divmod(c, e.ny)
             entry = self._entry_at(self.M, k, i, component, strand)
             found.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))

@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Index, Value, Variable
-from knode_cosserat.engine.equations import Nonzeros
 from knode_cosserat.engine.linear import Add, Columns, Number, write
-from knode_cosserat.engine.memory import Array
+from knode_cosserat.engine.memory import Array, aligned_zeros
+from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.engine.step_map import COLUMNS, STATE, StepMap
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.settings import Settings
@@ -125,7 +125,7 @@ class _TangentCode(StepMap):
         """The derivatives of a step at its solution."""
         e = self.equations
         self.derivatives = f = self._function("derivatives")
-        f.call(self.linearised, f.arguments[0])
+        f.call(self.linearise, f.arguments[0])
         for name, state in self._end_states():
             for array, nonzeros in (
                 (self.by_history[name], e.by_history[name]), (self.by_control[name], e.by_control[name])
@@ -142,7 +142,7 @@ class _TangentCode(StepMap):
         self.shift = f = self._function("shift", "coefficients")
         c0 = f.load(f.arguments[1], 0)
         self._write_shift(self.records, self._count("used"))
-        for i, j, newest in self._numbers_of(self._evaluated_at(self.y), "used between"):
+        for i, j, newest in self._numbers_of(self._state_arrays(self.y), "used between"):
             self._write_wide(newest, self.records[0], i, j)
             if self.settings.uses_rate:
                 self._write_wide(c0 * newest + self._wide(self.H, i, j), self.rate, i, j)
@@ -375,7 +375,7 @@ class TangentCore(_TangentCode):
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
             self._put_in(moved, self.dparameters, directions[:, None, None])
-        states = _aligned(blocks * self.state_size).reshape(blocks, -1)
+        states = aligned_zeros(blocks * self.state_size).reshape(blocks, -1)
         d_records, d_rate = d_states
         columns = filled(np.concatenate([d_records, d_rate[None]])).reshape(-1, *d_rate.shape[:2], blocks, L)
         self._lasting(states, L)[:] = self._by_strand(self.records[0], columns.transpose(3, 4, 0, 1, 2))
@@ -385,7 +385,7 @@ class TangentCore(_TangentCode):
         shapes = (self.counts["nodes"], self.packed.size), (k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
         arrays = *begun, moved, states, filled(weights), filled(d_controls), d_rows, d_unknowns
-        self._functions["run"](*(each.ctypes.data for each in arrays), count, len(directions), blocks * L)
+        self._functions.run("run", *arrays, count, len(directions), blocks * L)
         motion = (self._numbers(begun[0][None], each)[0, 0] for each in (*self.records, self.rate))
         *records, rate = (self._joined(self.rate, each, places) for each in motion)
         columns = self._joined(self.rate, self._lasting(states, L, -count), places).transpose(2, 3, 4, 0, 1)
@@ -557,16 +557,10 @@ class CotangentCore(_TangentCode):
         size = sum(map(self._size_of, self._packed(self._kept)))
         kept = np.empty((count, size))
         arrays = *begun, kept, states, d_controls, d_rows, d_unknowns
-        self._functions["run"](*(each.ctypes.data for each in arrays), size, count, m)
+        self._functions.run("run", *arrays, size, count, m)
         before = self._joined(self.rate, self._lasting(states, 1, count)[:, 0], places).transpose(1, 2, 3, 0)
         return self._numbers(states, self.parameter)[:, 0, 0].T, d_controls, before[:-1], before[-1]
 
 
 def _nodes(nonzeros: Nonzeros) -> list[int]:
     return [node for *_, node in nonzeros]
-
-
-def _aligned(size: int) -> np.ndarray:
-    """Return zeros, aligned to 64 bytes."""
-    raw = np.zeros(size + 8)
-    return raw[(-raw.ctypes.data // 8) % 8 :][:size]
