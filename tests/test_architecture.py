@@ -17,7 +17,7 @@ BASE = "_arguments _blas _files _jax _lazy _numbers _processes _program_cache _r
 #: packages and modules, each depends on those before it only; the empty name is `import knode_cosserat`
 ORDER = (
     *("io", "rods", "robots", "controls", "schemes", "engine", "trajectory", "solvers", "metrics"),
-    *("estimation", "recordings", "statics", "control", "learning", "loading", "evaluation", "figures"),
+    *("estimation", "recordings", "statics", "control", "learning", "loading", "figures"),
     *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli"),
 )
 LAYERS = (BASE.split(), *([name] for name in ORDER))

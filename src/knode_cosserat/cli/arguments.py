@@ -388,6 +388,7 @@ def shows_progress(progress: bool | None) -> bool:
 def figures() -> Any:
     """Return the module of figures. Raises `ImportError` without matplotlib."""
     from knode_cosserat import figures
+    from knode_cosserat.figures.style import require_matplotlib
 
-    figures.require_matplotlib()
+    require_matplotlib()
     return figures

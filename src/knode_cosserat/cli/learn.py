@@ -148,8 +148,7 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
     require_writable(
         None if several else out, figure, (out if several else None, files.checkpoint, files.log)
     )
-    if figure:
-        figures()
+    drawing = figures() if figure else None
     from knode_cosserat.learning.states import fit_states as learn
     from knode_cosserat.solvers.segments import DataError
 
@@ -172,10 +171,8 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
         raise ValueError(text) from None
     seconds = perf_counter() - began
     result.save(out)
-    if figure:
-        from knode_cosserat.evaluation.learning_figures import residual
-
-        residual(next(iter(result)) if several else result, training[0]).savefig(figure)
+    if drawing:
+        drawing.residual(next(iter(result)) if several else result, training[0]).savefig(figure)
     count = sum(len(one.time) for one in training)
     subject = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [

@@ -61,14 +61,11 @@ def inspect(
     than those known, it proposes a configuration, and reads the recording with it.
     """
     require_writable(figure=plot)
-    if plot:
-        figures()
+    drawing = figures() if plot else None
     loaded, proposed = _loaded(recording, config)
     report = loaded.health()
-    if plot:
-        from knode_cosserat.evaluation import recording_figures
-
-        recording_figures.health(loaded, report).savefig(plot)
+    if drawing:
+        drawing.health(loaded, report).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
     content = {"recording": str(recording), **report.to_dict()}
     lines = _lines(report)

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from knode_cosserat.controls import labels
-from knode_cosserat.evaluation.style import DASHES, PALETTE
+from knode_cosserat.figures.style import DASHES, PALETTE
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.trajectory import Trajectory
 
@@ -281,13 +281,3 @@ def flat_height(points: NDArray[np.float64], view: str, width: float, beside: fl
     across, up = (span[AXES.index(name)] for name in view)
     shape = up / across if across > 0.0 else 4.0
     return float(np.clip((width - beside) * max(shape, 0.12) + 0.85, 1.6, 1.15 * width))
-
-
-# matplotlib
-
-
-def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure of a given size (in)."""
-    from knode_cosserat.evaluation.styled_figure import StyledFigure
-
-    return StyledFigure(figsize=(width, height), layout="constrained", dpi=150)
