@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+from collections.abc import Iterator
 from pathlib import Path
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -13,6 +15,7 @@ from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import Report, argument, option, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app, examples
+from knode_cosserat.errors import first_line
 
 if TYPE_CHECKING:
     from knode_cosserat.sweeps import Sweep
@@ -99,9 +102,11 @@ class _Machines(NamedTuple):
         ),
     ] = None
 
-    def executor(self) -> Any:
-        """Return the executor of the sweep."""
-        from knode_cosserat.sweeps import Dask, Local, Slurm
+    @contextlib.contextmanager
+    def executor(self, folder: Path) -> Iterator[Any]:
+        """Give the executor of a sweep in a folder; None: processes of this machine."""
+        from knode_cosserat._processes import dask_client
+        from knode_cosserat.sweeps import SweepError
 
         if self.dask and (self.workers or self.cluster):
             raise ValueError(
@@ -116,8 +121,27 @@ class _Machines(NamedTuple):
                 raise ValueError(f"--slurm must be NAME=VALUE, such as timeout_min=60 (got {text!r})")
             parameters[name] = int(value) if value.isdecimal() else value
         if self.dask:
-            return Dask(self.dask)
-        return Slurm(self.workers or 1, self.cluster, parameters) if self.cluster else Local(self.workers)
+            with dask_client(self.dask, SweepError) as client:
+                yield client.get_executor(pure=False)
+        elif self.cluster:
+            yield _submitit_executor(folder / "jobs", self.cluster, parameters)
+        else:
+            yield None
+
+
+def _submitit_executor(folder: Path, cluster: str, parameters: dict[str, Any]) -> Any:
+    if cluster not in ("slurm", "local", "debug"):
+        raise ValueError(f"--cluster is {cluster!r}; allowed is slurm, local or debug")
+    try:
+        import submitit
+    except ImportError:
+        raise ImportError("SLURM needs submitit: pip install 'knode-cosserat[sweep]'") from None
+    try:
+        executor = submitit.AutoExecutor(folder, cluster=cluster)
+        executor.update_parameters(**parameters)
+    except Exception as error:  # submitit raises many kinds, also for a missing `sbatch`
+        raise ValueError(f"--cluster {cluster}: jobs cannot be submitted: {first_line(error)}") from None
+    return executor
 
 
 @app.command(
@@ -149,7 +173,7 @@ def sweep(
     """
     from knode_cosserat.sweeps import Plan, run_sweep
 
-    executor, described = machines.executor(), cases.sweep()
+    described = cases.sweep()
     require_writable(folders=[] if dry_run else [out])
     plan = Plan.of(described)
     facts = {
@@ -164,7 +188,10 @@ def sweep(
         write_output(report.as_json, facts, [*str(described).splitlines(), size])
         return
     began = perf_counter()
-    data = run_sweep(described, out, executor=executor, progress=report.shows_progress)
+    # jobs of a cluster divide the files; by default there is one job
+    workers = (machines.workers or 1) if machines.cluster else machines.workers
+    with machines.executor(out) as executor:
+        data = run_sweep(described, out, workers=workers, executor=executor, progress=report.shows_progress)
     seconds = perf_counter() - began
     facts |= {"failed": data.failed_count, "computing_time": round(seconds, 2)}
     write_output(report.as_json, facts, [*str(data).splitlines(), f"computed in {seconds:.1f} s"], out=out)
