@@ -152,6 +152,19 @@ def test_dask_gives_the_same_bytes(whole, tmp_path):
     assert data.is_complete and content(tmp_path / "dask") == content(whole.folder)
 
 
+class Elsewhere(concurrent.futures.ThreadPoolExecutor):
+    """A worker on a machine that does not see the folder of the sweep."""
+
+    def submit(self, work, /):
+        return super().submit(dataclasses.replace(work, folder=Path("/elsewhere")))
+
+
+def test_workers_that_do_not_see_the_folder_give_the_same_bytes(whole, tmp_path):
+    with Elsewhere(1) as executor:
+        data = run_sweep(described(), tmp_path / "here", workers=2, executor=executor)
+    assert data.is_complete and content(tmp_path / "here") == content(whole.folder)
+
+
 #: a scheduler of one machine: it starts the script for each task of an array, and gives a number
 FAKE_SBATCH = """#!{python}
 import os, re, subprocess, sys

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -22,7 +21,6 @@ from knode_cosserat.cli.arguments import (
     load_ensemble_folder,
     load_system,
     load_trajectory_file,
-    option,
     require_writable,
     trajectories_by_name,
 )
@@ -36,28 +34,10 @@ if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
 
-class _Kind(enum.StrEnum):
-    """Kinds of figures that `plot` draws."""
-
-    overview = "overview"
-    shape = "shape"
-    path = "path"
-    tip = "tip"
-    states = "states"
-    tensions = "tensions"
-    error = "error"
-    compare = "compare"
-
-
-class _Viewpoint(enum.StrEnum):
-    """Projections of a robot: in space, or onto a coordinate plane."""
-
-    xyz = "xyz"
-    xy = "xy"
-    xz = "xz"
-    yz = "yz"
-
-
+#: kinds of figures that `plot` draws
+Kind = Literal["overview", "shape", "path", "tip", "states", "tensions", "error", "compare"]
+#: projections of a robot: in space, or onto a coordinate plane
+Viewpoint = Literal["xyz", "xy", "xz", "yz"]
 Trajectories = Annotated[list[Path], argument("TRAJECTORY…", "Trajectory files; the first is the reference.")]
 
 
@@ -66,17 +46,16 @@ class _Look(NamedTuple):
 
     Options:
         view (--view): View in space (xyz), or projection onto a coordinate plane.
+        columns (--columns N): Width of the figure: one or two columns of a paper.
     """
 
-    view: _Viewpoint = _Viewpoint.xyz
-    columns: Annotated[
-        int, option("N", "Width of the figure: one or two columns of a paper.", min=1, max=2)
-    ] = 1
+    view: Viewpoint = "xyz"
+    columns: int = 1
 
     def of(self, trajectory: Trajectory) -> str | None:
         """Return the name of the view; None for the only view of a planar system."""
         is_planar = np.shape(trajectory.position)[-1] == 2
-        return None if is_planar and self.view is _Viewpoint.xyz else self.view.value
+        return None if is_planar and self.view == "xyz" else self.view
 
 
 class _Pace(NamedTuple):
@@ -176,7 +155,7 @@ def plot(
     trajectories: Trajectories,
     out: Annotated[Path, Picture],
     look: _Look,
-    kind: _Kind = _Kind.overview,
+    kind: Kind = "overview",
     as_json: Json = False,
 ) -> None:
     """Draw one trajectory, or overlay several.
@@ -197,28 +176,26 @@ def plot(
     drawing = figures()
     states = _distinct_trajectories(trajectories)
     first, *others = states.values()
-    if others and kind is _Kind.overview:
-        kind = _Kind.compare
-    if others and kind in (_Kind.shape, _Kind.tensions):
+    if others and kind == "overview":
+        kind = "compare"
+    if others and kind in ("shape", "tensions"):
         raise ValueError(f"--kind {kind} draws one trajectory; {len(states)} were given. Use --kind compare")
-    if not others and kind in (_Kind.error, _Kind.compare):
+    if not others and kind in ("error", "compare"):
         raise ValueError(f"--kind {kind} needs a reference and at least one other trajectory; one was given")
     rest = dict(list(states.items())[1:])
     looks: dict[str, Any] = {"columns": look.columns}
     draw = {
-        _Kind.overview: lambda: drawing.overview(first),
-        _Kind.shape: lambda: drawing.shape(first, view=look.of(first), **looks),
-        _Kind.path: lambda: drawing.path(states, view=look.of(first), **looks),
-        _Kind.tip: lambda: drawing.tips(states, **looks),
-        _Kind.states: lambda: drawing.states(states, **looks),
-        _Kind.tensions: lambda: drawing.tensions(first, **looks),
-        _Kind.error: lambda: drawing.error(first, rest, **looks),
-        _Kind.compare: lambda: drawing.compare(first, rest),
+        "overview": lambda: drawing.overview(first),
+        "shape": lambda: drawing.shape(first, view=look.of(first), **looks),
+        "path": lambda: drawing.path(states, view=look.of(first), **looks),
+        "tip": lambda: drawing.tips(states, **looks),
+        "states": lambda: drawing.states(states, **looks),
+        "tensions": lambda: drawing.tensions(first, **looks),
+        "error": lambda: drawing.error(first, rest, **looks),
+        "compare": lambda: drawing.compare(first, rest),
     }
     draw[kind]().savefig(out)
-    write_output(
-        as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind.value}, [], out=out
-    )
+    write_output(as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind}, [], out=out)
 
 
 @app.command()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import functools
 import math
 import re
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
@@ -34,14 +33,6 @@ from knode_cosserat.recordings.formats import read_suffixes
 if TYPE_CHECKING:
     from knode_cosserat.learning.config import FitConfig
     from knode_cosserat.rods.system import System
-
-
-class _Preset(enum.StrEnum):
-    """Presets of the learning method."""
-
-    best = "best"
-    paper = "paper"
-    network = "network"
 
 
 class _Data(NamedTuple):
@@ -69,7 +60,7 @@ class _Method(NamedTuple):
         epochs (--epochs N): Training epochs of a network. Default: the preset's.
     """
 
-    preset: _Preset = _Preset.best
+    preset: Literal["best", "paper", "network"] = "best"
     seed: int | None = None
     seeds: str | None = None
     epochs: int | None = None
@@ -90,14 +81,14 @@ class _Method(NamedTuple):
         from knode_cosserat.learning.config import FitConfig, StructuredOptions
 
         seed = self.numbers()
-        if self.preset is _Preset.best:
+        if self.preset == "best":
             if self.epochs is not None:
                 raise ValueError(
                     "--epochs is for networks; the preset best has none. Use --preset paper or --preset "
                     "network"
                 )
             return FitConfig(StructuredOptions(resample=isinstance(seed, tuple)), seed=seed)
-        config = FitConfig.paper(seed) if self.preset is _Preset.paper else FitConfig.network(seed)
+        config = FitConfig.paper(seed) if self.preset == "paper" else FitConfig.network(seed)
         if self.epochs is None or config.segments is None:
             return config
         segments = dataclasses.replace(config.segments, epochs=self.epochs)
@@ -175,7 +166,7 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
     subject = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
         f"learned a residual model of {robot} from {subject} ({count} rows): "
-        f"preset {method.preset.value}, {seconds:.2f} s"
+        f"preset {method.preset}, {seconds:.2f} s"
     ]
     models = []
     for model in result if several else [result]:
@@ -185,7 +176,7 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
     write_output(
         report.as_json,
         {
-            "robot": robot, "preset": method.preset.value,
+            "robot": robot, "preset": method.preset,
             "trajectories": [str(path) for path in data.trajectories], "rows": count,
             "computing_time": round(seconds, 4), "models": models,
         },

@@ -61,7 +61,7 @@ def inspect(
     loaded, proposed = _loaded(recording, config)
     report = loaded.health()
     if drawing:
-        drawing.health(loaded, report).savefig(plot)
+        drawing.health(loaded).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
     content = {"recording": str(recording), **report.to_dict()}
     lines = _lines(report)

@@ -26,13 +26,10 @@ _MARKS = (
 )
 
 
-def health(recording: Recording, report: Health | None = None) -> Figure:
-    """Return a figure of a recording and its quality: tensions, positions, missing frames and noise.
-
-    The report is `recording.health()` if it is not given.
-    """
+def health(recording: Recording) -> Figure:
+    """Return a figure of a recording and its quality: tensions, positions, missing frames and noise."""
     check_arguments(health, locals())
-    report = report or recording.health()
+    report = recording.health()
     robot = {True: "a simulated robot", False: "a physical robot", None: "not stated whether simulated"}
     with new_figure(TWO_COLUMNS, 6.0) as figure:
         figure.suptitle(f"{recording.source}\n{report.duration:.2f} s, {robot[recording.simulated]}")

@@ -19,34 +19,8 @@ DASHES = ("-", "--", "-.", ":")
 TIME_COLOURS = "viridis"
 #: width of a figure in one column of a paper, and in two (in)
 ONE_COLUMN, TWO_COLUMNS = 3.5, 7.16
-STYLE: Any = {
-    "font.size": 8,
-    "font.family": "sans-serif",
-    "font.sans-serif": ["DejaVu Sans"],
-    "mathtext.fontset": "dejavusans",
-    "axes.titlesize": 8,
-    "axes.axisbelow": True,
-    "axes.grid": True,
-    "axes.linewidth": 0.6,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "figure.titlesize": 9,
-    "grid.color": "#DDDDDD",
-    "grid.linewidth": 0.5,
-    "legend.frameon": False,
-    "legend.fontsize": 7.5,
-    "lines.linewidth": 1.3,
-    "lines.markersize": 4,
-    "xtick.major.width": 0.6,
-    "ytick.major.width": 0.6,
-    # TrueType: fonts are embedded and text is searchable; journals reject Type 3
-    "pdf.fonttype": 42,
-    "ps.fonttype": 42,
-    # letters as paths, which do not depend on installed fonts
-    "svg.fonttype": "path",
-    "svg.hashsalt": "knode-cosserat",
-    "savefig.dpi": 220,
-}
+#: fonts, lines and file formats
+STYLE = Path(__file__).with_name("figures.mplstyle")
 
 
 def require_matplotlib() -> None:
@@ -62,7 +36,7 @@ def style() -> Any:
     require_matplotlib()
     import matplotlib
 
-    return matplotlib.rc_context(STYLE)
+    return matplotlib.rc_context(fname=STYLE)
 
 
 def width_of(columns: int) -> float:

@@ -221,7 +221,9 @@ def run_sweep(
         if solved:
             times = [(shard.seconds / shard.cases, shard.cpu_seconds / shard.cases) for shard in solved]
             facts["case_seconds"], facts["case_cpu_seconds"] = np.median(times, axis=0).tolist()
-        log_run(folder, executor=type(executor).__name__, workers=workers, **facts)
+        log_run(
+            folder, executor=type(executor).__name__ if executor else "processes", workers=workers, **facts
+        )
     # files of killed writes
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder / SHARDS):
