@@ -13,7 +13,6 @@ import numpy as np
 
 import knode_cosserat as kc
 from knode_cosserat import figures
-from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.metrics import rms_distance
 from knode_cosserat.recordings.streams import Body, Tensions
 from knode_cosserat.recordings.virtual import lagged
@@ -68,7 +67,7 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     recordings = {name: kc.load_recording(out / f"{name}.csv", config) for name in SIGNALS}
     unseen = recordings.pop("unseen").sampled(DT, mean=True)
     first = recordings["sine-1"]
-    recording_figures.health(first, first.health()).savefig(out / "health.png", dpi=130)
+    figures.health(first).savefig(out / "health.png", dpi=130)
     found = kc.identify(knowledge, list(recordings.values()), progress=print)
     print(found)
     kc.save_robot(found.robot, out / "found.yaml")

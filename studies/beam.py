@@ -23,9 +23,8 @@ from scipy.spatial.transform import Rotation
 
 from knode_cosserat._files import csv_rows
 from knode_cosserat._files.reading import read_bytes
-from knode_cosserat.evaluation.comparison import REFERENCE, legend_below
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.comparison import REFERENCE, legend_below
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.recordings.findings import RecordingError, naming
 from knode_cosserat.recordings.formats.csv_table import read_csv
 from knode_cosserat.recordings.table import columns_of
@@ -552,8 +551,7 @@ def drops(
     Raises:
         ImportError: matplotlib is not installed.
     """
-    with style():
-        figure = new_figure(TWO_COLUMNS, 1.7 * len(recordings) + 0.4)
+    with new_figure(TWO_COLUMNS, 1.7 * len(recordings) + 0.4) as figure:
         grid = figure.subplots(len(recordings), 2, squeeze=False, width_ratios=(1.6, 1.0), sharey="row")
         for row, each in zip(grid, recordings, strict=True):
             time = each.time - each.crossing

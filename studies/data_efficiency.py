@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat import controls
-from knode_cosserat.evaluation.comparison import legend_below
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, style
+from knode_cosserat.figures.comparison import legend_below
+from knode_cosserat.figures.style import PALETTE, new_figure
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
@@ -209,8 +208,7 @@ def figure(cells: Sequence[Any], measure: str = "tip_dtw") -> Figure:
     """
     imperfections = [name for name in dict.fromkeys(cell["imperfection"] for cell in cells) if name != ANY]
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
-    with style():
-        whole = new_figure(2.9 * len(imperfections) + 0.6, 3.8 * len(controls) + 1.0)
+    with new_figure(2.9 * len(imperfections) + 0.6, 3.8 * len(controls) + 1.0) as whole:
         grid = whole.subplots(len(controls), len(imperfections), sharex=True, sharey=True, squeeze=False)
         for line, control in zip(grid, controls, strict=True):
             for axes, imperfection in zip(line, imperfections, strict=True):

@@ -31,8 +31,7 @@ from knode_cosserat.envs import (
 )
 from knode_cosserat.envs.tasks import TASKS, Tip
 from knode_cosserat.estimation.outputs import BodyPositions
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, style, width_of
+from knode_cosserat.figures.style import PALETTE, new_figure, width_of
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 from knode_cosserat.rods.wrapped import nominal_model
@@ -238,8 +237,7 @@ def ppo(settings: Any) -> Product:
 
 def curve_figure(facts: Mapping[str, Any]) -> Any:
     """Return the figure of PPO's mean reward over time, with the score of predictive control."""
-    with style():
-        figure = new_figure(width_of(1), 2.4)
+    with new_figure(width_of(1), 2.4) as figure:
         axes = figure.subplots()
         steps, seconds, reward = np.array(facts["curve"]).T
         axes.plot(seconds, reward, color=PALETTE[0], label="PPO while it explores")

@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat.evaluation.comparison import METHODS as LINES
-from knode_cosserat.evaluation.comparison import REFERENCE, legend_below
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import TWO_COLUMNS, style
+from knode_cosserat.figures.comparison import METHODS as LINES
+from knode_cosserat.figures.comparison import REFERENCE, legend_below
+from knode_cosserat.figures.style import TWO_COLUMNS, new_figure
 from knode_cosserat.metrics import state_errors
 from knode_cosserat.recordings.estimation.estimate import Method, estimate_states
 from knode_cosserat.recordings.load import load_recording
@@ -143,8 +142,7 @@ def estimated_states(
     Raises:
         ImportError: matplotlib is not installed.
     """
-    with style():
-        figure = new_figure(TWO_COLUMNS, 6.2)
+    with new_figure(TWO_COLUMNS, 6.2) as figure:
         grid = figure.subplots(4, 2, sharex=True, height_ratios=(2, 1, 2, 1))
         for k, (name, component, node, title) in enumerate(_SHOWN):
             above, below = grid[2 * (k // 2), k % 2], grid[2 * (k // 2) + 1, k % 2]

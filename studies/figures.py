@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from knode_cosserat.evaluation.comparison import draw_shapes, draw_tips, legend_below, require_some, show_all
-from knode_cosserat.evaluation.drawing import draw_tensions, new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.comparison import draw_shapes, draw_tips, legend_below, require_some, show_all
+from knode_cosserat.figures.drawing import draw_tensions
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -25,8 +25,7 @@ def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
         ValueError: there is nothing to draw, or a batch is given; from every function here.
     """
     require_some(trajectories)
-    with style():
-        figure = new_figure(TWO_COLUMNS, 1.8 * len(trajectories))
+    with new_figure(TWO_COLUMNS, 1.8 * len(trajectories)) as figure:
         rows = figure.subplots(len(trajectories), 1, squeeze=False)[:, 0]
         for axes, (title, trajectory) in zip(rows, trajectories.items(), strict=True):
             draw_tensions(axes, trajectory)
@@ -39,10 +38,9 @@ def controls(trajectories: Mapping[str, Trajectory]) -> Figure:
 def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
     """Return a figure of shapes at `count` times and tip paths, a panel per prediction over the reference."""
     require_some(predictions)
-    with style():
-        columns = min(2, len(predictions))
-        rows = -(-len(predictions) // columns)
-        figure = new_figure(TWO_COLUMNS, 2.9 * rows + 0.3)
+    columns = min(2, len(predictions))
+    rows = -(-len(predictions) // columns)
+    with new_figure(TWO_COLUMNS, 2.9 * rows + 0.3) as figure:
         grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
         panels = grid[: len(predictions)]
         for axes in grid[len(predictions) :]:
@@ -57,8 +55,7 @@ def shapes(reference: Trajectory, predictions: Mapping[str, Trajectory], count: 
 def predicted_tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory]]]) -> Figure:
     """Return a figure of the tips over time: a column per case, given by its reference and predictions."""
     require_some(cases)
-    with style():
-        figure = new_figure(TWO_COLUMNS, 4.0)
+    with new_figure(TWO_COLUMNS, 4.0) as figure:
         grid = figure.subplots(3, len(cases), sharex="col", squeeze=False)
         for column, (title, (reference, predictions)) in zip(grid.T, cases.items(), strict=True):
             draw_tips(column, reference, predictions)
@@ -71,8 +68,7 @@ def predicted_tips(cases: Mapping[str, tuple[Trajectory, Mapping[str, Trajectory
 def losses(runs: Mapping[str, Sequence[ArrayLike]]) -> Figure:
     """Return a figure of the loss over epochs: median and range of the runs (seeds) for each label."""
     require_some(runs)
-    with style():
-        figure = new_figure(TWO_COLUMNS, 3.2)
+    with new_figure(TWO_COLUMNS, 3.2) as figure:
         axes = figure.subplots()
         for k, (label, histories) in enumerate(runs.items()):
             values = np.stack([np.asarray(history, dtype=float) for history in histories])

@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat import controls
-from knode_cosserat.evaluation.comparison import legend_below
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.comparison import legend_below
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import TendonRobot
@@ -365,8 +364,7 @@ def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
         ImportError: matplotlib is not installed.
     """
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
-    with style():
-        whole = new_figure(TWO_COLUMNS, 0.19 * len(names) + 1.4)
+    with new_figure(TWO_COLUMNS, 0.19 * len(names) + 1.4) as whole:
         panels = whole.subplots(1, len(PAPER_MEASURES), sharey=True)
         for axes, measure in zip(panels, PAPER_MEASURES, strict=True):
             left = ratios(cells, measure)

@@ -6,19 +6,20 @@ capture. All settings are passed to the jobs as plain values.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import itertools
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.comparison import METHODS as LOOKS
-from knode_cosserat.evaluation.comparison import REFERENCE, legend_below, require_some
-from knode_cosserat.evaluation.drawing import equal_scales, new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.comparison import METHODS as LOOKS
+from knode_cosserat.figures.comparison import REFERENCE, legend_below, require_some
+from knode_cosserat.figures.drawing import equal_scales
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.identification.evaluate import Evaluation, compared, predict
 from knode_cosserat.identification.fit import fit as learn
 from knode_cosserat.identification.identify import IdentificationError, identify
@@ -654,8 +655,7 @@ def measured_tensions(recordings: Mapping[str, Predicted]) -> Figure:
         ImportError: matplotlib is not installed; from every function here.
         ValueError: there is nothing to draw; from every function here.
     """
-    with style():
-        figure, panels = _grid(recordings, 2.3)
+    with _grid(recordings, 2.3) as (figure, panels):
         for axes, (name, it) in zip(panels, recordings.items(), strict=False):
             for k in range(it.tension.shape[1]):
                 colour = PALETTE[k % len(PALETTE)]
@@ -671,8 +671,7 @@ def measured_tensions(recordings: Mapping[str, Predicted]) -> Figure:
 
 def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
     """Return a figure of x of the tips over time."""
-    with style():
-        figure, panels = _grid(recordings, 2.3)
+    with _grid(recordings, 2.3) as (figure, panels):
         # one scale for all panels, so that motions are comparable; predictions far off leave the axes
         reach = 2.5 * max(float(np.nanmax(np.abs(it.measured[:, 0]))) for it in recordings.values())
         for axes, (name, it) in zip(panels, recordings.items(), strict=False):
@@ -686,10 +685,9 @@ def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
 def paths(recordings: Mapping[str, Predicted]) -> Figure:
     """Return a figure of the paths of the tips in space."""
     require_some(recordings)
-    with style():
-        columns = min(COLUMNS, len(recordings))
-        rows = -(-len(recordings) // columns)
-        figure = new_figure(TWO_COLUMNS, 2.6 * rows + 0.4)
+    columns = min(COLUMNS, len(recordings))
+    rows = -(-len(recordings) // columns)
+    with new_figure(TWO_COLUMNS, 2.6 * rows + 0.4) as figure:
         grid = figure.subplots(rows, columns, subplot_kw={"projection": "3d"}, squeeze=False).ravel()
         for axes, (name, it) in zip(grid, recordings.items(), strict=False):
             axes.plot(*it.measured.T, **MEASURED)
@@ -709,8 +707,7 @@ def paths(recordings: Mapping[str, Predicted]) -> Figure:
 def horizon(recordings: Mapping[str, Predicted]) -> Figure:
     """Return a figure of the tip error over the horizon: RMS over the recordings, and their range."""
     require_some(recordings)
-    with style():
-        figure = new_figure(TWO_COLUMNS, 3.2)
+    with new_figure(TWO_COLUMNS, 3.2) as figure:
         axes = figure.subplots()
         methods = list(dict.fromkeys(method for it in recordings.values() for method in it.predicted))
         for method in methods:
@@ -744,8 +741,7 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
 
 def consistency(groups: Mapping[str, Sequence[Float[np.ndarray, "T 3"]]], dt: float) -> Figure:
     """Return a figure of repeated recordings of one control, overlaid: the robot's repeatability."""
-    with style():
-        figure, panels = _grid(groups, 2.3)
+    with _grid(groups, 2.3) as (figure, panels):
         for axes, (name, several) in zip(panels, groups.items(), strict=False):
             length = min(len(tip) for tip in several)
             tips = np.stack([tip[:length] for tip in several])
@@ -761,12 +757,13 @@ def consistency(groups: Mapping[str, Sequence[Float[np.ndarray, "T 3"]]], dt: fl
         return _finished(figure, panels)
 
 
-def _grid(given: Mapping[str, Any], height: float) -> tuple[Any, Any]:
+@contextlib.contextmanager
+def _grid(given: Mapping[str, Any], height: float) -> Iterator[tuple[Any, Any]]:
     require_some(given)
     columns = 1 if len(given) < 3 else 2
     rows = -(-len(given) // columns)
-    figure = new_figure(TWO_COLUMNS, 0.7 * height * rows + 0.5)
-    return figure, figure.subplots(rows, columns, squeeze=False).ravel()
+    with new_figure(TWO_COLUMNS, 0.7 * height * rows + 0.5) as figure:
+        yield figure, figure.subplots(rows, columns, squeeze=False).ravel()
 
 
 def _finished(figure: Any, panels: Any) -> Figure:

@@ -19,7 +19,7 @@ BASE = (
 #: packages and modules, each depends on those before it only; the empty name is `import knode_cosserat`
 ORDER = (
     *("io", "rods", "robots", "controls", "schemes", "engine", "trajectory", "solvers", "metrics"),
-    *("estimation", "recordings", "statics", "control", "learning", "loading", "evaluation", "figures"),
+    *("estimation", "recordings", "statics", "control", "learning", "loading", "figures"),
     *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli"),
 )
 LAYERS = (BASE.split(), *([name] for name in ORDER))

@@ -169,6 +169,8 @@ FUNCTIONS: dict[Any, dict[str, str]] = {
     kc.figures.animate: {"trajectories": "shown", "path": "path"},
     kc.figures.closed_loop: {"log": "log"},
     kc.figures.compare: {"reference": "trajectory", "predictions": "motions by name"},
+    kc.figures.health: {"recording": "recording"},
+    kc.figures.residual: {"model": "model", "trajectory": "trajectory"},
     kc.figures.overview: {"trajectory": "trajectory"},
     kc.figures.shape: {"trajectory": "trajectory"},
     kc.figures.spread: {"batch": "trajectory"},
@@ -188,7 +190,7 @@ FUNCTIONS: dict[Any, dict[str, str]] = {
 }
 #: functions without arguments, for who extends the package, or of anything that is drawn
 OTHERS = {
-    "catalog", "load_example", "robot_schema", "require_matplotlib", "register", "register_controller",
+    "catalog", "load_example", "robot_schema", "register", "register_controller",
     "parameter", "effects_of", "make", "curves", "error", "path",
 }  # fmt: skip
 

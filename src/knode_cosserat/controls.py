@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import csv
 import difflib
+import functools
 import inspect
 import os
 import re
@@ -569,6 +570,11 @@ def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
     return arguments
 
 
+@functools.cache
+def _parameters_of(function: Callable[..., Any]) -> Mapping[str, inspect.Parameter]:
+    return inspect.signature(function).parameters
+
+
 def _tension_signal(name: str, text: str, steps: int, times: tuple[float, Sampled], tendons: int) -> Tensions:
     """Return a signal of all tendons; `times` are the time step (s) and the time in it."""
     signal = _TENSIONS[name]
@@ -581,7 +587,7 @@ def _tension_signal(name: str, text: str, steps: int, times: tuple[float, Sample
         raise ControlsError(
             f"tendons is {listed}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
         )
-    parameters = inspect.signature(signal.make).parameters
+    parameters = _parameters_of(signal.make)
     arguments |= {"steps": steps, "count" if "count" in parameters else "tendons": tendons}
     if "dt" in parameters:
         arguments |= {"dt": times[0], "sampled": times[1]}

@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.trajectory import Trajectory
 from knode_cosserat.viewer import export_scene
@@ -259,8 +258,7 @@ def _parameters(result: CableResult) -> str:
 
 def figure(results: Sequence[CableResult]) -> Figure:
     """Return a figure: errors of all motions, and the shapes of the median one over time."""
-    with style():
-        drawn = new_figure(TWO_COLUMNS, 2.6 * len(results))
+    with new_figure(TWO_COLUMNS, 2.6 * len(results)) as drawn:
         grid = drawn.subplots(len(results), 1 + len(SHOWN), squeeze=False)
         for row, result in zip(grid, results, strict=True):
             for k, method in enumerate(METHODS):

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
-from knode_cosserat.evaluation import recording_figures
 from knode_cosserat.recordings.frame import leans_of, rod_lengths
 from knode_cosserat.recordings.streams import Body, Tensions
 from tests.recordings.made import LAG, PAPER, changed, made, write
@@ -120,7 +119,7 @@ def test_a_recording_without_commands_or_rest_still_has_a_report(tmp_path):
     assert report.latency is None
     assert report.tension_errors == ()
     assert all(stream.noise is not None for stream in report.streams)
-    recording_figures.health(recording, report).savefig(tmp_path / "it.png")
+    kc.figures.health(recording).savefig(tmp_path / "it.png")
 
 
 # the command
@@ -160,7 +159,7 @@ def test_inspect_draws_and_gives_json(bag, report, tmp_path):
 
 
 def test_the_figure_shows_what_was_found(recording, report):
-    figure = recording_figures.health(recording, report)
+    figure = kc.figures.health(recording)
     tensions, x, y, z, frames = figure.axes[:5]
     np.testing.assert_array_equal(x.lines[0].get_xdata(), recording.bodies[0].time)
     np.testing.assert_array_equal(z.lines[3].get_ydata(), recording.bodies[3].position[:, 2])

@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.comparison import comparison
 from studies import figures
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw
@@ -87,7 +86,7 @@ def test_tips_are_drawn_over_time_a_column_for_each_case(truth, baseline):
 
 
 def test_a_comparison_has_shapes_and_tips_of_all(truth, baseline):
-    figure = comparison(truth, {"baseline": baseline, "best": truth}, count=2)
+    figure = kc.figures.compare(truth, {"baseline": baseline, "best": truth}, count=2)
     assert drawn(figure).startswith(b"\x89PNG")
     assert labels(figure) == ["reference", "baseline", "best"]
     shapes, *tips = figure.axes
@@ -124,7 +123,7 @@ def test_what_cannot_be_drawn_is_said(truth):
         lambda: figures.controls({}),
         lambda: figures.shapes(truth, {}),
         lambda: figures.predicted_tips({}),
-        lambda: comparison(truth, {}),
+        lambda: kc.figures.compare(truth, {}),
         lambda: figures.losses({}),
     ):
         with pytest.raises(ValueError, match="there is nothing to draw"):

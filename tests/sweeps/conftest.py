@@ -9,10 +9,10 @@ import pytest
 def whole(tmp_path_factory):
     """An undisturbed sweep of 48 cases in 3 shards."""
     # not before the tests have chosen how JAX compiles
-    from knode_cosserat.sweeps import Local, run_sweep
+    from knode_cosserat.sweeps import run_sweep
     from tests.sweeps.small_sweep import described
 
-    return run_sweep(described(), tmp_path_factory.mktemp("whole") / "sweep", executor=Local(1))
+    return run_sweep(described(), tmp_path_factory.mktemp("whole") / "sweep", workers=1)
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from knode_cosserat.sweeps import Local, SweepError, load_sweep, run_sweep
-from knode_cosserat.sweeps._shards import KEY, METADATA_CHECKSUM, json_checksum, read_shard, require_pyarrow
+from knode_cosserat.sweeps import SweepError, load_sweep, run_sweep
+from knode_cosserat.sweeps._shards import KEY, checksum, read_shard, require_pyarrow
 from tests.sweeps.small_sweep import content, described
 
 ROOT = Path(__file__).parents[2]
@@ -30,17 +30,18 @@ def rewritten(path, **changes):
     pyarrow = require_pyarrow()
     table = pyarrow.parquet.read_table(path)
     about = json.loads(table.schema.metadata[KEY]) | changes
-    del about[METADATA_CHECKSUM]
-    about[METADATA_CHECKSUM] = json_checksum(about)
+    if "sweep" in changes:
+        columns = read_shard(path).columns
+        about["checksum"] = checksum(columns, {k: it for k, it in about.items() if k != "checksum"})
     pyarrow.parquet.write_table(table.replace_schema_metadata({KEY: json.dumps(about).encode()}), path)
 
 
 def test_a_shard_of_another_version_is_refused_and_stays(copied):
     path = copied / "shards" / "000001.parquet"
-    rewritten(path, version=2)
+    rewritten(path, version=9)
     before = content(copied)
     for call in (lambda: run_sweep(described(), copied), lambda: load_sweep(copied).verify()):
-        with pytest.raises(SweepError, match=r"000001\.parquet: the shard has the version 2; allowed is 1"):
+        with pytest.raises(SweepError, match=r"000001\.parquet: the shard has the version 9; allowed is 2"):
             call()
     assert content(copied) == before
 
@@ -69,7 +70,7 @@ def test_damaged_shards_are_told_and_solved_again(whole, copied):
         for name, values in read_shard(whole.folder / "shards" / "000001.parquet").columns.items():
             np.testing.assert_array_equal(shard.columns[name], values)
     path.write_bytes(good[: len(good) // 2])
-    run_sweep(described(), copied, executor=Local(1))
+    run_sweep(described(), copied, workers=1)
     assert content(copied) == content(whole.folder)
 
 
@@ -117,13 +118,13 @@ def test_a_disk_that_fills_up_loses_nothing(whole, copied, tmp_path):
 import resource, signal, sys
 from pathlib import Path
 from tests.sweeps.test_sweep import described
-from knode_cosserat.sweeps import Local, run_sweep
+from knode_cosserat.sweeps import run_sweep
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
 import jax
 jax.config.update("jax_enable_compilation_cache", False)
 resource.setrlimit(resource.RLIMIT_FSIZE, (1000, resource.RLIM_INFINITY))
 try:
-    run_sweep(described(), Path({str(copied)!r}), executor=Local(1))
+    run_sweep(described(), Path({str(copied)!r}), workers=1)
 except ValueError as error:
     print(error)
 """
@@ -133,5 +134,5 @@ except ValueError as error:
     assert done.stdout.count("\n") == 1
     assert "000002.parquet: cannot be written: File too large; complete shards are kept" in done.stdout
     assert content(copied) == before
-    run_sweep(described(), copied, executor=Local(1))
+    run_sweep(described(), copied, workers=1)
     assert content(copied) == content(whole.folder)

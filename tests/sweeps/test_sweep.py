@@ -1,5 +1,6 @@
 """Sweeps in a folder: results of `simulate`, resumed after kills to the same bytes."""
 
+import concurrent.futures
 import dataclasses
 import json
 import os
@@ -9,6 +10,7 @@ import subprocess
 import sys
 import time
 import warnings
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +18,9 @@ import pyarrow.compute
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.sweeps import Dask, Local, Plan, Slurm, Sweep, SweepError, load_sweep, run_sweep
-from knode_cosserat.sweeps._run import ShardJob, Work
+from knode_cosserat import _processes
+from knode_cosserat.sweeps import Plan, Sweep, SweepError, load_sweep, run_sweep
+from knode_cosserat.sweeps._run import Work
 from knode_cosserat.sweeps._shards import require_pyarrow, shard_bytes
 from tests.commands import run, succeeded, told
 from tests.sweeps.small_sweep import ROBOT, content, described
@@ -93,9 +96,9 @@ def test_the_data_say_what_they_are(whole):
 def test_recovery_solves_more_cases(tmp_path):
     robot = {"robot": ROBOT["robot"], "set": {"nodes": 5, "bending_damping": 1e-6}}
     sweep = described(robots=robot, vary={"height": [1.0, 300.0, 3e4]})
-    failed = run_sweep(sweep, tmp_path / "failed", executor=Local(1))
+    failed = run_sweep(sweep, tmp_path / "failed", workers=1)
     assert np.any(failed["result"][1] < 0) and np.any(failed["result"][2] < 0)
-    found = run_sweep(dataclasses.replace(sweep, recovery=True), tmp_path / "found", executor=Local(1))
+    found = run_sweep(dataclasses.replace(sweep, recovery=True), tmp_path / "found", workers=1)
     one = kc.load_robot(ROBOT["robot"]).replace(**robot["set"])
     for k, height in enumerate((1.0, 300.0, 3e4)):
         with warnings.catch_warnings():
@@ -124,25 +127,42 @@ def test_a_platform_starts_from_its_equilibrium(tmp_path):
 
 @pytest.mark.slow
 def test_two_processes_give_the_same_bytes(whole, tmp_path):
-    run_sweep(described(), tmp_path / "two", executor=Local(2))
+    run_sweep(described(), tmp_path / "two", workers=2)
     assert content(tmp_path / "two") == content(whole.folder)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("cluster", ["debug", "local"])
 def test_jobs_of_submitit_give_the_same_bytes(whole, tmp_path, cluster):
-    pytest.importorskip("submitit")
-    data = run_sweep(described(), tmp_path / "jobs-of", executor=Slurm(2, cluster, {"timeout_min": 5}))
+    submitit = pytest.importorskip("submitit")
+    executor = submitit.AutoExecutor(tmp_path / "jobs", cluster=cluster)
+    data = run_sweep(described(), tmp_path / "jobs-of", workers=2, executor=executor)
     assert data.is_complete and content(tmp_path / "jobs-of") == content(whole.folder)
 
 
 def test_dask_gives_the_same_bytes(whole, tmp_path):
     distributed = pytest.importorskip("distributed")
-    with distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
-    ) as cluster:
-        data = run_sweep(described(), tmp_path / "dask", executor=Dask(cluster.scheduler_address))
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None
+        ) as cluster,
+        distributed.Client(cluster, set_as_default=False) as client,
+    ):
+        data = run_sweep(described(), tmp_path / "dask", executor=client.get_executor(pure=False))
     assert data.is_complete and content(tmp_path / "dask") == content(whole.folder)
+
+
+class Elsewhere(concurrent.futures.ThreadPoolExecutor):
+    """A worker on a machine that does not see the folder of the sweep."""
+
+    def submit(self, work, /):
+        return super().submit(dataclasses.replace(work, folder=Path("/elsewhere")))
+
+
+def test_workers_that_do_not_see_the_folder_give_the_same_bytes(whole, tmp_path):
+    with Elsewhere(1) as executor:
+        data = run_sweep(described(), tmp_path / "here", workers=2, executor=executor)
+    assert data.is_complete and content(tmp_path / "here") == content(whole.folder)
 
 
 #: a scheduler of one machine: it starts the script for each task of an array, and gives a number
@@ -166,7 +186,7 @@ exec "$@"
 
 @pytest.mark.slow
 def test_slurm_with_a_fake_scheduler_gives_the_same_bytes(whole, tmp_path, monkeypatch):
-    pytest.importorskip("submitit")
+    submitit = pytest.importorskip("submitit")
     tools = tmp_path / "bin"
     tools.mkdir()
     for name, text in (
@@ -176,7 +196,8 @@ def test_slurm_with_a_fake_scheduler_gives_the_same_bytes(whole, tmp_path, monke
         (tools / name).write_text(text)
         (tools / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}:{os.environ['PATH']}")
-    data = run_sweep(described(), tmp_path / "slurm", executor=Slurm(2, "slurm", {"timeout_min": 5}))
+    executor = submitit.AutoExecutor(tmp_path / "jobs", cluster="slurm")
+    data = run_sweep(described(), tmp_path / "slurm", workers=2, executor=executor)
     assert data.is_complete and content(tmp_path / "slurm") == content(whole.folder)
 
 
@@ -184,10 +205,9 @@ def test_an_interrupted_job_goes_on_where_it_stopped(whole, copied):
     submitit = pytest.importorskip("submitit")
     (copied / "shards" / "000001.parquet").unlink()
     plan = Plan.of(described())
-    work = Work(plan, copied, whole.manifest["made_by"])
-    again = ShardJob(work, (0, 1, 2)).checkpoint()
+    again = Work(plan, copied, (0, 1, 2), whole.manifest["made_by"]).checkpoint()
     assert isinstance(again, submitit.helpers.DelayedSubmission)
-    assert [done.shard for done in again.result()] == [1]
+    assert [shard.number for shard in again.result()] == [1]
     assert content(copied) == content(whole.folder)
 
 
@@ -195,9 +215,9 @@ SCRIPT = """
 import sys
 from pathlib import Path
 from tests.sweeps.test_sweep import described
-from knode_cosserat.sweeps import Local, run_sweep
+from knode_cosserat.sweeps import run_sweep
 if __name__ == "__main__":
-    run_sweep(described(), Path(sys.argv[1]), executor=Local(int(sys.argv[2])))
+    run_sweep(described(), Path(sys.argv[1]), workers=int(sys.argv[2]))
 """
 
 
@@ -227,7 +247,7 @@ def test_killed_again_and_again_it_ends_with_the_same_bytes(whole, tmp_path):
         process.send_signal(signal.SIGKILL)
         process.wait()
     assert load_sweep(folder).manifest == whole.manifest
-    data = run_sweep(described(), folder, executor=Local(1))
+    data = run_sweep(described(), folder, workers=1)
     assert data.is_complete and content(folder) == content(whole.folder)
 
 
@@ -250,7 +270,7 @@ def test_what_is_there_is_not_solved_again(whole, copied):
     with pytest.raises(SweepError, match="1 of 3 shards are missing, first 1"):
         partial.verify()
     kept = (copied / "shards" / "000000.parquet").stat().st_mtime_ns
-    run_sweep(described(), copied, executor=Local(1))
+    run_sweep(described(), copied, workers=1)
     assert content(copied) == content(whole.folder)
     assert (copied / "shards" / "000000.parquet").stat().st_mtime_ns == kept
     runs = [json.loads(line) for line in (copied / "log.jsonl").read_text().splitlines()]
@@ -261,23 +281,39 @@ def test_what_is_there_is_not_solved_again(whole, copied):
 # bad input
 
 
-def test_executors_that_cannot_work(tmp_path, monkeypatch):
-    from knode_cosserat import _processes
+class Unable(concurrent.futures.Executor):
+    """An executor that is not there, or whose workers die."""
 
-    monkeypatch.setattr(_processes, "PATIENCE", 0.3)
-    for executor, message in (
-        (Dask("tcp://127.0.0.1:9"), "no Dask scheduler answers at"),
-        (Slurm(1, "slrum"), "cluster is 'slrum'; allowed is slurm, local or debug"),
-        (Slurm(1, "slurm"), "slurm: jobs cannot be submitted: "),
-        (Slurm(1, "local", {"timeout": 3}), "local: jobs cannot be submitted: "),
-    ):
-        with pytest.raises(SweepError, match=message):
-            run_sweep(described(), tmp_path / "a", executor=executor)
-    with pytest.raises(ValueError, match="executor is 'slurm'; allowed is a Local"):
-        run_sweep(described(), tmp_path / "b", executor="slurm")
-    work = Work(Plan.of(described()), None, {"jax": "0.1"})
+    def __init__(self, error, accepts=True):
+        self.error, self.accepts = error, accepts
+
+    def submit(self, work, /):
+        if not self.accepts:
+            raise self.error
+        future = concurrent.futures.Future()
+        future.set_exception(self.error)
+        return future
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"executor": "slurm"}, "executor is 'slurm'; allowed is one with submit"),
+        ({"workers": 0}, "workers is 0; allowed is a whole number from 1 on"),
+        ({"executor": Unable(OSError("no sbatch"), accepts=False)}, "jobs cannot be submitted: no sbatch$"),
+        ({"executor": Unable(BrokenProcessPool("a\nb"))}, "died: b; complete shards are kept, and the same"),
+        ({"executor": Unable(MemoryError())}, "died: MemoryError; complete"),
+        ({"executor": Unable(SweepError("full"))}, "^full$"),
+    ],
+)
+def test_executors_that_cannot_work(tmp_path, arguments, message):
+    with pytest.raises(SweepError, match=message):
+        run_sweep(described(), tmp_path / "a", **arguments)
+
+
+def test_a_worker_of_another_version_refuses_to_work(tmp_path):
     with pytest.raises(SweepError, match="the workers have another"):
-        work.solve(0)
+        Work(Plan.of(described()), tmp_path, (0,), {"jax": "0.1"})()
 
 
 def test_equal_columns_give_equal_bytes():
@@ -322,11 +358,16 @@ def test_a_dry_run_writes_nothing(tmp_path):
         (("--vary", "length"), "--vary must be NAME=LOW:HIGH"),
         (("--vary", "height=3"), "a name is given twice"),
         (("--dask", "tcp://a:1", "--workers", 2), "--dask without --workers"),
+        (("--dask", "tcp://127.0.0.1:9"), "no Dask scheduler answers at"),
         (("--slurm", "mem_gb=3"), "required is --cluster slurm"),
+        (("--cluster", "slrum"), "--cluster is 'slrum'; allowed is slurm, local or debug"),
+        (("--cluster", "slurm"), "--cluster slurm: jobs cannot be submitted: "),
+        (("--cluster", "local", "--slurm", "timeout=3"), "--cluster local: jobs cannot be submitted: "),
         (("--cluster", "debug", "--slurm", "mem_gb"), "--slurm must be NAME=VALUE"),
     ],
 )
-def test_the_command_refuses_mistakes_in_one_line(tmp_path, more, message):
+def test_the_command_refuses_mistakes_in_one_line(tmp_path, monkeypatch, more, message):
+    monkeypatch.setattr(_processes, "PATIENCE", 0.3)
     result = run(*COMMAND, "--out", tmp_path / "a", *more)
     assert result.exit_code == 2 and message in result.stderr and result.stderr.count("\n") == 1
-    assert not (tmp_path / "a").exists()
+    assert not (tmp_path / "a" / "sweep.json").exists()

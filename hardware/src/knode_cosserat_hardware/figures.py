@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -23,8 +22,7 @@ def load_cell(fit: LoadCellFit) -> Figure:
     """
     top = int(np.argmax(fit.weight))
     legs = (("loading", slice(0, top + 1), "o"), ("unloading", slice(top + 1, None), "s"))
-    with style():
-        figure = new_figure(TWO_COLUMNS, 2.6)
+    with new_figure(TWO_COLUMNS, 2.6) as figure:
         line, residual = figure.subplots(1, 2)
         ends = np.array([fit.weight.min(), fit.weight.max()])
         label = f"{fit.gain:.5g} ± {fit.gain_error:.1g} N per unit"

@@ -118,22 +118,20 @@ class Report(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """Options of the rows of recordings, and of their simulation."""
+    """Options of the rows of recordings, and of their simulation.
 
-    config: Annotated[
-        Path | None,
-        option(
-            "YAML",
-            "Meaning of the recordings' topics or columns.",
-            show_default="the paper's robot for bags; titles and comments for tables",
-        ),
-    ] = None
-    start: Annotated[
-        float | None,
-        option("S", "Start time in the recording (s), at which the robot rests.", show_default="0"),
-    ] = None
-    seconds: Annotated[float | None, option("S", "Duration used (s).", show_default="to the end")] = None
-    dt: Annotated[float, option("S", "Time between rows of a recording (s).")] = 0.0125
+    Options:
+        config (--config YAML): Meaning of the recordings' topics or columns. Default: the paper's robot for
+            bags; titles and comments for tables.
+        start (--start S): Start time in the recording (s), at which the robot rests. Default: 0.
+        seconds (--seconds S): Duration used (s). Default: to the end.
+        dt (--dt S): Time between rows of a recording (s).
+    """
+
+    config: Path | None = None
+    start: float | None = None
+    seconds: float | None = None
+    dt: float = 0.0125
     space: Space = "lobatto4"
 
     @property
@@ -388,6 +386,7 @@ def shows_progress(progress: bool | None) -> bool:
 def figures() -> Any:
     """Return the module of figures. Raises `ImportError` without matplotlib."""
     from knode_cosserat import figures
+    from knode_cosserat.figures.style import require_matplotlib
 
-    figures.require_matplotlib()
+    require_matplotlib()
     return figures

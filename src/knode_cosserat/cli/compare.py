@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import enum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-import typer
 
 from knode_cosserat.cli.arguments import (
     Changes,
@@ -23,13 +21,12 @@ from knode_cosserat.cli.arguments import (
     load_ensemble_folder,
     load_system,
     load_trajectory_file,
-    option,
     require_writable,
     trajectories_by_name,
 )
 from knode_cosserat.cli.learn import evaluate_on_recordings
 from knode_cosserat.cli.output import table, write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 
 if TYPE_CHECKING:
     from knode_cosserat.learning.ensemble import Ensemble
@@ -37,65 +34,51 @@ if TYPE_CHECKING:
     from knode_cosserat.trajectory import Trajectory
 
 
-class _Kind(enum.StrEnum):
-    """Kinds of figures that `plot` draws."""
-
-    overview = "overview"
-    shape = "shape"
-    path = "path"
-    tip = "tip"
-    states = "states"
-    tensions = "tensions"
-    error = "error"
-    compare = "compare"
-
-
-class _Viewpoint(enum.StrEnum):
-    """Projections of a robot: in space, or onto a coordinate plane."""
-
-    xyz = "xyz"
-    xy = "xy"
-    xz = "xz"
-    yz = "yz"
-
-
+#: kinds of figures that `plot` draws
+Kind = Literal["overview", "shape", "path", "tip", "states", "tensions", "error", "compare"]
+#: projections of a robot: in space, or onto a coordinate plane
+Viewpoint = Literal["xyz", "xy", "xz", "yz"]
 Trajectories = Annotated[list[Path], argument("TRAJECTORY…", "Trajectory files; the first is the reference.")]
 
 
 class _Look(NamedTuple):
-    """View and width of a figure."""
+    """View and width of a figure.
 
-    view: Annotated[
-        _Viewpoint, typer.Option(help="View in space (xyz), or projection onto a coordinate plane.")
-    ] = _Viewpoint.xyz
-    columns: Annotated[
-        int, option("N", "Width of the figure: one or two columns of a paper.", min=1, max=2)
-    ] = 1
+    Options:
+        view (--view): View in space (xyz), or projection onto a coordinate plane.
+        columns (--columns N): Width of the figure: one or two columns of a paper.
+    """
+
+    view: Viewpoint = "xyz"
+    columns: int = 1
 
     def of(self, trajectory: Trajectory) -> str | None:
         """Return the name of the view; None for the only view of a planar system."""
         is_planar = np.shape(trajectory.position)[-1] == 2
-        return None if is_planar and self.view is _Viewpoint.xyz else self.view.value
+        return None if is_planar and self.view == "xyz" else self.view
 
 
 class _Pace(NamedTuple):
-    """Frame rate and speed of an animation."""
+    """Frame rate and speed of an animation.
 
-    fps: Annotated[float, option("F", "Frames per second, 1 to 50.")] = 25.0
-    speed: Annotated[float, option("S", "Playback speed: 1 is real time, 0.5 is half speed.")] = 1.0
+    Options:
+        fps (--fps F): Frames per second, 1 to 50.
+        speed (--speed S): Playback speed: 1 is real time, 0.5 is half speed.
+    """
+
+    fps: float = 25.0
+    speed: float = 1.0
 
 
 class _Predictor(NamedTuple):
-    """Prediction, or what predicts."""
+    """Prediction, or what predicts.
 
-    prediction: Annotated[
-        str,
-        argument(
-            "PREDICTION",
-            "Trajectory file; or a robot, model or ensemble (a folder; its mean is compared), "
-            "which is simulated under the controls of each reference.",
-        ),
-    ]
+    Options:
+        prediction (PREDICTION): Trajectory file; or a robot, model or ensemble (a folder; its mean is
+            compared), which is simulated under the controls of each reference.
+    """
+
+    prediction: str
     changes: Changes = None
 
     def load(self) -> Trajectory | System | Ensemble:
@@ -108,25 +91,13 @@ class _Predictor(NamedTuple):
         return load_trajectory_file(Path(name))
 
 
-@app.command(
-    epilog=examples(
-        "evaluate prediction.nc truth.nc",
-        "evaluate model truth.nc",
-        "evaluate delrin-tendon-robot truth.nc --set youngs_modulus=10e9 --rows 100",
-        "evaluate found.yaml unseen.bag --json",
-        "evaluate my-robot.yaml a.csv b.csv --config my-recording.yaml --start 1",
-    )
-)
+@app.command()
 def evaluate(
     predictor: _Predictor,
-    references: Annotated[
-        list[Path], argument("REFERENCE", "Trajectory files (.nc); or recordings: bags or tables.")
-    ],
+    references: list[Path],
     sampling: Sampling,
     report: Report,
-    rows: Annotated[
-        int | None, option("N", "Compare only the first N rows; the paper's tables use 100.", min=1)
-    ] = None,
+    rows: int | None = None,
 ) -> None:
     """Compute the error of a prediction against references.
 
@@ -137,6 +108,17 @@ def evaluate(
 
     A recording is predicted from its measured tensions, starting at the equilibrium under the first ones.
     Rotations are relative to the start. --config, --start, --seconds, --dt and --space apply to recordings.
+
+    Options:
+        references (REFERENCE): Trajectory files (.nc); or recordings: bags or tables.
+        rows (--rows N≥1): Compare only the first N rows; the paper's tables use 100.
+
+    Examples:
+        evaluate prediction.nc truth.nc
+        evaluate model truth.nc
+        evaluate delrin-tendon-robot truth.nc --set youngs_modulus=10e9 --rows 100
+        evaluate found.yaml unseen.bag --json
+        evaluate my-robot.yaml a.csv b.csv --config my-recording.yaml --start 1
     """
     import knode_cosserat as kc
 
@@ -168,20 +150,12 @@ def evaluate(
     write_output(report.as_json, {"prediction": prediction, "references": compared}, table(lines))
 
 
-@app.command(
-    epilog=examples(
-        "plot truth.nc --out truth.png",
-        "plot truth.nc --kind shape --view xz --out side.pdf",
-        "plot truth.nc prediction.nc --kind error --out error.svg",
-    )
-)
+@app.command()
 def plot(
     trajectories: Trajectories,
     out: Annotated[Path, Picture],
     look: _Look,
-    kind: Annotated[
-        _Kind, typer.Option(help="Kind of figure.", show_default="overview; compare for several trajectories")
-    ] = _Kind.overview,
+    kind: Kind = "overview",
     as_json: Json = False,
 ) -> None:
     """Draw one trajectory, or overlay several.
@@ -189,43 +163,45 @@ def plot(
     For one trajectory: overview, shape (shapes over time), tensions. For any number: path (of the tip), tip
     and states (over time). For two or more: error (distance of the tips from the first trajectory's) and
     compare (shapes and tips).
+
+    Options:
+        kind (--kind): Kind of figure. Default: overview; compare for several trajectories.
+
+    Examples:
+        plot truth.nc --out truth.png
+        plot truth.nc --kind shape --view xz --out side.pdf
+        plot truth.nc prediction.nc --kind error --out error.svg
     """
     require_writable(figure=out)
     drawing = figures()
     states = _distinct_trajectories(trajectories)
     first, *others = states.values()
-    if others and kind is _Kind.overview:
-        kind = _Kind.compare
-    if others and kind in (_Kind.shape, _Kind.tensions):
+    if others and kind == "overview":
+        kind = "compare"
+    if others and kind in ("shape", "tensions"):
         raise ValueError(f"--kind {kind} draws one trajectory; {len(states)} were given. Use --kind compare")
-    if not others and kind in (_Kind.error, _Kind.compare):
+    if not others and kind in ("error", "compare"):
         raise ValueError(f"--kind {kind} needs a reference and at least one other trajectory; one was given")
     rest = dict(list(states.items())[1:])
     looks: dict[str, Any] = {"columns": look.columns}
     draw = {
-        _Kind.overview: lambda: drawing.overview(first),
-        _Kind.shape: lambda: drawing.shape(first, view=look.of(first), **looks),
-        _Kind.path: lambda: drawing.path(states, view=look.of(first), **looks),
-        _Kind.tip: lambda: drawing.tips(states, **looks),
-        _Kind.states: lambda: drawing.states(states, **looks),
-        _Kind.tensions: lambda: drawing.tensions(first, **looks),
-        _Kind.error: lambda: drawing.error(first, rest, **looks),
-        _Kind.compare: lambda: drawing.compare(first, rest),
+        "overview": lambda: drawing.overview(first),
+        "shape": lambda: drawing.shape(first, view=look.of(first), **looks),
+        "path": lambda: drawing.path(states, view=look.of(first), **looks),
+        "tip": lambda: drawing.tips(states, **looks),
+        "states": lambda: drawing.states(states, **looks),
+        "tensions": lambda: drawing.tensions(first, **looks),
+        "error": lambda: drawing.error(first, rest, **looks),
+        "compare": lambda: drawing.compare(first, rest),
     }
     draw[kind]().savefig(out)
-    write_output(
-        as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind.value}, [], out=out
-    )
+    write_output(as_json, {"trajectories": [str(path) for path in trajectories], "kind": kind}, [], out=out)
 
 
-@app.command(
-    epilog=examples(
-        "animate truth.nc --out truth.gif", "animate truth.nc prediction.nc --fps 20 --view xz --out both.mp4"
-    )
-)
+@app.command()
 def animate(
     trajectories: Trajectories,
-    out: Annotated[Path, option("FILE", "Write the animation to this GIF or MP4 file.")],
+    out: Path,
     pace: _Pace,
     look: _Look,
     as_json: Json = False,
@@ -233,6 +209,13 @@ def animate(
     """Animate one trajectory, or several overlaid.
 
     A GIF needs matplotlib; an MP4 also needs the program ffmpeg.
+
+    Options:
+        out (--out FILE): Write the animation to this GIF or MP4 file.
+
+    Examples:
+        animate truth.nc --out truth.gif
+        animate truth.nc prediction.nc --fps 20 --view xz --out both.mp4
     """
     require_writable(out)
     drawing = figures()

@@ -13,7 +13,7 @@ import typer
 from knode_cosserat._files.csv_rows import size_excess
 from knode_cosserat.cli.arguments import Json, Nominal, load_system, option, parse_limits, require_writable
 from knode_cosserat.cli.output import write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 from knode_cosserat.recordings.formats import written_suffixes
 from knode_cosserat.rods.wrapped import nominal_model
 
@@ -50,21 +50,20 @@ Method = Annotated[
 
 
 class _Task(NamedTuple):
-    """Reference of the tip, and the controlled robot."""
+    """Reference of the tip, and the controlled robot.
 
-    reference: Annotated[
-        str | None,
-        option(
-            "NAME|CSV",
-            "Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6, or a CSV table. The "
-            "centre is at x=, y=, z= (m), in plane=xy, yz or xz.",
-        ),
-    ] = None
-    seconds: Annotated[float, option("S", "Duration (s).")] = 10.0
-    plant: Annotated[
-        str | None, option("ROBOT", "Robot that is controlled, simulated.", show_default="the model itself")
-    ] = None
-    noise: Annotated[float, option("FACTOR", "Noise of the tip sensor, in multiples of 0.2 mm.")] = 0.0
+    Options:
+        reference (--reference NAME|CSV): Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6,
+            or a CSV table. The centre is at x=, y=, z= (m), in plane=xy, yz or xz.
+        seconds (--seconds S): Duration (s).
+        plant (--plant ROBOT): Robot that is controlled, simulated. Default: the model itself.
+        noise (--noise FACTOR): Noise of the tip sensor, in multiples of 0.2 mm.
+    """
+
+    reference: str | None = None
+    seconds: float = 10.0
+    plant: str | None = None
+    noise: float = 0.0
 
     def plant_of(self, model: System, dt: float) -> Any:
         """Return the controlled robot: another simulator's, another robot or the model itself."""
@@ -79,32 +78,29 @@ class _Task(NamedTuple):
 
 
 class _Method(NamedTuple):
-    """Controller and limits."""
+    """Controller and limits.
+
+    Options:
+        dt (--dt S): Period of the control (s).
+        realtime (--realtime): Choose the longest prediction that this computer computes in 60 % of a period.
+        low (--low NUMBERS): Least control: one number, or one for each.
+        high (--high NUMBERS): Greatest control: one number, or one for each.
+        rate (--rate PER_S): Greatest change of a control in 1 s.
+        lag (--lag S): Time constant of the motors that the controller expects (s).
+        adapt (--adapt NAME): Adapt this parameter of the model while running; may be repeated.
+        deviation (--tip-deviation M): Standard deviation of the measured tip for the observer (m): noise and
+            error of the model.
+    """
 
     method: Method = "predictive"
-    dt: Annotated[float, option("S", "Period of the control (s).")] = 0.05
-    realtime: Annotated[
-        bool,
-        typer.Option(
-            "--realtime",
-            help="Choose the longest prediction that this computer computes in 60 % of a period.",
-        ),
-    ] = False
-    low: Annotated[str, option("NUMBERS", "Least control: one number, or one for each.")] = "0"
-    high: Annotated[str, option("NUMBERS", "Greatest control: one number, or one for each.")] = "10"
-    rate: Annotated[float, option("PER_S", "Greatest change of a control in 1 s.")] = 40.0
-    lag: Annotated[float, option("S", "Time constant of the motors that the controller expects (s).")] = 0.0
-    adapt: Annotated[
-        list[str] | None, option("NAME", "Adapt this parameter of the model while running; may be repeated.")
-    ] = None
-    deviation: Annotated[
-        float,
-        option(
-            "M",
-            "Standard deviation of the measured tip for the observer (m): noise and error of the model.",
-            "--tip-deviation",
-        ),
-    ] = 2e-4
+    dt: float = 0.05
+    realtime: bool = False
+    low: str = "0"
+    high: str = "10"
+    rate: float = 40.0
+    lag: float = 0.0
+    adapt: list[str] | None = None
+    deviation: float = 2e-4
 
     @property
     def name(self) -> str:
@@ -124,9 +120,15 @@ class _Method(NamedTuple):
 
 
 class _Output(NamedTuple):
-    """Files and output of a closed loop."""
+    """Files and output of a closed loop.
 
-    out: Annotated[Path | None, option("FILE", "Write one row a period to this CSV file.")] = None
+    Options:
+        out (--out FILE): Write one row a period to this CSV file.
+        states (--states FILE): Write the estimated states as a trajectory (.nc), to view or plot.
+        figure (--figure FILE): Draw path, error and controls into this file.
+    """
+
+    out: Path | None = None
     recording: Annotated[
         Path | None,
         option(
@@ -134,41 +136,39 @@ class _Output(NamedTuple):
             f"Write the measured tip and the controls as a recording: {', '.join(written_suffixes())}.",
         ),
     ] = None
-    states: Annotated[
-        Path | None, option("FILE", "Write the estimated states as a trajectory (.nc), to view or plot.")
-    ] = None
-    figure: Annotated[Path | None, option("FILE", "Draw path, error and controls into this file.")] = None
+    states: Path | None = None
+    figure: Path | None = None
     as_json: Json = False
 
 
 class _Viewer(NamedTuple):
-    """Viewer with a target."""
+    """Viewer with a target.
 
-    live: Annotated[
-        bool, typer.Option("--live", help="Open the viewer: the tip follows a target that you drag.")
-    ] = False
-    export: Annotated[
-        Path | None, option("FILE", "With --live: at the end, write the last run as one HTML file.")
-    ] = None
-    port: Annotated[
-        int, option("N", "With --live: port of the local web server.", show_default="any free port")
-    ] = 0
-    no_open: Annotated[bool, typer.Option("--no-open", help="With --live: do not open the browser.")] = False
+    Options:
+        live (--live): Open the viewer: the tip follows a target that you drag.
+        export (--export FILE): With --live: at the end, write the last run as one HTML file.
+        port (--port N): With --live: port of the local web server. Default: any free port.
+        no_open (--no-open): With --live: do not open the browser.
+    """
+
+    live: bool = False
+    export: Path | None = None
+    port: int = 0
+    no_open: bool = False
 
 
-@app.command(
-    epilog=examples(
-        "control delrin-tendon-robot --reference circle:radius=0.1,period=4",
-        "control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus",
-        "control delrin-tendon-robot --live",
-    )
-)
+@app.command()
 def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, viewer: _Viewer) -> None:
     """Control the tip of a robot in closed loop, and report the tracking error.
 
     ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so
     that the effect of a wrong model is seen. Controls stay within --low, --high and --rate in every period.
     With --live, the target is dragged in the browser, and the report is of the last run, until Ctrl-C.
+
+    Examples:
+        control delrin-tendon-robot --reference circle:radius=0.1,period=4
+        control my-model.knode --plant my-robot.yaml --reference path.csv --adapt youngs_modulus
+        control delrin-tendon-robot --live
     """
     if viewer.live == (task.reference is not None):
         raise ValueError("give either --reference, or --live to drag the target in the browser")

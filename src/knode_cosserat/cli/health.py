@@ -6,14 +6,18 @@ import typer
 
 from knode_cosserat.cli.arguments import Json
 from knode_cosserat.cli.output import write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 
 
-@app.command(epilog=examples("doctor", "doctor --json"))
+@app.command()
 def doctor(as_json: Json = False) -> None:
     """Check the installation with a short simulation.
 
     Prints versions, devices, cache and precision. The exit status is 1 if a check fails.
+
+    Examples:
+        doctor
+        doctor --json
     """
     from knode_cosserat.diagnosis import doctor as check
 

@@ -15,13 +15,12 @@ from knode_cosserat.cli.arguments import (
     Report,
     Space,
     figures,
-    option,
     parse_limits,
     parse_numbers,
     require_writable,
 )
 from knode_cosserat.cli.output import best_so_far, vector_text, write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 from knode_cosserat.cli.robots import Held
 from knode_cosserat.cli.summaries import stability_summary
 from knode_cosserat.errors import first_line
@@ -32,23 +31,17 @@ if TYPE_CHECKING:
 
 
 class _Limits(NamedTuple):
-    """Limits of the controls."""
+    """Limits of the controls.
 
-    low: Annotated[
-        str,
-        option(
-            "LIMITS",
-            "Lower limits of the controls in their units (tensions: N): one number, or one per control.",
-        ),
-    ] = "0"
-    high: Annotated[
-        str,
-        option(
-            "LIMITS",
-            "Upper limits of the controls in their units (tensions: N): one number, or one per control, "
-            "such as 8,8,10,10.",
-        ),
-    ] = "10"
+    Options:
+        low (--low LIMITS): Lower limits of the controls in their units (tensions: N): one number, or one per
+            control.
+        high (--high LIMITS): Upper limits of the controls in their units (tensions: N): one number, or one
+            per control, such as 8,8,10,10.
+    """
+
+    low: str = "0"
+    high: str = "10"
 
     def of(self, system: System) -> tuple[float | list[float], float | list[float]]:
         """Return the lower and the upper limits of a robot's controls."""
@@ -61,17 +54,17 @@ FARTHEST = 10.0
 
 
 class _Target(NamedTuple):
-    """Target of the tip."""
+    """Target of the tip.
 
-    position: Annotated[
-        str | None, option("X,Y,Z", "Target position of the tip (m), such as 0.1,0.05,0.58.")
-    ] = None
-    quaternion: Annotated[
-        str | None, option("W,X,Y,Z", "Target orientation of the tip: a quaternion, scalar first.")
-    ] = None
-    tolerance: Annotated[
-        float, option("X", "Tolerance: position error as a fraction of the length, angle error in rad.")
-    ] = 1e-4
+    Options:
+        position (--position X,Y,Z): Target position of the tip (m), such as 0.1,0.05,0.58.
+        quaternion (--quaternion W,X,Y,Z): Target orientation of the tip: a quaternion, scalar first.
+        tolerance (--tolerance X): Tolerance: position error as a fraction of the length, angle error in rad.
+    """
+
+    position: str | None = None
+    quaternion: str | None = None
+    tolerance: float = 1e-4
 
     def pose(self, length: float) -> tuple[list[float] | None, list[float] | None]:
         """Return position (m) and quaternion. Raises `ValueError` for a position that seems to be in mm."""
@@ -92,12 +85,7 @@ class _Target(NamedTuple):
         return target, orientation
 
 
-@app.command(
-    epilog=examples(
-        "reach delrin-tendon-robot --position 0.17404 0.0838 0.60002 --high 10",
-        "reach delrin-tendon-robot --quaternion 0.98 -0.1 0.17 0 --low 1 --high 8,8,10,10 --tolerance 1e-2",
-    )
-)
+@app.command()
 def reach(
     model: Model, target: _Target, limits: _Limits, space: Space = "lobatto2", as_json: Json = False
 ) -> None:
@@ -105,6 +93,10 @@ def reach(
 
     Among several solutions it returns the one with the smallest controls above the lower limits. If the pose
     cannot be reached, it returns the nearest pose and says so.
+
+    Examples:
+        reach delrin-tendon-robot --position 0.17404 0.0838 0.60002 --high 10
+        reach delrin-tendon-robot --quaternion 0.98 -0.1 0.17 0 --low 1 --high 8,8,10,10 --tolerance 1e-2
     """
     import knode_cosserat as kc
     from knode_cosserat.controls import labels, units
@@ -165,20 +157,23 @@ def reach(
     write_output(as_json, facts, lines)
 
 
-@app.command(
-    epilog=examples(
-        "modes delrin-routed-tendon-robot --tension 7,5,5,7",
-        "modes my-rod.yaml --control base_z=0.1 --count 4 --picture modes.png",
-    )
-)
+@app.command()
 def modes(
     model: Model,
     held: Held,
-    number: Annotated[int, option("N", "Largest number of modes.", "--count", min=1)] = 10,
+    number: int = 10,
     picture: Annotated[Path | None, Picture] = None,
     as_json: Json = False,
 ) -> None:
-    """Compute the modes of vibration about the equilibrium under a constant control."""
+    """Compute the modes of vibration about the equilibrium under a constant control.
+
+    Options:
+        number (--count N≥1): Largest number of modes.
+
+    Examples:
+        modes delrin-routed-tendon-robot --tension 7,5,5,7
+        modes my-rod.yaml --control base_z=0.1 --count 4 --picture modes.png
+    """
     require_writable(picture)
     drawing = figures() if picture else None
     import knode_cosserat as kc
@@ -195,26 +190,31 @@ def modes(
 
 
 class _Samples(NamedTuple):
-    """Sampled equilibria and their files."""
+    """Sampled equilibria and their files.
 
-    out: Annotated[Path, option("FILE", "Write controls and tip poses to this .nc, .csv or .npz file.")]
+    Options:
+        out (--out FILE): Write controls and tip poses to this .nc, .csv or .npz file.
+        number (--count N): Number of equilibria to compute.
+        seed (--seed N≥0): Random seed of the samples.
+    """
+
+    out: Path
     picture: Annotated[Path | None, Picture] = None
-    number: Annotated[int, option("N", "Number of equilibria to compute.", "--count")] = 10_000
-    seed: Annotated[int, option("N", "Random seed of the samples.", min=0)] = 0
+    number: int = 10_000
+    seed: int = 0
 
 
-@app.command(
-    epilog=examples(
-        "workspace delrin-tendon-robot --count 100000 --out workspace.nc",
-        "workspace my-robot.yaml --high 8 --count 4096 --out workspace.csv --picture workspace.png",
-    )
-)
+@app.command()
 def workspace(
     model: Model, samples: _Samples, limits: _Limits, report: Report, space: Space = "lobatto2"
 ) -> None:
     """Sample the tip poses that a robot reaches at rest.
 
     Controls are distributed evenly between their limits.
+
+    Examples:
+        workspace delrin-tendon-robot --count 100000 --out workspace.nc
+        workspace my-robot.yaml --high 8 --count 4096 --out workspace.csv --picture workspace.png
     """
     from knode_cosserat.statics.workspace import FORMATS
 

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
-import enum
 import functools
 import math
 import re
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
-
-import typer
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
@@ -26,11 +23,10 @@ from knode_cosserat.cli.arguments import (
     is_recording,
     load_recordings,
     load_trajectory_file,
-    option,
     require_writable,
 )
 from knode_cosserat.cli.output import best_so_far, write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 from knode_cosserat.cli.summaries import residual_summary
 from knode_cosserat.recordings.formats import read_suffixes
 
@@ -39,43 +35,35 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
 
 
-class _Preset(enum.StrEnum):
-    """Presets of the learning method."""
-
-    best = "best"
-    paper = "paper"
-    network = "network"
-
-
 class _Data(NamedTuple):
-    """Training and validation data."""
+    """Training and validation data.
 
-    trajectories: Annotated[
-        list[Path], argument("TRAJECTORY", "Training trajectories (.nc) with full states.")
-    ]
-    rows: Annotated[
-        int | None, option("N", "Use the first N rows of each trajectory only; the paper uses 30.", min=1)
-    ] = None
-    held_out: Annotated[
-        list[Path] | None, option("FILE", "Validation trajectory for early stopping; may be repeated.")
-    ] = None
+    Options:
+        trajectories (TRAJECTORY): Training trajectories (.nc) with full states.
+        rows (--rows N≥1): Use the first N rows of each trajectory only; the paper uses 30.
+        held_out (--held-out FILE): Validation trajectory for early stopping; may be repeated.
+    """
+
+    trajectories: list[Path]
+    rows: int | None = None
+    held_out: list[Path] | None = None
 
 
 class _Method(NamedTuple):
-    """Method of learning."""
+    """Method of learning.
 
-    preset: Annotated[
-        _Preset,
-        typer.Option(
-            help="best: structured residual by sparse regression. paper: the paper's network and training. "
-            "network: a network without the paper's constraints."
-        ),
-    ] = _Preset.best
-    seed: Annotated[int | None, option("N", "Random seed.", show_default="0")] = None
-    seeds: Annotated[str | None, option("N,N,…", "Several random seeds: train one model for each.")] = None
-    epochs: Annotated[
-        int | None, option("N", "Training epochs of a network.", show_default="the preset's")
-    ] = None
+    Options:
+        preset (--preset): best: structured residual by sparse regression. paper: the paper's network and
+            training. network: a network without the paper's constraints.
+        seed (--seed N): Random seed. Default: 0.
+        seeds (--seeds N,N,…): Several random seeds: train one model for each.
+        epochs (--epochs N): Training epochs of a network. Default: the preset's.
+    """
+
+    preset: Literal["best", "paper", "network"] = "best"
+    seed: int | None = None
+    seeds: str | None = None
+    epochs: int | None = None
 
     def numbers(self) -> int | tuple[int, ...]:
         """Return the seed of one model, or the seeds of several."""
@@ -93,14 +81,14 @@ class _Method(NamedTuple):
         from knode_cosserat.learning.config import FitConfig, StructuredOptions
 
         seed = self.numbers()
-        if self.preset is _Preset.best:
+        if self.preset == "best":
             if self.epochs is not None:
                 raise ValueError(
                     "--epochs is for networks; the preset best has none. Use --preset paper or --preset "
                     "network"
                 )
             return FitConfig(StructuredOptions(resample=isinstance(seed, tuple)), seed=seed)
-        config = FitConfig.paper(seed) if self.preset is _Preset.paper else FitConfig.network(seed)
+        config = FitConfig.paper(seed) if self.preset == "paper" else FitConfig.network(seed)
         if self.epochs is None or config.segments is None:
             return config
         segments = dataclasses.replace(config.segments, epochs=self.epochs)
@@ -108,30 +96,31 @@ class _Method(NamedTuple):
 
 
 class _Files(NamedTuple):
-    """Files of a fit."""
+    """Files of a fit.
 
-    out: Annotated[
-        Path, option("PATH", "Write the model to this file; with --seeds, write an ensemble to this folder.")
-    ]
-    checkpoint: Annotated[
-        Path | None, option("DIR", "Save the training state in this folder, and resume from it.")
-    ] = None
-    log: Annotated[Path | None, option("DIR", "Write TensorBoard event files to this folder.")] = None
+    Options:
+        out (--out PATH): Write the model to this file; with --seeds, write an ensemble to this folder.
+        checkpoint (--checkpoint DIR): Save the training state in this folder, and resume from it.
+        log (--log DIR): Write TensorBoard event files to this folder.
+    """
+
+    out: Path
+    checkpoint: Path | None = None
+    log: Path | None = None
     figure: Annotated[Path | None, Picture] = None
 
 
-@app.command(
-    epilog=examples(
-        "fit delrin-tendon-robot a.nc b.nc --set youngs_modulus=10e9 --out model",
-        "fit my-robot.yaml a.nc b.nc --preset paper --seeds 0,1,2 --checkpoint saved --out model",
-    )
-)
+@app.command()
 def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: Report) -> None:
     """Learn a residual model from trajectories.
 
     The residual is the difference between the robot's physics and the trajectories. Trajectories have full
     states, from a simulation or from state estimation; use `identify` for recordings. The resulting model is
     accepted wherever a robot is.
+
+    Examples:
+        fit delrin-tendon-robot a.nc b.nc --set youngs_modulus=10e9 --out model
+        fit my-robot.yaml a.nc b.nc --preset paper --seeds 0,1,2 --checkpoint saved --out model
     """
     robot, out, figure = nominal.robot, files.out, files.figure
     recordings = [path for path in data.trajectories if is_recording(str(path))]
@@ -148,8 +137,7 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
     require_writable(
         None if several else out, figure, (out if several else None, files.checkpoint, files.log)
     )
-    if figure:
-        figures()
+    drawing = figures() if figure else None
     from knode_cosserat.learning.states import fit_states as learn
     from knode_cosserat.solvers.segments import DataError
 
@@ -172,15 +160,13 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
         raise ValueError(text) from None
     seconds = perf_counter() - began
     result.save(out)
-    if figure:
-        from knode_cosserat.evaluation.learning_figures import residual
-
-        residual(next(iter(result)) if several else result, training[0]).savefig(figure)
+    if drawing:
+        drawing.residual(next(iter(result)) if several else result, training[0]).savefig(figure)
     count = sum(len(one.time) for one in training)
     subject = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
         f"learned a residual model of {robot} from {subject} ({count} rows): "
-        f"preset {method.preset.value}, {seconds:.2f} s"
+        f"preset {method.preset}, {seconds:.2f} s"
     ]
     models = []
     for model in result if several else [result]:
@@ -190,7 +176,7 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
     write_output(
         report.as_json,
         {
-            "robot": robot, "preset": method.preset.value,
+            "robot": robot, "preset": method.preset,
             "trajectories": [str(path) for path in data.trajectories], "rows": count,
             "computing_time": round(seconds, 4), "models": models,
         },
@@ -207,32 +193,23 @@ FINELY = 0.0125
 
 
 class _Search(NamedTuple):
-    """Search, and its files."""
+    """Search, and its files.
 
-    out: Annotated[Path, option("FILE", "Write the identified robot to this YAML file.")]
-    effects: Annotated[
-        list[str] | None,
-        option(
-            "NAME",
-            "Physical effect to identify, such as friction; may be repeated.",
-            "--effect",
-            show_default="selected by recordings left out",
-        ),
-    ] = None
-    checkpoint: Annotated[
-        Path | None, option("DIR", "Keep finished searches here; an interrupted run resumes.")
-    ] = None
-    minutes: Annotated[
-        float, option("MINUTES", "End after this time with the best robot so far.", show_default="no limit")
-    ] = math.inf
+    Options:
+        out (--out FILE): Write the identified robot to this YAML file.
+        effects (--effect NAME): Physical effect to identify, such as friction; may be repeated. Default:
+            selected by recordings left out.
+        checkpoint (--checkpoint DIR): Keep finished searches here; an interrupted run resumes.
+        minutes (--minutes MINUTES): End after this time with the best robot so far. Default: no limit.
+    """
+
+    out: Path
+    effects: list[str] | None = None
+    checkpoint: Path | None = None
+    minutes: float = math.inf
 
 
-@app.command(
-    epilog=examples(
-        "identify delrin-tendon-robot a.bag b.bag --out found.yaml",
-        "identify my-robot.yaml a.csv b.csv --config my-recording.yaml --out found.yaml",
-    )
-)
+@app.command()
 def identify(
     nominal: Nominal,
     recordings: Annotated[list[Path], argument("RECORDING", f"Recordings ({', '.join(read_suffixes())}).")],
@@ -245,6 +222,10 @@ def identify(
     ROBOT is the nominal robot, from measured dimensions, masses and data sheets. An effect is kept if it
     lowers the error on recordings left out of the search. The result must pass trial simulations with larger
     and with random tensions. When --minutes are over, or at Ctrl-C, the best robot so far is written.
+
+    Examples:
+        identify delrin-tendon-robot a.bag b.bag --out found.yaml
+        identify my-robot.yaml a.csv b.csv --config my-recording.yaml --out found.yaml
     """
     require_writable(search.out)
     import knode_cosserat as kc

@@ -24,7 +24,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.schemes.result import SimulationError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
 PROGRAM = "knode-cosserat"
 COMMANDS = "knode_cosserat.commands"
@@ -96,11 +96,58 @@ class _Command(TyperCommand):
 
 
 class _App(typer.Typer):
-    """Typer application with commands of class `_Command`, whose functions may have groups of options."""
+    """Typer application with commands of class `_Command`, whose functions may have groups of options.
 
-    def command(self, *arguments: Any, **options: Any) -> Any:
-        register = super().command(*arguments, **{"cls": _Command, **options})
-        return lambda function: register(_ungrouped(function))
+    The docstring of a command states its options and examples, that of a group (a named tuple) its options.
+    """
+
+    def command(self, *arguments: Any, **settings: Any) -> Any:
+        def register(function: Callable[..., Any]) -> Any:
+            stated = _sections(function)
+            if stated["Examples"]:
+                settings["epilog"] = examples(*stated["Examples"])
+            command = _ungrouped(function)
+            command.__doc__ = "\n".join(stated["Description"])
+            return typer.Typer.command(self, *arguments, **{"cls": _Command, **settings})(command)
+
+        return register
+
+
+def _sections(stating: Callable[..., Any]) -> dict[str, list[str]]:
+    """Return the lines of the description in a docstring, and the entries of its sections."""
+    sections: dict[str, list[str]] = {"Description": [], "Options": [], "Examples": []}
+    entries = sections["Description"]
+    for line in inspect.cleandoc(stating.__doc__ or "").splitlines():
+        if line.endswith(":") and line[:-1] in sections:
+            entries = sections[line[:-1]]
+        elif entries is sections["Description"]:
+            entries.append(line)
+        elif line.startswith(" " * 8):
+            entries[-1] += f" {line.strip()}"
+        elif line.strip():
+            entries.append(line.strip())
+    return sections
+
+
+#: "rows (--rows N≥1): Number of rows. Default: all." is an option, and "robot (ROBOT): …" an argument
+_ENTRY = re.compile(
+    r"(?P<name>\w+) \((?P<option>--[\w-]+)? ?(?P<metavar>[^≥)]*)(≥(?P<least>\d+))?\): (?P<help>.*)"
+)
+
+
+def _options(stating: Callable[..., Any]) -> dict[str, Any]:
+    """Return the options and arguments that a docstring states, by parameter."""
+    options = {}
+    for entry in _sections(stating)["Options"]:
+        if not (match := _ENTRY.fullmatch(entry)):
+            raise SyntaxError(f"{stating.__name__}: not an option: {entry}")
+        words, _, default = match["help"].partition(" Default: ")
+        settings: dict[str, Any] = {"metavar": match["metavar"] or None, "help": words}
+        settings |= {"show_default": default.removesuffix(".")} if default else {}
+        settings |= {"min": int(match["least"])} if match["least"] else {}
+        option = match["option"]
+        options[match["name"]] = typer.Option(option, **settings) if option else typer.Argument(**settings)
+    return options
 
 
 def _ungrouped(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -110,17 +157,22 @@ def _ungrouped(function: Callable[..., Any]) -> Callable[..., Any]:
     """
     parameters: list[inspect.Parameter] = []
     groups: dict[str, Any] = {}
+
+    def add(name: str, default: Any, hint: Any, options: Mapping[str, Any]) -> None:
+        hint = Annotated[hint, options[name]] if name in options else hint
+        parameters.append(
+            inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=hint)
+        )
+
+    own = _options(function)
     for name, parameter in inspect.signature(function, eval_str=True).parameters.items():
         group: Any = parameter.annotation
         if not hasattr(group, "_fields"):
-            parameters.append(parameter.replace(kind=parameter.KEYWORD_ONLY))
+            add(name, parameter.default, group, own)
             continue
-        groups[name] = group
+        groups[name], stated = group, _options(group)
         for field, hint in get_type_hints(group, include_extras=True).items():
-            default = group._field_defaults.get(field, parameter.empty)
-            parameters.append(
-                inspect.Parameter(field, parameter.KEYWORD_ONLY, default=default, annotation=hint)
-            )
+            add(field, group._field_defaults.get(field, inspect.Parameter.empty), hint, stated)
 
     def command(**values: Any) -> Any:
         grouped = {name: group(*map(values.pop, group._fields)) for name, group in groups.items()}

@@ -20,7 +20,7 @@ from knode_cosserat.cli.arguments import (
     require_writable,
 )
 from knode_cosserat.cli.output import table, write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 from knode_cosserat.recordings.formats import formats, written_suffixes
 
 if TYPE_CHECKING:
@@ -28,13 +28,7 @@ if TYPE_CHECKING:
     from knode_cosserat.recordings.health import Health, StreamHealth
 
 
-@app.command(
-    epilog=examples(
-        "inspect sine_1p0.bag",
-        "inspect sine_1p0.bag --config my-robot.yaml --plot health.png",
-        "inspect table.csv --json",
-    )
-)
+@app.command()
 def inspect(
     recording: Annotated[
         Path,
@@ -43,14 +37,7 @@ def inspect(
             f"File or folder of one of these formats: {', '.join(kind.name for kind in formats())}.",
         ),
     ],
-    config: Annotated[
-        Path | None,
-        option(
-            "YAML",
-            "Meaning of the recording's topics or columns.",
-            show_default="the paper's robot for bags; titles and comments for tables; or a proposal",
-        ),
-    ] = None,
+    config: Path | None = None,
     plot: Annotated[Path | None, Picture] = None,
     as_json: Json = False,
 ) -> None:
@@ -59,16 +46,22 @@ def inspect(
     Sampling rates, gaps, swapped axes, noise, and the delay and error of measured tensions relative to
     commands. Lists the defects found and their corrections. For a recording with other topics or columns
     than those known, it proposes a configuration, and reads the recording with it.
+
+    Options:
+        config (--config YAML): Meaning of the recording's topics or columns. Default: the paper's robot for
+            bags; titles and comments for tables; or a proposal.
+
+    Examples:
+        inspect sine_1p0.bag
+        inspect sine_1p0.bag --config my-robot.yaml --plot health.png
+        inspect table.csv --json
     """
     require_writable(figure=plot)
-    if plot:
-        figures()
+    drawing = figures() if plot else None
     loaded, proposed = _loaded(recording, config)
     report = loaded.health()
-    if plot:
-        from knode_cosserat.evaluation import recording_figures
-
-        recording_figures.health(loaded, report).savefig(plot)
+    if drawing:
+        drawing.health(loaded).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
     content = {"recording": str(recording), **report.to_dict()}
     lines = _lines(report)
@@ -153,41 +146,35 @@ def _number_text(value: Any, factor: float, form: str) -> str:
 
 
 class _Motion(NamedTuple):
-    """Motion of a virtual robot, and its noise."""
+    """Motion of a virtual robot, and its noise.
 
-    signal: Annotated[
-        str,
-        argument(
-            "CONTROLS",
-            "Commanded tensions: sine:PERIOD (s), step:HEIGHT (N, after 2 s) or random:SEED, around the "
-            "paper's rest tension; or any controls of `simulate`, after 1 s of rest.",
-        ),
-    ]
-    seconds: Annotated[float, option("S", "Duration (s).")] = 16.0
-    seed: Annotated[int, option("N", "Random seed of sensor noise and body mounting.", min=0)] = 0
-    swap: Annotated[
-        float | None, option("S", "Time when a tracked body swaps axes (s).", show_default="never")
-    ] = None
+    Options:
+        signal (CONTROLS): Commanded tensions: sine:PERIOD (s), step:HEIGHT (N, after 2 s) or random:SEED,
+            around the paper's rest tension; or any controls of `simulate`, after 1 s of rest.
+        seconds (--seconds S): Duration (s).
+        seed (--seed N≥0): Random seed of sensor noise and body mounting.
+        swap (--swap S): Time when a tracked body swaps axes (s). Default: never.
+    """
+
+    signal: str
+    seconds: float = 16.0
+    seed: int = 0
+    swap: float | None = None
 
 
 class _Files(NamedTuple):
-    """Files of a recording and of the truth."""
+    """Files of a recording and of the truth.
+
+    Options:
+        truth (--truth FILE): Write the robot with --imperfections to this YAML file.
+    """
 
     out: Annotated[Path, option("FILE", f"Write this recording: {', '.join(written_suffixes())}.")]
-    truth: Annotated[
-        Path | None, option("FILE", "Write the robot with --imperfections to this YAML file.")
-    ] = None
+    truth: Path | None = None
     states: Annotated[Path | None, NetCDF] = None
 
 
-@app.command(
-    epilog=examples(
-        "record-virtual sine:1.0 --out x.bag",
-        "record-virtual step:4.4 --out step.bag --seconds 12 --states truth.nc",
-        "record-virtual random:0 --out random.bag --seed 3 --swap 9",
-        "record-virtual sine:3.0 --out x.bag --imperfections 7 --truth true-robot.yaml",
-    )
-)
+@app.command()
 def record_virtual(
     motion: _Motion,
     files: _Files,
@@ -209,6 +196,12 @@ def record_virtual(
     The recording has the format of the paper's robot. The simulation includes effects that models do not
     have: tendon friction, ribs with masses, a sleeve, motor lag and sensor noise. --states writes the true
     states. With --imperfections the robot is the paper's with random effects that `identify` can find.
+
+    Examples:
+        record-virtual sine:1.0 --out x.bag
+        record-virtual step:4.4 --out step.bag --seconds 12 --states truth.nc
+        record-virtual random:0 --out random.bag --seed 3 --swap 9
+        record-virtual sine:3.0 --out x.bag --imperfections 7 --truth true-robot.yaml
     """
     signal, seconds, seed, swap = motion
     out, truth, states = files

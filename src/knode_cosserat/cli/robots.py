@@ -26,13 +26,12 @@ from knode_cosserat.cli.arguments import (
     coarse_grid_in_output,
     figures,
     load_system,
-    option,
     parse_numbers,
     require_trajectory_name,
     require_writable,
 )
 from knode_cosserat.cli.output import table, value_text, vector_text, write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 
 if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
@@ -44,49 +43,31 @@ COARSE = (
 
 
 class _Run(NamedTuple):
-    """Controls and numerical settings of a simulation."""
+    """Controls and numerical settings of a simulation.
 
-    controls: Annotated[
-        str,
-        option(
-            "CONTROLS",
-            "Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or step:HEIGHT,at=S), ramp:HEIGHT "
-            "(N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any controls by name: "
-            "NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat info ROBOT` lists the "
-            "names), the others zero; or none.",
-        ),
-    ]
-    steps: Annotated[
-        int | None, option("N", "Number of time steps; required unless a file gives the controls.")
-    ] = None
-    dt: Annotated[float | None, option("S", "Time step (s).", show_default="0.05, or the file's")] = None
-    time: Annotated[str, option("SCHEME", "Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.")] = (
-        "sdirk2"
-    )
+    Options:
+        controls (--controls CONTROLS): Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or
+            step:HEIGHT,at=S), ramp:HEIGHT (N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV
+            file. Any controls by name: NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat
+            info ROBOT` lists the names), the others zero; or none.
+        steps (--steps N): Number of time steps; required unless a file gives the controls.
+        dt (--dt S): Time step (s). Default: 0.05, or the file's.
+        time (--time SCHEME): Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.
+        initial (--initial STATE): State before the first step: equilibrium (at rest without controls), or
+            unstressed (the shape that the rod was made in, as in the paper's studies).
+        allow_failure (--allow-failure): Write the solved steps even if a later step fails.
+    """
+
+    controls: str
+    steps: int | None = None
+    dt: float | None = None
+    time: str = "sdirk2"
     space: Space = "lobatto2"
-    initial: Annotated[
-        str,
-        option(
-            "STATE",
-            "State before the first step: equilibrium (at rest without controls), or unstressed (the "
-            "shape that the rod was made in, as in the paper's studies).",
-        ),
-    ] = "equilibrium"
-    allow_failure: Annotated[
-        bool, typer.Option("--allow-failure", help="Write the solved steps even if a later step fails.")
-    ] = False
+    initial: str = "equilibrium"
+    allow_failure: bool = False
 
 
-@app.command(
-    epilog=examples(
-        "simulate delrin-tendon-robot --controls sine:1.5 --steps 100 --out truth.nc",
-        "simulate delrin-tendon-robot --controls step:1.5,at=2 --steps 200 --dt 0.02 --out step.nc",
-        "simulate my-robot.yaml --controls tensions.csv --set youngs_modulus=10e9 --out stiff.nc",
-        "simulate delrin-tendon-robot --controls 7,5,5,7 --steps 40 --out hold.nc",
-        "simulate my-rod.yaml --controls 'base_z=ramp:0.1;base_rx=sine:2' --steps 100 --out pushed.nc",
-        "simulate my-robot.yaml --controls random:0 --steps 100 --out r.nc --figure r.png --json",
-    )
-)
+@app.command()
 def simulate(
     model: Model,
     run: _Run,
@@ -94,7 +75,16 @@ def simulate(
     report: Report,
     figure: Annotated[Path | None, Picture] = None,
 ) -> None:
-    """Simulate a robot under tensions or other controls."""
+    """Simulate a robot under tensions or other controls.
+
+    Examples:
+        simulate delrin-tendon-robot --controls sine:1.5 --steps 100 --out truth.nc
+        simulate delrin-tendon-robot --controls step:1.5,at=2 --steps 200 --dt 0.02 --out step.nc
+        simulate my-robot.yaml --controls tensions.csv --set youngs_modulus=10e9 --out stiff.nc
+        simulate delrin-tendon-robot --controls 7,5,5,7 --steps 40 --out hold.nc
+        simulate my-rod.yaml --controls 'base_z=ramp:0.1;base_rx=sine:2' --steps 100 --out pushed.nc
+        simulate my-robot.yaml --controls random:0 --steps 100 --out r.nc --figure r.png --json
+    """
     require_trajectory_name(out)
     require_writable(out, figure)
     drawing = figures() if figure else None
@@ -140,17 +130,16 @@ def simulate(
 
 
 class Held(NamedTuple):
-    """Constant control of an equilibrium: from tensions, from numbers in order, or by name."""
+    """Constant control of an equilibrium: from tensions, from numbers in order, or by name.
 
-    tension: Annotated[str | None, option("N,N,…", "Tensions of all tendons (N), such as 7,5,5,7.")] = None
-    control: Annotated[
-        str | None,
-        option(
-            "CONTROL",
-            "All controls in order, such as 7,5,5,7; or some by name, such as base_z=0.1,base_ry=0.2, "
-            "and the others zero. `knode-cosserat info ROBOT` lists names and units.",
-        ),
-    ] = None
+    Options:
+        tension (--tension N,N,…): Tensions of all tendons (N), such as 7,5,5,7.
+        control (--control CONTROL): All controls in order, such as 7,5,5,7; or some by name, such as
+            base_z=0.1,base_ry=0.2, and the others zero. `knode-cosserat info ROBOT` lists names and units.
+    """
+
+    tension: str | None = None
+    control: str | None = None
 
     def of(self, system: System) -> Any:
         """Return the control of a robot."""
@@ -183,12 +172,7 @@ class Held(NamedTuple):
         return parse_signals(layout, words, {"middle": np.ones(1), "end": np.ones(1)})[0]
 
 
-@app.command(
-    epilog=examples(
-        "equilibrium delrin-tendon-robot --tension 7,5,5,7",
-        "equilibrium soft-slender-robot --control base_z=0.1,base_ry=0.2",
-    )
-)
+@app.command()
 def equilibrium(
     model: Model,
     held: Held,
@@ -196,7 +180,12 @@ def equilibrium(
     out: Annotated[Path | None, NetCDF] = None,
     as_json: Json = False,
 ) -> None:
-    """Compute the static equilibrium under a constant control."""
+    """Compute the static equilibrium under a constant control.
+
+    Examples:
+        equilibrium delrin-tendon-robot --tension 7,5,5,7
+        equilibrium soft-slender-robot --control base_z=0.1,base_ry=0.2
+    """
     require_trajectory_name(out)
     require_writable(out)
     import knode_cosserat as kc
@@ -229,7 +218,7 @@ def equilibrium(
     write_output(as_json, facts, lines, out=out)
 
 
-@app.command(epilog=examples("info", "info delrin-tendon-robot --set length=0.4", "info model"))
+@app.command()
 def info(
     robot: Annotated[
         str | None, typer.Argument(metavar="[ROBOT]", help=f"{ROBOT} If omitted, list the catalog.")
@@ -241,6 +230,11 @@ def info(
     """Show a robot's parameters and controls, or the catalog.
 
     For a model, show the residual as well.
+
+    Examples:
+        info
+        info delrin-tendon-robot --set length=0.4
+        info model
     """
     import knode_cosserat as kc
 
@@ -274,13 +268,19 @@ def info(
     )
 
 
-@app.command(epilog=examples("schema > robot.schema.json"))
+@app.command()
 def schema(
-    as_json: Annotated[bool, typer.Option("--json", help="Print the schema on one line.")] = False,
+    as_json: bool = False,
 ) -> None:
     """Print the JSON Schema of robot files.
 
     Editors use it to complete and check them.
+
+    Options:
+        as_json (--json): Print the schema on one line.
+
+    Examples:
+        schema > robot.schema.json
     """
     import json
 

@@ -19,55 +19,47 @@ from knode_cosserat.cli.arguments import (
     is_recording,
     is_trajectory,
     load_system,
-    option,
     require_writable,
     trajectories_by_name,
 )
 from knode_cosserat.cli.output import write_output
-from knode_cosserat.cli.program import app, examples
+from knode_cosserat.cli.program import app
 
 #: robot of `view --live` without a name
 EXAMPLE = "delrin-tendon-robot"
 
 
 class _Live(NamedTuple):
-    """Simulation in real time."""
+    """Simulation in real time.
 
-    live: Annotated[
-        bool, typer.Option("--live", help="Simulate a robot or model in real time, controlled by sliders.")
-    ] = False
-    dt: Annotated[
-        float | None,
-        option("S", "With --live: time step (s).", show_default="the model's training step, or 0.05"),
-    ] = None
+    Options:
+        live (--live): Simulate a robot or model in real time, controlled by sliders.
+        dt (--dt S): With --live: time step (s). Default: the model's training step, or 0.05.
+    """
+
+    live: bool = False
+    dt: float | None = None
     space: Space = "lobatto2"
     changes: Changes = None
     nodes: Nodes = None
 
 
 class _Page(NamedTuple):
-    """Page of the viewer."""
+    """Page of the viewer.
 
-    export: Annotated[Path | None, option("FILE", "Write one self-contained HTML file and exit.")] = None
-    port: Annotated[
-        int,
-        option(
-            "N",
-            "Port of the local web server, reachable from this machine only.",
-            show_default="any free port",
-        ),
-    ] = 0
-    no_open: Annotated[bool, typer.Option("--no-open", help="Do not open the browser.")] = False
+    Options:
+        export (--export FILE): Write one self-contained HTML file and exit.
+        port (--port N): Port of the local web server, reachable from this machine only. Default: any free
+            port.
+        no_open (--no-open): Do not open the browser.
+    """
+
+    export: Path | None = None
+    port: int = 0
+    no_open: bool = False
 
 
-@app.command(
-    epilog=examples(
-        "view truth.nc prediction.nc",
-        "view truth.nc --export scene.html",
-        "view --live delrin-tendon-robot",
-        "view --live model",
-    )
-)
+@app.command()
 def view(
     live: _Live,
     page: _Page,
@@ -80,6 +72,12 @@ def view(
     """Show trajectories in 3-D, or control a robot by sliders.
 
     The scene opens in the browser.
+
+    Examples:
+        view truth.nc prediction.nc
+        view truth.nc --export scene.html
+        view --live delrin-tendon-robot
+        view --live model
     """
     from knode_cosserat import viewer
 

@@ -15,8 +15,8 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.envs.dynamics import EpisodeState
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.policy import Policy
-from knode_cosserat.evaluation.animation import write_frames
-from knode_cosserat.evaluation.style import require_matplotlib
+from knode_cosserat.figures.animation import write_frames
+from knode_cosserat.figures.style import require_matplotlib
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.wrapped import nominal_model
 

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     from knode_cosserat.sweeps._data import SweepData, load_sweep
     from knode_cosserat.sweeps._description import Range, Sweep, SweepError
     from knode_cosserat.sweeps._plan import Plan as Plan
-    from knode_cosserat.sweeps._run import Dask, Local, Slurm, run_sweep
+    from knode_cosserat.sweeps._run import run_sweep
 
-__all__ = ["Dask", "Local", "Range", "Slurm", "Sweep", "SweepData", "SweepError", "load_sweep", "run_sweep"]
+__all__ = ["Range", "Sweep", "SweepData", "SweepError", "load_sweep", "run_sweep"]
 
 make_lazy(
     __name__,
@@ -21,6 +21,6 @@ make_lazy(
         "knode_cosserat.sweeps._data": "SweepData load_sweep",
         "knode_cosserat.sweeps._description": "Range Sweep SweepError",
         "knode_cosserat.sweeps._plan": "Plan",
-        "knode_cosserat.sweeps._run": "Dask Local Slurm run_sweep",
+        "knode_cosserat.sweeps._run": "run_sweep",
     },
 )

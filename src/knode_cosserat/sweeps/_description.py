@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -40,6 +40,69 @@ class SweepError(KnodeCosseratError, ValueError):
     code = "sweep"
 
 
+def _is_number(value: Any) -> bool:
+    real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
+    return real and bool(np.isfinite(value))
+
+
+def _is_whole(value: Any, least: int = 1) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
+
+
+#: allowed values of fields: a test and its words, or a collection of names
+RULES: dict[str, tuple[Callable[[Any], bool], str] | Collection[Any]] = {
+    "low": (_is_number, "a finite number"),
+    "high": (_is_number, "a finite number"),
+    "scale": ("linear", "log"),
+    "count": (lambda value: value is None or _is_whole(value, 2), "a whole number from 2 on"),
+    "steps": (_is_whole, "a whole number from 1 on"),
+    "dt": (lambda value: _is_number(value) and value > 0.0, "a number of seconds above 0"),
+    "vary": (lambda value: isinstance(value, Mapping), "a mapping from names to ranges or lists"),
+    "sampler": SAMPLERS,
+    "samples": (lambda value: value is None or _is_whole(value), "a whole number from 1 on"),
+    "seed": (lambda value: _is_whole(value, 0), "a whole number from 0 on"),
+    "seeds": (
+        lambda value: isinstance(value, Sequence | np.ndarray) and all(_is_whole(seed, 0) for seed in value),
+        "a list of whole numbers from 0 on",
+    ),
+    "store": (lambda value: len(set(value)) == len(value), "each name once"),
+    "precision": ("double", "single"),
+    "initial": STARTS,
+    "recovery": (False, True),
+    "shard": (lambda value: value is None or _is_whole(value), "a whole number from 1 on"),
+}
+
+
+def _require_allowed(settings: Any) -> None:
+    """Raise `SweepError` unless all fields of a dataclass have values that `RULES` allow."""
+    for field in dataclasses.fields(settings):
+        value, rule = getattr(settings, field.name), RULES.get(field.name)
+        if isinstance(rule, tuple) and callable(rule[0]):
+            is_allowed, words = rule
+            if not is_allowed(value):
+                raise SweepError(f"{field.name} is {shown(value)}; allowed is {words}")
+        elif rule is not None:
+            _require_known(f"{field.name} is {shown(value)}", value, rule)
+
+
+def _require_known(problem: str, name: Any, known: Collection[Any]) -> None:
+    if not any(name == each for each in known):
+        names = list(map(str, known))
+        raise SweepError(f"{problem}; allowed is {', '.join(names)}{did_you_mean(name, names)}")
+
+
+def _require_keys(mapping: Mapping[Any, Any], cls: type) -> None:
+    """Raise `SweepError` unless a mapping has keys of a dataclass, among them all without a default."""
+    fields = dataclasses.fields(cls)
+    for key in mapping:
+        _require_known(f"the key {shown(key)} is unknown", key, [field.name for field in fields])
+    missing = dataclasses.MISSING
+    required = [it.name for it in fields if it.default is missing and it.default_factory is missing]
+    for key in required:
+        if key not in mapping:
+            raise SweepError(f"the key {key!r} is missing; required is {', '.join(required)}")
+
+
 @dataclasses.dataclass(frozen=True)
 class Range:
     """Range of a varied number: from `low` to `high`, uniform, or uniform in the logarithm.
@@ -53,17 +116,13 @@ class Range:
     count: int | None = None
 
     def __post_init__(self) -> None:
+        _require_allowed(self)
         for name in ("low", "high"):
-            value = getattr(self, name)
-            _require(_is_number(value), name, value, "a finite number")
-            object.__setattr__(self, name, float(value))
-        _require(self.scale in ("linear", "log"), "scale", self.scale, "linear or log")
+            object.__setattr__(self, name, float(getattr(self, name)))
         if not self.low < self.high:
             raise SweepError(f"low is {self.low:g} and high {self.high:g}; allowed is low below high")
         if self.scale == "log" and not self.low > 0.0:
             raise SweepError(f"low is {self.low:g}; allowed with the scale log is a number above 0")
-        if self.count is not None:
-            _require_count("count", self.count, least=2)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -134,12 +193,11 @@ class Sweep:
     shard: int | None = None
 
     def __post_init__(self) -> None:
-        _require_count("steps", self.steps)
-        _require(_is_number(self.dt) and self.dt > 0.0, "dt", self.dt, "a number of seconds above 0")
-        _require(isinstance(self.vary, Mapping), "vary", self.vary, "a mapping from names to ranges or lists")
-        _require(
-            isinstance(self.seeds, Sequence | np.ndarray), "seeds", self.seeds, "a list of whole numbers"
-        )
+        store = _words("store", self.store) if self.store else ()
+        for name in store:
+            _require_known(f"store: {name!r} is unknown", name, STORED)
+        object.__setattr__(self, "store", store)
+        _require_allowed(self)
         robots = self.robots if isinstance(self.robots, list | tuple) else [self.robots]
         if not robots:
             raise SweepError("robots is empty; allowed is one robot or more")
@@ -149,26 +207,14 @@ class Sweep:
             "controls": _words("controls", self.controls),
             "vary": {name: _variation(name, values) for name, values in self.vary.items()},
             "seeds": tuple(self.seeds),
-            "store": _words("store", self.store) if self.store else (),
         }.items():
             object.__setattr__(self, name, value)
-        _require_count("seed", self.seed, least=0)
-        for seed in self.seeds:
-            _require_count("seeds", seed, least=0)
-        if self.shard is not None:
-            _require_count("shard", self.shard)
-        for name in self.store:
-            _require_known(f"store: {name!r} is unknown", name, STORED)
-        if len(set(self.store)) < len(self.store):
-            raise SweepError(f"store is {', '.join(self.store)}; allowed is each name once")
-        _require(self.precision in ("double", "single"), "precision", self.precision, "double or single")
-        _require(self.initial in STARTS, "initial", self.initial, " or ".join(STARTS))
-        _require(self.recovery in (False, True), "recovery", self.recovery, "false or true")
-        _require_known(f"sampler is {shown(self.sampler)}", self.sampler, SAMPLERS)
         if self.sampler == "grid":
-            more = "a grid has all combinations, and no samples; leave it out, or use the sampler sobol"
             if self.samples is not None:
-                raise SweepError(f"samples is {shown(self.samples)}; {more}")
+                raise SweepError(
+                    f"samples is {shown(self.samples)}; a grid has all combinations, and no samples; leave "
+                    "it out, or use the sampler sobol"
+                )
             for name, values in self.vary.items():
                 if isinstance(values, Range) and values.count is None:
                     raise SweepError(
@@ -177,10 +223,8 @@ class Sweep:
                     )
         elif self.samples is None:
             raise SweepError(f"samples is missing; required is a number of samples for {self.sampler}")
-        else:
-            _require_count("samples", self.samples)
-            if self.samples > (most := SAMPLERS[self.sampler]):
-                raise SweepError(f"samples is {self.samples}; allowed with {self.sampler} is up to {most}")
+        elif self.samples > (most := SAMPLERS[self.sampler]):
+            raise SweepError(f"samples is {self.samples}; allowed with {self.sampler} is up to {most}")
         if self.case_count > MOST_CASES:
             raise SweepError(f"there are {self.case_count} cases; allowed is up to {MOST_CASES:.0e}")
 
@@ -193,13 +237,8 @@ class Sweep:
         """
         if not isinstance(mapping, Mapping):
             raise SweepError(f"{source}: the sweep is {shown(mapping)}; allowed is a mapping of settings")
-        known = [field.name for field in dataclasses.fields(cls)]
         try:
-            for key in mapping:
-                _require_known(f"the key {shown(key)} is unknown", key, known)
-            for key in known[:4]:
-                if key not in mapping:
-                    raise SweepError(f"the key {key!r} is missing; required is {', '.join(known[:4])}")
+            _require_keys(mapping, cls)
             return cls(**mapping)
         except SweepError as error:
             raise SweepError(f"{source}: {error}") from None
@@ -273,33 +312,10 @@ def values_at(variation: Range | tuple[Any, ...], fraction: np.ndarray) -> np.nd
     return np.clip(low + fraction * (high - low), low, high)
 
 
-# checks
-
-
-def _require(fair: bool, name: str, value: Any, allowed: str) -> None:
-    if not fair:
-        raise SweepError(f"{name} is {shown(value)}; allowed is {allowed}")
-
-
-def _require_known(problem: str, name: Any, known: Collection[str]) -> None:
-    if name not in known:
-        raise SweepError(f"{problem}; allowed is {', '.join(known)}{did_you_mean(name, known)}")
-
-
-def _is_number(value: Any) -> bool:
-    real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return real and bool(np.isfinite(value))
-
-
-def _require_count(name: str, value: Any, least: int = 1) -> None:
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    _require(whole and value >= least, name, value, f"a whole number from {least} on")
-
-
 def _words(name: str, value: Any) -> tuple[str, ...]:
     words = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list | tuple) else ()
-    fair = bool(words) and all(isinstance(word, str) for word in words)
-    _require(fair, name, value, "a word or a list of words")
+    if not words or not all(isinstance(word, str) for word in words):
+        raise SweepError(f"{name} is {shown(value)}; allowed is a word or a list of words")
     return words
 
 
@@ -326,11 +342,7 @@ def _variation(name: Any, values: Any) -> Range | tuple[Any, ...]:
         return values
     try:
         if isinstance(values, Mapping):
-            known = [field.name for field in dataclasses.fields(Range)]
-            for key in values:
-                _require_known(f"the key {shown(key)} is unknown", key, known)
-            if not {"low", "high"} <= values.keys():
-                raise SweepError("low and high are required")
+            _require_keys(values, Range)
             return Range(**values)
         values = values.tolist() if isinstance(values, np.ndarray) else values
         if not isinstance(values, list | tuple) or not values:

@@ -17,7 +17,7 @@ import importlib.metadata
 import json
 import platform
 import subprocess
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -48,9 +48,10 @@ MANIFEST, SHARDS, LOG = "sweep.json", "shards", "log.jsonl"
 FORMAT, VERSION, CHECKSUM = "knode-cosserat sweep", 1, "checksum"
 #: largest manifest (bytes): a varied number has up to 20, and there are up to a million of them in lists
 LARGEST_MANIFEST = 64_000_000
-#: packages whose versions may change a result in its last bits, and parts of this one that results depend on
-PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "pyarrow")
-SOURCES = ("_files", "rods", "solvers", "learning", "identification", "sweeps")
+#: packages whose versions may change a result in its last bits
+PACKAGES = ("jax", "jaxlib", "numpy", "scipy", "equinox", "llvmlite", "pyarrow")
+#: parts of this package that results depend on
+SOURCES = ("_files", "rods", "schemes", "engine", "solvers", "learning", "sweeps")
 
 
 # provenance
@@ -59,8 +60,8 @@ SOURCES = ("_files", "rods", "solvers", "learning", "identification", "sweeps")
 @functools.cache
 def made_by() -> dict[str, str]:
     """Return the versions of Python and packages, and a checksum of the code that results depend on."""
-    files = [*ROOT.glob("*.py"), *(file for name in SOURCES for file in (ROOT / name).rglob("*.py"))]
     digest = hashlib.sha256()
+    files = [*ROOT.glob("*.py"), *(file for name in SOURCES for file in (ROOT / name).rglob("*.py"))]
     for file in sorted(files):
         digest.update(file.relative_to(ROOT).as_posix().encode() + b"\0" + file.read_bytes())
     versions = {name: importlib.metadata.version(name) for name in PACKAGES}
@@ -113,25 +114,29 @@ def _text(system: System) -> str:
 
 def _columns(plan: Plan, robot: int) -> dict[str, dict[str, Any]]:
     """Return the columns of a robot's shards by name: shape of one case's value, unit and meaning."""
-    sweep, rows, columns = plan.sweep, plan.sweep.steps + 1, {}
-
-    def add(name: str, shape: tuple[int, ...], unit: str, meaning: str) -> None:
-        columns[name] = {"shape": list(shape), "unit": unit, "meaning": meaning}
-
-    add("case", (), "", "number of the case in the sweep")
-    add("robot", (), "", "number of the robot in the description, from 0")
-    add("word", (), "", "number of the word of controls, from 0")
-    add("seed", (), "", "seed of the case")
+    sweep, rows = plan.sweep, [plan.sweep.steps + 1]
+    columns: dict[str, tuple[Sequence[int], str, str]] = {
+        "case": ([], "", "number of the case in the sweep"),
+        "robot": ([], "", "number of the robot in the description, from 0"),
+        "word": ([], "", "number of the word of controls, from 0"),
+        "seed": ([], "", "seed of the case"),
+    }
     for name, values in sweep.vary.items():
         stated = parameter_at(nominal_model(plan.systems[0]), name)
-        shape = np.shape(values[0]) if isinstance(values, tuple) else ()
-        add(name, shape, stated.unit if stated else "", "varied number")
-    add("result", (rows,), "", "result codes of the rows; below 0: not solved")
-    add("position_error", (rows,), "m", "estimated discretisation error of positions")
-    add("reason", (), "", "reason of a failed case; empty for a solved one")
+        shape = np.shape(values[0]) if isinstance(values, tuple) else []
+        columns[name] = shape, stated.unit if stated else "", "varied number"
+    columns |= {
+        "result": (rows, "", "result codes of the rows; below 0: not solved"),
+        "position_error": (rows, "m", "estimated discretisation error of positions"),
+        "reason": ([], "", "reason of a failed case; empty for a solved one"),
+    }
     for name, shape in plan.stored_shapes(robot).items():
-        add(name, shape, STORED[name][1], STORED[name][0])
-    return columns
+        meaning, unit = STORED[name]
+        columns[name] = shape, unit, meaning
+    return {
+        name: {"shape": list(shape), "unit": unit, "meaning": meaning}
+        for name, (shape, unit, meaning) in columns.items()
+    }
 
 
 def write_manifest(folder: Path, manifest: Mapping[str, Any]) -> None:
@@ -220,6 +225,14 @@ def open_folder(plan: Plan, folder: Path) -> None:
                 f"{folder}: the sweep was begun with {name} {made}, and this is {version}, so results may "
                 "differ; go on with the same version, or use another folder"
             )
+
+
+def holds_plan(folder: Path, plan: Plan) -> bool:
+    """True if the folder has the manifest of a plan: a worker on another machine may not see it."""
+    try:
+        return bool(read_manifest(folder)["identity"] == plan.identity)
+    except SweepError:
+        return False
 
 
 def is_complete(plan: Plan, folder: Path, number: int) -> bool:

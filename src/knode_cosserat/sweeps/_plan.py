@@ -10,6 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import re
+import string
 from collections.abc import Mapping
 from typing import Any, NamedTuple, Self
 
@@ -29,7 +30,6 @@ from knode_cosserat.schemes.settings import NewtonOptions, Settings
 from knode_cosserat.solvers.simulate import checked_dt
 from knode_cosserat.sweeps._description import Range, RobotEntry, Sweep, SweepError, value_count, values_at
 from knode_cosserat.sweeps._sampling import case_seeds, unit_points
-from knode_cosserat.sweeps._signals import case_controls, placeholders
 
 #: most cases of a shard, and most megabytes of numbers in one, if the description does not say
 SHARD_CASES, SHARD_MEGABYTES = 4096, 16
@@ -51,17 +51,17 @@ class Cases(NamedTuple):
     refused: dict[int, str]
 
 
-@dataclasses.dataclass(frozen=True, eq=False)
+@dataclasses.dataclass(frozen=True)
 class Plan:
     """Sweep with its robots loaded and its shards counted; workers receive it whole."""
 
-    sweep: Sweep
-    systems: tuple[System, ...]
-    settings: Settings
+    sweep: Sweep = dataclasses.field(compare=False)
+    systems: tuple[System, ...] = dataclasses.field(compare=False)
+    settings: Settings = dataclasses.field(compare=False)
     #: checksum of everything that the results depend on, apart from versions
     identity: str
     #: by robot and word: controls that are the same in all cases, read once because a file may change
-    fixed: Mapping[tuple[int, int], np.ndarray]
+    fixed: Mapping[tuple[int, int], np.ndarray] = dataclasses.field(compare=False)
 
     @classmethod
     def of(cls, sweep: Sweep) -> Self:
@@ -90,6 +90,8 @@ class Plan:
             settings = Settings.of(sweep.time, sweep.space, "consistent", NewtonOptions())
         except ValueError as error:
             raise SweepError(str(error)) from None
+        if "controls" in sweep.store and not all(system.control_layout.size for system in systems):
+            raise SweepError("store: controls: a robot has none; allowed is a robot with controls")
         if settings.time is None:
             raise SweepError("time is None; allowed is a time scheme: equilibria have no time steps")
         fixed = _fixed_controls(sweep, systems)
@@ -261,6 +263,38 @@ def _fixed_controls(sweep: Sweep, systems: tuple[System, ...]) -> dict[tuple[int
             if len(refused) == 3:
                 raise SweepError(refused[1])
     return fixed
+
+
+def placeholders(word: str) -> list[str]:
+    """Return the names in braces in a word of controls. Raises `SweepError` for unmatched braces."""
+    allowed = "allowed is a name in braces: sine:{period}"
+    try:
+        names = [name for _, name, _, _ in string.Formatter().parse(word) if name is not None]
+    except ValueError as error:
+        raise SweepError(f"controls {word!r}: {error}; {allowed}") from None
+    for name in names:
+        if not re.fullmatch(r"[A-Za-z_][\w-]*", name):
+            raise SweepError(f"controls {word!r}: {{{name}}} is no name; {allowed}")
+    return list(dict.fromkeys(names))
+
+
+def case_controls(
+    robot: System, word: str, steps: int, dt: float, numbers: Mapping[str, np.ndarray]
+) -> tuple[np.ndarray, dict[int, str]]:
+    """Return the controls (cases, steps, c) of cases, and reasons of refused ones, which are zeros.
+
+    `numbers` are the values of the names in braces, one a case.
+    """
+    # a Python number prints all its digits
+    varied = {name: numbers[name].tolist() for name in placeholders(word)}
+    cases = [dict(zip(varied, values, strict=True)) for values in zip(*varied.values(), strict=True)]
+    values, refused = np.zeros((len(cases), steps, robot.control_layout.size)), {}
+    for k, case in enumerate(cases):
+        try:
+            values[k] = controls.parse(word.format(**case), steps, dt, robot)
+        except controls.ControlsError as error:
+            refused[k] = str(error)
+    return values, refused
 
 
 def _system_checksum(system: System) -> str:

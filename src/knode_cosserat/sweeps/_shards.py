@@ -1,7 +1,7 @@
 """Shards as Parquet files: one row a case, with a version and a checksum in the file's metadata.
 
 Parquet, not Zarr: a shard is one file, so that it is there whole or not at all by one rename. A column with
-an array in each row, such as the tip's positions, is a list of fixed size; its shape is in the metadata.
+an array in each row, such as the tip's positions, has Arrow's type of tensors with a fixed shape.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat.errors import first_line
 from knode_cosserat.sweeps._description import SweepError
 
-#: key of the metadata, version of the format, and key of the checksum of all other metadata
-KEY, VERSION, METADATA_CHECKSUM = b"knode-cosserat sweep", 1, "own_checksum"
-#: columns of text
-TEXTS = ("reason",)
+#: key of the metadata, and version of the format
+KEY, VERSION = b"knode-cosserat sweep", 2
+#: column of text
+REASON = "reason"
+KEPT = "complete shards are kept, and the same command goes on where it stopped"
 
 
 class Shard(NamedTuple):
@@ -37,29 +38,29 @@ class Shard(NamedTuple):
 def shard_bytes(columns: Mapping[str, Any], about: Mapping[str, Any]) -> bytes:
     """Return the content of a shard's file; equal columns and metadata give equal bytes."""
     pyarrow = require_pyarrow()
-    arrays, shapes, split = {}, {}, []
+    arrays, split = {}, []
     for name, values in columns.items():
         array = np.ascontiguousarray(values)
-        shapes[name] = list(array.shape[1:])
-        if name in TEXTS:
-            arrays[name] = pyarrow.array([str(text) for text in array], pyarrow.string())
-            continue
-        arrays[name] = pyarrow.array(array.reshape(-1))
-        if shapes[name]:
-            size = int(np.prod(shapes[name]))
-            arrays[name] = pyarrow.FixedSizeListArray.from_arrays(arrays[name], size)
+        is_tensor = array.ndim > 1
+        make = pyarrow.FixedShapeTensorArray.from_numpy_ndarray if is_tensor else pyarrow.array
+        arrays[name] = make(array)
         if array.dtype.kind == "f":
-            split.append(f"{name}.list.element" if shapes[name] else name)
-    stated = {**about, "version": VERSION, "shapes": shapes, "checksum": checksum(columns)}
-    stated[METADATA_CHECKSUM] = json_checksum(stated)
+            split.append(f"{name}.list.element" if is_tensor else name)
+    stated = {**about, "version": VERSION}
+    stated["checksum"] = checksum(columns, stated)
     table = pyarrow.table(arrays).replace_schema_metadata({KEY: json.dumps(stated, sort_keys=True).encode()})
     sink = pyarrow.BufferOutputStream()
     # level 1 of zstd with split bytes takes a tenth off doubles at 300 MB/s
     pyarrow.parquet.write_table(
-        table, sink, compression="zstd", compression_level=1, use_byte_stream_split=split,
-        use_dictionary=list(TEXTS), write_statistics=[name for name in columns if not shapes[name]],
-        row_group_size=len(table) or 1, store_schema=True,
-    )  # fmt: skip
+        table,
+        sink,
+        compression="zstd",
+        compression_level=1,
+        use_byte_stream_split=split,
+        use_dictionary=[REASON],
+        write_statistics=[name for name, values in columns.items() if np.ndim(values) == 1],
+        row_group_size=len(table) or 1,
+    )
     return bytes(sink.getvalue())
 
 
@@ -69,10 +70,7 @@ def write_shard(path: Path, content: bytes) -> None:
         with replacing(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
-        raise SweepError(
-            f"{path}: cannot be written: {error.strerror or error}; complete shards are kept, and the same "
-            "command goes on where it stopped"
-        ) from None
+        raise SweepError(f"{path}: cannot be written: {error.strerror or error}; {KEPT}") from None
 
 
 def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool = True) -> Shard:
@@ -81,7 +79,7 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool =
     Args:
         path: the file.
         names: the columns; None: all.
-        verify: read all columns, and compare their checksum.
+        verify: read all columns, and compare the checksum.
 
     Raises:
         SweepError: the file cannot be read, has another version, or was changed.
@@ -91,20 +89,19 @@ def read_shard(path: Path, names: Sequence[str] | None = None, *, verify: bool =
         raise SweepError(f"{path}: there is no such shard; the sweep is not complete")
     try:
         # a text that many rows have is stored once, and must not be written out for each
-        with open_parquet(path, read_dictionary=TEXTS) as file:
+        with open_parquet(path, read_dictionary=[REASON]) as file:
             about = _metadata(file, path)
             require_limited_expansion(file.metadata, path)
             table = file.read(columns=None if verify or names is None else list(names))
-            columns = {
-                name: _numpy(table.column(name).combine_chunks(), about["shapes"][name], path)
-                for name in table.column_names
-            }
+            columns = {name: _numpy(table.column(name).combine_chunks()) for name in table.column_names}
+            _require_short_texts(columns.get(REASON, ()), path)
     except ReadError as error:
         raise SweepError(f"{path}: damaged: {error}") from None
     except (TypeError, AttributeError) as error:
         raise SweepError(f"{path}: damaged: {first_line(error)}") from None
-    if verify and checksum(columns) != about["checksum"]:
-        raise SweepError(f"{path}: damaged: the checksum of its columns is not the stated one")
+    stated = about.pop("checksum", None)
+    if verify and checksum(columns, about) != stated:
+        raise SweepError(f"{path}: damaged: its contents do not have its checksum")
     if missing := set(names or ()) - set(columns):
         raise SweepError(f"{path}: damaged: it has no column {min(missing)}")
     return Shard(columns if names is None else {name: columns[name] for name in names}, about)
@@ -120,37 +117,31 @@ def _metadata(file: Any, path: Path) -> dict[str, Any]:
             f"{path}: the shard has the version {about.get('version')!r}; allowed is {VERSION}, which this "
             "version of the package reads and writes. Nothing was changed"
         )
-    if about.pop(METADATA_CHECKSUM, None) != json_checksum(about):
-        raise SweepError(f"{path}: damaged: the checksum of its metadata is not the stated one")
     return about
 
 
-def checksum(columns: Mapping[str, Any]) -> str:
-    """Return a checksum of the names, types, shapes and values of columns."""
-    digest = hashlib.sha256()
+def _numpy(column: Any) -> Any:
+    if hasattr(column, "to_numpy_ndarray"):
+        return column.to_numpy_ndarray()
+    return column.to_numpy(zero_copy_only=False)
+
+
+def _require_short_texts(texts: Sequence[str], path: Path) -> None:
+    total, (most, limit) = sum(map(len, texts)), expansion_limit(path)
+    if total > most:
+        raise ReadError(f"its texts have {total} characters; {limit}")
+
+
+def checksum(columns: Mapping[str, Any], about: Mapping[str, Any]) -> str:
+    """Return a checksum of metadata, and of the names, types, shapes and values of columns."""
+    digest = hashlib.sha256(json_checksum(about).encode())
     for name in sorted(columns):
         values = np.asarray(columns[name])
-        if values.dtype.kind in "OU":
-            content, kind = "\0".join(map(str, values)).encode(), "text"
-        else:
-            content, kind = np.ascontiguousarray(values).tobytes(), values.dtype.str
+        is_text = values.dtype.kind in "OU"
+        content = "\0".join(values.tolist()).encode() if is_text else np.ascontiguousarray(values).tobytes()
+        kind = "text" if is_text else values.dtype.str
         digest.update(f"{name} {kind} {values.shape} {len(content)}\n".encode() + content)
     return digest.hexdigest()
-
-
-def _numpy(column: Any, shape: Sequence[int], path: Path) -> Any:
-    """Return a column (rows, *shape) as an array."""
-    if hasattr(column, "chunks"):
-        column = column.chunk(0)
-    if hasattr(column, "dictionary"):
-        words = column.dictionary.to_numpy(zero_copy_only=False)
-        texts = words[column.indices.to_numpy(zero_copy_only=False)]
-        total, (most, limit) = sum(map(len, texts)), expansion_limit(path)
-        if total > most:
-            raise ReadError(f"its texts have {total} characters; {limit}")
-        return texts
-    flat = column.flatten() if shape else column
-    return flat.to_numpy(zero_copy_only=False).reshape(len(column), *shape)
 
 
 def require_pyarrow() -> Any:

@@ -40,8 +40,7 @@ from knode_cosserat.sweeps._plan import Cases, Plan
 #: robots that one call solves
 CHUNK = 16
 
-#: sweeps and robots whose programs this process has compiled
-_COMPILED: set[tuple[str, int]] = set()
+#: JAX may crash if one thread stores a program on disk while another compiles it
 _COMPILING = threading.Lock()
 
 
@@ -70,28 +69,23 @@ def _stored(systems, record, rows, store):  # type: ignore[no-untyped-def]
         "tip_position": lambda system, y: Drawing.of(system).positions(y[:, -1]),
         "tip_quaternion": lambda system, y: Drawing.of(system).quaternions(y[:, -1]),
         "position": lambda system, y: Drawing.of(system).positions(y),
+        "y": lambda _, y: y,
     }
     axes = (0 if jnp.ndim(systems.length) else None, 0)
     stored = {
-        name: jax.vmap(function, in_axes=axes)(systems, y)
-        for name, function in functions.items()
-        if name in store
+        name: jax.vmap(functions[name], in_axes=axes)(systems, y) for name in store if name in functions
     }
-    stored |= {name: part for name, part in (("y", y), ("z", records[..., ny:])) if name in store}
+    stored |= {"z": records[..., ny:]} if "z" in store else {}
     return {"result": solved, "position_error": jnp.where(solved < 0, jnp.nan, errors)} | stored
 
 
 def solve_shard(plan: Plan, number: int, threads: int | None = None) -> dict[str, Any]:
     """Return the columns of a shard, by name; by default with one thread for each usable core."""
     robot, cases = plan.span(number)[0], plan.cases(number)
-    size, threads, compiled = len(cases.case), threads or usable_cores(), (plan.identity, robot)
-    firsts = list(range(0, size, CHUNK))
-    parts = []
-    # JAX may crash if one thread stores a program on disk while another compiles it
+    size, threads = len(cases.case), threads or usable_cores()
     with _COMPILING:
-        if compiled not in _COMPILED:
-            parts = [_chunk(plan, robot, cases, firsts.pop(0))]
-            _COMPILED.add(compiled)
+        parts = [_chunk(plan, robot, cases, 0)]
+    firsts = range(CHUNK, size, CHUNK)
     with concurrent.futures.ThreadPoolExecutor(threads) as pool:
         chunks = map if threads == 1 else pool.map
         parts += chunks(lambda first: _chunk(plan, robot, cases, first), firsts)

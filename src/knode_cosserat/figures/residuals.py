@@ -7,9 +7,8 @@ from typing import TYPE_CHECKING, Any
 import jax
 import numpy as np
 
-from knode_cosserat.evaluation.drawing import new_figure
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
-from knode_cosserat.learning.knode import KNODE
+from knode_cosserat._arguments import check_arguments
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes import semi_discrete
@@ -18,6 +17,8 @@ from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from knode_cosserat.learning.knode import KNODE
 
 
 def residual(model: KNODE, trajectory: Trajectory) -> Figure:
@@ -30,6 +31,7 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
     Raises:
         DataError: the trajectory does not fit the model.
     """
+    check_arguments(residual, locals())
     data = samples(model.knowledge, [trajectory]).segments
     used = np.unique(data.origin[:, 1])
     time = np.asarray(trajectory.time)[used]
@@ -43,8 +45,7 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
         *((field, 1, f"{field.name} [{field.unit}]") for field in z_layout.fields),
         *((field, 0, f"{field.name}_s [{field.load or field.unit + '/m'}]") for field in stated),
     ]
-    with style():
-        figure = new_figure(TWO_COLUMNS, 0.8 + 1.1 * len(rows))
+    with new_figure(TWO_COLUMNS, 0.8 + 1.1 * len(rows)) as figure:
         axes = figure.subplots(len(rows), 1, sharex=True, squeeze=False)[:, 0]
         for axis, (field, part, label) in zip(axes, rows, strict=True):
             layout = (y_layout, z_layout)[part]

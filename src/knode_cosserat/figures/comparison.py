@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat.evaluation import drawing
-from knode_cosserat.evaluation.drawing import equal_scales, new_figure, one_of, tips_of
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures import drawing
+from knode_cosserat.figures.drawing import equal_scales, one_of, tips_of
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -28,22 +28,22 @@ METHODS: dict[str, dict[str, Any]] = {
 _OTHERS = ("baseline", "best", "paper", "calibrated")
 
 
-def look_of(label: str, place: int) -> dict[str, Any]:
-    """Return the line style of a prediction: fixed for methods of the studies, otherwise by position."""
-    return METHODS[label if label in METHODS else _OTHERS[place % len(_OTHERS)]]
+def looks_of(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
+    """Return the line styles of predictions: fixed for methods of the studies, otherwise by position."""
+    places = enumerate(labels)
+    return {label: METHODS.get(label) or METHODS[_OTHERS[k % len(_OTHERS)]] for k, label in places}
 
 
-def comparison(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
+def compare(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
     """Return one figure of the shapes and tips of several predictions, drawn over the reference.
 
     Raises:
         ImportError: matplotlib is not installed.
         ValueError: there is nothing to draw, or a batch is given.
     """
-    check_arguments(comparison, locals())
+    check_arguments(compare, locals())
     require_some(predictions)
-    with style():
-        figure = new_figure(TWO_COLUMNS, 3.8)
+    with new_figure(TWO_COLUMNS, 3.8) as figure:
         left, right = figure.subfigures(1, 2, width_ratios=(1.0, 1.35), wspace=0.03)
         axes = left.add_subplot(projection="3d")
         draw_shapes(axes, reference, predictions, count)
@@ -62,9 +62,8 @@ def draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Traj
     for row in rows:
         axes.plot(*true[row].T, **REFERENCE, solid_capstyle="round")
     axes.plot(*true[:, -1].T, **{**REFERENCE, "linewidth": 2.0}, label="reference")
-    for place, (label, prediction) in enumerate(predictions.items()):
-        points = np.asarray(one_of(prediction).position)
-        look = {**look_of(label, place), "linestyle": "-"}
+    for label, look in looks_of(predictions).items():
+        points, look = np.asarray(one_of(predictions[label]).position), {**look, "linestyle": "-"}
         for row in rows:
             axes.plot(*points[row].T, **look)
         axes.plot(*points[:, -1].T, **{**look, "linewidth": 0.9}, label=label)
@@ -79,10 +78,9 @@ def show_all(axes: Any, trajectories: Sequence[Trajectory], zoom: float) -> None
 
 def draw_tips(column: Any, reference: Trajectory, predictions: Mapping[str, Trajectory]) -> None:
     """Draw the tip's x, y and z over time, one below the other."""
-    looks = {label: look_of(label, place) for place, label in enumerate(predictions)}
-    paths = {label: (motion.time, tips_of(motion)) for label, motion in predictions.items()}
-    true = {"reference": (reference.time, tips_of(reference))}
-    drawing.draw_tips(column, true | paths, {"reference": REFERENCE, **looks})
+    motions = {"reference": reference, **predictions}
+    paths = {label: (motion.time, tips_of(motion)) for label, motion in motions.items()}
+    drawing.draw_tips(column, paths, {"reference": REFERENCE, **looks_of(predictions)})
 
 
 def legend_below(figure: Any, axes: Any, columns: int = 6) -> None:

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.evaluation.learning_figures import residual
 from knode_cosserat.solvers.segments import DataError
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw
@@ -30,7 +29,7 @@ def test_it_draws_what_is_added_to_what_the_knowledge_has(states):
     """(K + c0 B) u is the same for both: the knowledge's u is too large by what its K is too small."""
     stiffness = float(ROBOT.youngs_modulus) * np.pi * float(ROBOT.radius) ** 4 / 4.0
     model = kc.fit(ROBOT.replace(youngs_modulus=0.25 * float(ROBOT.youngs_modulus)), [states])
-    figure = residual(model, states)
+    figure = kc.figures.residual(model, states)
     figure.savefig(io.BytesIO(), format="png")
     panels = {axes.get_ylabel(): curves(axes) for axes in figure.axes}
     assert list(panels) == ["v [1]", "u [1/m]", "n_s [N/m]", "m_s [N]"]
@@ -48,4 +47,4 @@ def test_it_draws_what_is_added_to_what_the_knowledge_has(states):
 def test_states_of_another_robot_are_refused(states):
     model = kc.fit(ROBOT.replace(youngs_modulus=10e9), [states])
     with pytest.raises(DataError, match=r"20 nodes .* the knowledge has 10"):
-        residual(model, kc.simulate(ROBOT.replace(nodes=20), kc.controls.sine(0.5, 5, DT), DT))
+        kc.figures.residual(model, kc.simulate(ROBOT.replace(nodes=20), kc.controls.sine(0.5, 5, DT), DT))

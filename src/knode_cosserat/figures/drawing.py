@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from knode_cosserat.controls import labels
-from knode_cosserat.evaluation.style import DASHES, PALETTE
+from knode_cosserat.figures.style import DASHES, PALETTE
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.trajectory import Trajectory
 
@@ -48,19 +48,12 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     beside = axes.get_subplotspec().get_gridspec().ncols
     inches = axes.get_figure(root=False).bbox.width / axes.get_figure(root=True).dpi / beside
     small = inches < 4.5
-    steps = 3 if small else 4
-    for axis, c, h in zip((axes.xaxis, axes.yaxis, axes.zaxis), centre, half, strict=True):
-        # no ticks near the ends, where labels of two axes collide; but at least two, for a scale
-        for most in range(steps, steps + 4):
-            ticks = [tick for tick in MaxNLocator(most).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
-            if len(ticks) > 1:
-                break
-        axis.set_ticks(ticks)
-    for axis, pad in ((axes.xaxis, 4.0), (axes.yaxis, 7.0), (axes.zaxis, 9.5)):
-        axis.labelpad = pad - 7.0 * small
-    axes.tick_params(axis="x", pad=-2.0 * small)
-    axes.tick_params(axis="y", pad=-2.0 * small)
-    axes.tick_params(axis="z", pad=3.0)
+    for name, label_pad, tick_pad in (("x", 4.0, -2.0 * small), ("y", 7.0, -2.0 * small), ("z", 9.5, 3.0)):
+        axis = getattr(axes, f"{name}axis")
+        # no ticks at the ends, where labels of two axes collide
+        axis.set_major_locator(MaxNLocator(4 if small else 5, prune="both"))
+        axis.labelpad = label_pad - 7.0 * small
+        axes.tick_params(axis=name, pad=tick_pad)
 
 
 def draw_tips(
@@ -281,13 +274,3 @@ def flat_height(points: NDArray[np.float64], view: str, width: float, beside: fl
     across, up = (span[AXES.index(name)] for name in view)
     shape = up / across if across > 0.0 else 4.0
     return float(np.clip((width - beside) * max(shape, 0.12) + 0.85, 1.6, 1.15 * width))
-
-
-# matplotlib
-
-
-def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure of a given size (in)."""
-    from knode_cosserat.evaluation.styled_figure import StyledFigure
-
-    return StyledFigure(figsize=(width, height), layout="constrained", dpi=150)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
-from knode_cosserat.evaluation.drawing import (
+from knode_cosserat.figures.drawing import (
     View,
     by_label,
     checked_view,
@@ -27,7 +27,7 @@ from knode_cosserat.evaluation.drawing import (
     legend_above,
     valid_rows,
 )
-from knode_cosserat.evaluation.style import PALETTE, style, width_of
+from knode_cosserat.figures.style import PALETTE, style, width_of
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:

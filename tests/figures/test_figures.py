@@ -7,7 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat import figures
-from knode_cosserat.evaluation.style import PALETTE
+from knode_cosserat.figures.style import PALETTE
 from knode_cosserat.metrics import dtw_distance
 
 # beyond the package's own warnings: those of matplotlib about what it is asked to draw

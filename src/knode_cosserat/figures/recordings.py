@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat.evaluation.drawing import AXES, Tips, draw_tips, legend_above, line, new_figure, tips_of
-from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.figures.drawing import AXES, Tips, draw_tips, legend_above, line, tips_of
+from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.metrics import dtw_distance, rms_distance
 
 if TYPE_CHECKING:
@@ -26,15 +26,12 @@ _MARKS = (
 )
 
 
-def health(recording: Recording, report: Health) -> Figure:
-    """Return a figure of a recording and its quality: tensions, positions, missing frames and noise.
-
-    Raises:
-        ImportError: matplotlib is not installed.
-    """
+def health(recording: Recording) -> Figure:
+    """Return a figure of a recording and its quality: tensions, positions, missing frames and noise."""
+    check_arguments(health, locals())
+    report = recording.health()
     robot = {True: "a simulated robot", False: "a physical robot", None: "not stated whether simulated"}
-    with style():
-        figure = new_figure(TWO_COLUMNS, 6.0)
+    with new_figure(TWO_COLUMNS, 6.0) as figure:
         figure.suptitle(f"{recording.source}\n{report.duration:.2f} s, {robot[recording.simulated]}")
         left, right = figure.subfigures(1, 2, width_ratios=(2.3, 1.0))
         axes = left.subplots(5, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0, 1.0, 0.9))
@@ -69,8 +66,7 @@ def prediction_against_measurement(prediction: Tips, recording: Measurements) ->
     dtw, rmse = dtw_distance(predicted, measured), float(rms_distance(predicted, measured))
     robot = "simulated stand-in robot" if recording.simulated else "robot"
     time = recording.time
-    with style():
-        figure = new_figure(TWO_COLUMNS, 4.4)
+    with new_figure(TWO_COLUMNS, 4.4) as figure:
         figure.suptitle(
             f"Tip, predicted and measured: DTW {dtw:.2f} m over {len(distance)} rows, "
             f"RMSE {100 * rmse:.1f} cm"

@@ -1,14 +1,4 @@
-"""Figures of trajectories in one style, for a screen or a paper; they need matplotlib, the extra `viz`.
-
-Every function returns a new `matplotlib.figure.Figure`. No window is opened and no global setting changes.
-`figure.savefig("it.pdf")` (or .svg, .png) embeds the fonts. The colours are Okabe and Ito's, and every axis
-has its unit. `columns` sets the width: one column of a paper (3.5 in) or two (7.16 in). `trajectories` is one
-trajectory, or a dict of several by label, which are overlaid. Each is of one robot; unsolved rows stay empty.
-
-Raises, from every function here:
-    ImportError: matplotlib is not installed.
-    ValueError: there is nothing to draw, or a batch is given where one robot is required.
-"""
+"""Figures of trajectories, batches, modes, workspaces and closed loops."""
 
 from __future__ import annotations
 
@@ -19,10 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat.evaluation.animation import animate
-from knode_cosserat.evaluation.comparison import REFERENCE
-from knode_cosserat.evaluation.comparison import comparison as compare
-from knode_cosserat.evaluation.drawing import (
+from knode_cosserat.figures.comparison import REFERENCE
+from knode_cosserat.figures.drawing import (
     AXES,
     Tips,
     View,
@@ -34,7 +22,6 @@ from knode_cosserat.evaluation.drawing import (
     flat_height,
     legend_above,
     line,
-    new_figure,
     one_of,
     path_of,
     require_span,
@@ -42,13 +29,12 @@ from knode_cosserat.evaluation.drawing import (
     tips_of,
     valid_rows,
 )
-from knode_cosserat.evaluation.recording_figures import prediction_against_measurement
-from knode_cosserat.evaluation.style import (
+from knode_cosserat.figures.style import (
     PALETTE,
     TIME_COLOURS,
     TWO_COLUMNS,
+    new_figure,
     require_matplotlib,
-    style,
     width_of,
 )
 from knode_cosserat.trajectory import Trajectory
@@ -59,12 +45,6 @@ if TYPE_CHECKING:
     from knode_cosserat.control import LoopLog
     from knode_cosserat.statics.modes import Modes
     from knode_cosserat.statics.workspace import Workspace
-
-__all__ = [
-    "animate", "closed_loop", "compare", "curves", "error", "overview", "path",
-    "prediction_against_measurement", "require_matplotlib", "shape", "spread", "states", "tensions", "tips",
-    "vibration", "workspace",
-]  # fmt: skip
 
 #: default fields of `states`, if the system has them
 FIELDS = ("q", "w", "n", "m", "v", "u")
@@ -84,10 +64,8 @@ def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, c
     view = checked_view(view, curves[0].shape[-1])
     points = np.concatenate([curve.reshape(-1, curve.shape[-1]) for curve in curves])
     width = width_of(columns)
-    several = len(trajectory.time) > 1
-    with style():
-        height = flat_height(points, view, width, 1.2 if several else 0.6)
-        figure = new_figure(width, height if len(view) == 2 else 0.85 * width)
+    height = flat_height(points, view, width, 1.2 if len(trajectory.time) > 1 else 0.6)
+    with new_figure(width, height if len(view) == 2 else 0.85 * width) as figure:
         _draw_shape(figure, trajectory, count, view)
     return figure
 
@@ -136,9 +114,8 @@ def path(
     paths = {label: path_of(one) for label, one in motions.items()}
     points = np.concatenate(list(paths.values()))
     view, width = checked_view(view, points.shape[1]), width_of(columns)
-    with style():
-        height = flat_height(points, view, width, 0.8)
-        figure = new_figure(width, height + 0.25 if len(view) == 2 else 0.9 * width)
+    height = flat_height(points, view, width, 0.8)
+    with new_figure(width, height + 0.25 if len(view) == 2 else 0.9 * width) as figure:
         seen = View(figure, 111, view)
         for i, (label, tip) in enumerate(paths.items()):
             look = {**line(i), "label": label or None}
@@ -157,8 +134,7 @@ def tips(trajectories: Tips | Mapping[str, Tips], *, columns: int = 1) -> Figure
     motions = by_label(trajectories)
     paths = {label: (one.time, tips_of(one)) for label, one in motions.items()}
     size = min(tip.shape[1] for _, tip in paths.values())
-    with style():
-        figure = new_figure(width_of(columns), 0.4 + 1.15 * size)
+    with new_figure(width_of(columns), 0.4 + 1.15 * size) as figure:
         axes = figure.subplots(size, 1, sharex=True, squeeze=False)[:, 0]
         draw_tips(axes, paths)
         figure.align_ylabels()
@@ -197,8 +173,7 @@ def states(
         raise ValueError(f"node is {node}; the trajectory has {first.y.shape[1]} nodes")
     across = min(columns, 2, len(names))
     rows = -(-len(names) // across)
-    with style():
-        figure = new_figure(width_of(columns), 0.5 + 1.5 * rows)
+    with new_figure(width_of(columns), 0.5 + 1.5 * rows) as figure:
         grid = figure.subplots(rows, across, sharex=True, squeeze=False).ravel()
         for axes, name in zip(grid, names, strict=False):
             for i, (label, one) in enumerate(motions.items()):
@@ -232,8 +207,7 @@ def error(truth: Tips, predictions: Tips | Mapping[str, Tips], *, columns: int =
     """
     check_arguments(error, locals())
     motions, true = by_label(predictions, "predictions"), tips_of(truth)
-    with style():
-        figure = new_figure(width_of(columns), 2.4)
+    with new_figure(width_of(columns), 2.4) as figure:
         axes = figure.subplots()
         for i, (label, one) in enumerate(motions.items()):
             tip = tips_of(one)
@@ -256,8 +230,7 @@ def tensions(trajectory: Trajectory, *, columns: int = 1) -> Figure:
     """Return a figure of every tendon's tension over time, held from row to row; or of the controls."""
     check_arguments(tensions, locals())
     one_of(trajectory)
-    with style():
-        figure = new_figure(width_of(columns), 2.4)
+    with new_figure(width_of(columns), 2.4) as figure:
         draw_tensions(figure.subplots(), trajectory)
     return figure
 
@@ -266,8 +239,7 @@ def overview(trajectory: Trajectory, count: int = 12) -> Figure:
     """Return one figure of shapes, tip path and tensions of a trajectory, two columns wide."""
     check_arguments(overview, locals())
     curves = curves_of(one_of(trajectory))
-    with style():
-        figure = new_figure(TWO_COLUMNS, 4.2)
+    with new_figure(TWO_COLUMNS, 4.2) as figure:
         left, right = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
         _draw_shape(left, trajectory, count, checked_view(None, curves[0].shape[-1]))
         size = curves[0].shape[-1]
@@ -289,8 +261,7 @@ def spread(batch: Trajectory, *, columns: int = 1) -> Figure:
     if np.ndim(batch.y) != 4:
         raise ValueError("the trajectory is of one robot; allowed is a batch")
     tip = np.asarray(batch.tip_position)
-    with style():
-        figure = new_figure(width_of(columns), 0.4 + 1.15 * tip.shape[2])
+    with new_figure(width_of(columns), 0.4 + 1.15 * tip.shape[2]) as figure:
         rows = figure.subplots(tip.shape[2], 1, sharex=True, squeeze=False)[:, 0]
         for k, axes in enumerate(rows):
             for (low, high), strength, label in (((0, 100), 0.18, "all"), ((5, 95), 0.4, "nine tenths")):
@@ -331,8 +302,7 @@ def curves(
     for label, values in lines.items():
         if np.shape(values) != at.shape:
             raise ValueError(f"the curve {label!r} has shape {np.shape(values)}; x has {len(at)} values")
-    with style():
-        figure = new_figure(width_of(columns), 2.4)
+    with new_figure(width_of(columns), 2.4) as figure:
         axes = figure.subplots()
         for i, (label, values) in enumerate(lines.items()):
             look = {**line(i), "marker": marker or None, "label": label or None}
@@ -361,8 +331,7 @@ def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
     across = min(len(shown), 3 if columns == 2 else 2)
     rows = -(-len(shown) // across)
     width = width_of(columns)
-    with style():
-        figure = new_figure(width, rows * (width / across + 0.2))
+    with new_figure(width, rows * (width / across + 0.2)) as figure:
         grid = figure.add_gridspec(rows, across)
         for k, shape in enumerate(shown):
             seen = View(figure, grid[divmod(k, across)], "xyz")
@@ -395,8 +364,7 @@ def workspace(samples: Workspace) -> Figure:
     shown = np.flatnonzero(samples.valid)[:MOST_POINTS]
     x, y, z = samples.position[shown].T
     total = samples.controls[shown].sum(axis=1)
-    with style():
-        figure = new_figure(TWO_COLUMNS, 3.2)
+    with new_figure(TWO_COLUMNS, 3.2) as figure:
         for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
             axes = figure.add_subplot(1, 2, k + 1)
             points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
@@ -416,8 +384,7 @@ def closed_loop(log: LoopLog) -> Figure:
     check_arguments(closed_loop, locals())
     wanted, tip = log.reference[:, :2], log.tip[:, :2]
     fallback = np.array([status != "optimal" for status in log.status])
-    with style():
-        figure = new_figure(TWO_COLUMNS, 4.2)
+    with new_figure(TWO_COLUMNS, 4.2) as figure:
         path, error, control, last = figure.subplots(2, 2).ravel()
         path.plot(*wanted.T, label="reference", **REFERENCE)
         path.plot(*tip.T, color=PALETTE[0], label="tip")

@@ -1,1 +1,0 @@
-"""Drawing behind `knode_cosserat.figures`, animations, and figures of recordings and residuals."""
