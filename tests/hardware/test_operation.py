@@ -17,7 +17,7 @@ from knode_cosserat_hardware.driver import DriverState, HardwareError, Limits
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion, StoppedError
 from knode_cosserat_hardware.simulated import MachineParameters, SimulatedRobot
-from tests.hardware.waiting import eventually
+from tests.hardware.waiting import eventually, free_computation
 
 pytestmark = pytest.mark.slow
 
@@ -171,7 +171,8 @@ def plant_of(robot, **more):
 AIM = kc.control.constant([0.05, 0.0, 0.62])
 
 
-def test_a_loop_moves_the_robot_and_keeps_the_time(robot, controller):
+def test_a_loop_moves_the_robot_and_keeps_the_time(robot, controller, monkeypatch):
+    free_computation(monkeypatch)
     plant = plant_of(robot)
     log = kc.control.run_loop(controller, plant, AIM, 1.5)
     assert len(log.time) == 25 and log.missed == 0 and plant.reduced == 0

@@ -20,6 +20,7 @@ from knode_cosserat_hardware.open_driver import open_driver
 from knode_cosserat_hardware.simulated import SimulatedRobot
 from tests.commands import run
 from tests.hardware.fake_board import FakeBoard
+from tests.hardware.waiting import free_computation
 
 pytestmark = pytest.mark.slow
 
@@ -184,7 +185,8 @@ def test_a_fault_while_recording_keeps_the_bag(folder):
     assert recording.sampled(0.05).time[-1] > 0.3
 
 
-def test_run_closes_the_loop(folder):
+def test_run_closes_the_loop(folder, monkeypatch):
+    free_computation(monkeypatch)
     words = ("robot", "run", "rod.yaml", "--port", "simulated", "--robot", "rod.yaml", "--yes", "--json")
     aim = ("--reference", "circle:radius=0.03,period=3", "--method", "kinematic", "--dt", "0.06")
     found = facts(run(*words, *aim, "--seconds", "1.5", "--out", "log.csv", "--recording", "loop.csv"))

@@ -1,6 +1,7 @@
 """Waits for what threads and other programs do."""
 
 import time
+from types import SimpleNamespace
 
 
 def eventually(condition, timeout=5.0):
@@ -14,3 +15,8 @@ def eventually(condition, timeout=5.0):
 def wait_for(condition, timeout=60.0):
     """Wait for a condition."""
     assert eventually(condition, timeout), "waited too long"
+
+
+def free_computation(monkeypatch):
+    """Let computations of a loop take no time: only the robot's own clock moves."""
+    monkeypatch.setattr("knode_cosserat.control.loop.clock", SimpleNamespace(perf_counter=lambda: 0.0))
