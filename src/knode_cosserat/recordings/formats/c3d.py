@@ -19,7 +19,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files import csv_rows
-from knode_cosserat._files.limits import excess
+from knode_cosserat._files.reading import require_limit
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.exports import MOST_COLUMNS, Channels, Track, export_table, length_unit
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -41,7 +42,7 @@ def read_c3d(path: Path, wanted: Collection[str] = ()) -> Table:
     try:
         return _C3D(data).table()
     except (struct.error, IndexError, ValueError) as error:
-        if isinstance(error, RecordingError):
+        if isinstance(error, KnodeCosseratError):
             raise
         raise RecordingError(f"this C3D file is damaged: {error}") from None
 
@@ -63,8 +64,7 @@ class _C3D:
     def table(self) -> Table:
         words = struct.unpack_from(f"{self.order}5H", self.data, 2)
         points = self._number("POINT:USED", words[0])
-        if reason := excess(3 * points, MOST_COLUMNS, "columns"):
-            raise RecordingError(f"{reason}")
+        require_limit(3 * points, MOST_COLUMNS, "columns")
         per_frame, analog = struct.unpack_from(f"{self.order}H", self.data, 18)[0], words[1]
         scale = self._number("POINT:SCALE", self._floats(self.data[12:16])[0], float)
         rate = self._number("POINT:RATE", self._floats(self.data[20:24])[0], float)
