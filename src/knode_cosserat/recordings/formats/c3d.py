@@ -5,9 +5,9 @@ processors, and data are floats or scaled integers. A marker with a negative fou
 parameters, `POINT:UNITS` states the unit of length and `POINT:Y_SCREEN` the axis that points up.
 
 A file is read as far as its frames are complete: a reader that requires header and parameters to agree would
-refuse files of several programs. That is why no library reads them. Of 300 files with a few changed bytes, 266
-are read here; c3d 0.6.0 refuses 83 of these, and ezc3d 1.7.2 ends or hangs the process on 15 of the 300, and
-does not read files of MIPS.
+refuse files of several programs. That is why no library reads them. Of 300 files with a few changed bytes,
+266 are read here; c3d 0.6.0 refuses 83 of these, and ezc3d 1.7.2 ends or hangs the process on 15 of the 300,
+and does not read files of MIPS.
 """
 
 from __future__ import annotations
