@@ -9,8 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from knode_cosserat._files.limits import excess
-from knode_cosserat._files.reading import ReadError, read_bytes
+from knode_cosserat._files.reading import ReadError, read_bytes, require_limit
 from knode_cosserat.errors import KnodeCosseratError, first_line
 
 
@@ -24,8 +23,7 @@ def read_arrays(path: str | Path, limit: int) -> dict[str, np.ndarray]:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = archive.infolist()
-            if reason := excess(sum(each.file_size for each in entries), limit, "bytes when unpacked"):
-                raise ReadError(reason)
+            require_limit(sum(each.file_size for each in entries), limit, "bytes when unpacked")
             return {each.filename.removesuffix(".npy"): _array(archive.read(each)) for each in entries}
     except KnodeCosseratError:
         raise

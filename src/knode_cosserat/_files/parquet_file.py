@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files.limits import MORE, allowed, excess
-from knode_cosserat._files.reading import ReadError
+from knode_cosserat._files.limits import MORE, allowed
+from knode_cosserat._files.reading import ReadError, require_limit
 from knode_cosserat.errors import KnodeCosseratError, first_line
 
 #: limits of a file: bytes, columns, rows (5.5 h at 1 kHz)
@@ -45,7 +45,7 @@ def open_parquet(path: Path, **options: Any) -> Iterator[Any]:
 
     try:
         size = path.stat().st_size
-        _require_limit(size, LARGEST_FILE, "bytes")
+        require_limit(size, LARGEST_FILE, "bytes")
         # not memory-mapped: a file that is cut off while it is read would end the process
         with pyarrow.parquet.ParquetFile(
             path,
@@ -54,7 +54,7 @@ def open_parquet(path: Path, **options: Any) -> Iterator[Any]:
             thrift_container_size_limit=min(allowed(MOST_ENTRIES), _INT32),
             **options,
         ) as file:
-            _require_limit(file.metadata.num_columns, MOST_COLUMNS, "columns")
+            require_limit(file.metadata.num_columns, MOST_COLUMNS, "columns")
             yield file
     except FileNotFoundError:
         raise ReadError("no such file") from None
@@ -73,7 +73,7 @@ def require_limited_expansion(metadata: Any, path: Path) -> None:
     """Raise `ReadError` if the expanded columns or pages exceed the limit."""
     groups = [metadata.row_group(k) for k in range(metadata.num_row_groups)]
     rows = max(metadata.num_rows, sum(group.num_rows for group in groups))
-    _require_limit(rows, MOST_ROWS, "rows")
+    require_limit(rows, MOST_ROWS, "rows")
     chunks = [group.column(k) for group in groups for k in range(metadata.num_columns)]
     # a list has several values in a row
     values = max(rows * metadata.num_columns, sum(chunk.num_values for chunk in chunks))
@@ -93,8 +93,3 @@ def expansion_limit(path: Path) -> tuple[int, str]:
 def _require(fair: bool, what: str) -> None:
     if not fair:
         raise ReadError(what)
-
-
-def _require_limit(number: int, limit: int, unit: str) -> None:
-    reason = excess(number, limit, unit)
-    _require(not reason, reason)

@@ -19,6 +19,12 @@ class ReadError(KnodeCosseratError, ValueError):
     code = "read"
 
 
+def require_limit(number: int, limit: int, unit: str) -> None:
+    """Raise `ReadError` if a file has more of a unit than the limit allows."""
+    if reason := excess(number, limit, unit):
+        raise ReadError(reason)
+
+
 def read_bytes(path: str | Path, limit: int) -> bytes:
     """Return the content of a file or pipe; `limit` is the largest number of bytes.
 
@@ -28,8 +34,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
     try:
         with open(path, "rb") as file:
             status = os.fstat(file.fileno())
-            if reason := excess(status.st_size, limit, "bytes"):
-                raise ReadError(reason)
+            require_limit(status.st_size, limit, "bytes")
             if stat.S_ISREG(status.st_mode):
                 return file.read()
             most, parts, size = allowed(limit), [], 0

@@ -9,8 +9,9 @@ import zlib
 from pathlib import Path
 from typing import Any
 
+from knode_cosserat._files import csv_rows
 from knode_cosserat._files.limits import MORE, allowed
-from knode_cosserat._files.reading import read_bytes
+from knode_cosserat._files.reading import read_bytes, require_limit
 from knode_cosserat.recordings.findings import RecordingError
 
 GZIP_MAGIC = b"\x1f\x8b"
@@ -71,6 +72,27 @@ def file_bytes(path: Path, limit: int) -> bytes:
         words = f"{ratio} times the file and {allowance}" if most < allowed(limit) else str(most)
         raise RecordingError(f"it has more than {most} bytes when decompressed; allowed are {words}; {MORE}")
     return content
+
+
+def text_of(data: bytes, *, or_latin: bool = False) -> str:
+    """Return the text of bytes in UTF-8, or with `or_latin` in the code page of Windows.
+
+    Raises:
+        ReadError: it has too many lines.
+        RecordingError: it is not UTF-8.
+    """
+    require_limit(data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n"), csv_rows.MOST_LINES, "lines")
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        if or_latin:
+            return data.decode("latin-1")
+        raise RecordingError("not a recording: no bag, and no CSV text: it is not UTF-8") from None
+
+
+def lines_of(text: str) -> list[str]:
+    """Return the lines of a text."""
+    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
 
 
 class Decompression:

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files import csv_rows
-from knode_cosserat._files.limits import excess
+from knode_cosserat._files.reading import require_limit
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.table import (
@@ -74,8 +74,7 @@ def export_table(
 
     if not tracks:
         raise RecordingError("it has no bodies and no markers with positions")
-    if reason := excess(3 * len(tracks), MOST_COLUMNS, "columns"):
-        raise RecordingError(f"{reason}")
+    require_limit(3 * len(tracks), MOST_COLUMNS, "columns")
     columns: dict[str, np.ndarray] = {TIME: time}
     remarks, names = list(findings), []
     for track in sorted(tracks, key=lambda track: track.quaternion is None):
@@ -136,17 +135,8 @@ def length_unit(word: str, default: str, findings: list[Finding]) -> float:
 
 
 def text_lines(path: Path) -> list[str]:
-    """Return the lines of a text file. Raises `RecordingError`."""
-    data = content.file_bytes(path, csv_rows.LARGEST_FILE)
-    newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
-    if reason := excess(newlines, csv_rows.MOST_LINES, "lines"):
-        raise RecordingError(f"{reason}")
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        # exporting programs write names and units in the code page of Windows
-        text = data.decode("latin-1")
-    return text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    """Return the lines of a text file, whose names and units may be in the code page of Windows."""
+    return content.lines_of(content.text_of(content.file_bytes(path, csv_rows.LARGEST_FILE), or_latin=True))
 
 
 Columns = Callable[[Sequence[int]], Float[np.ndarray, "n places"]]
@@ -160,8 +150,7 @@ def cells_reader(lines: Sequence[str], titles: Sequence[str], delimiter: str) ->
     """
     from knode_cosserat.recordings.formats.csv_table import cells_of
 
-    if reason := excess(len(titles), MOST_COLUMNS, "columns"):
-        raise RecordingError(f"{reason}")
+    require_limit(len(titles), MOST_COLUMNS, "columns")
     rows = [line for line in lines if line.strip(f"{delimiter} \t")]
     if not rows:
         raise RecordingError("no rows after the header")

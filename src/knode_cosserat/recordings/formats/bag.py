@@ -21,7 +21,8 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat._files.limits import MORE, excess
+from knode_cosserat._files.limits import MORE
+from knode_cosserat._files.reading import require_limit
 from knode_cosserat._files.writing import replacing, temporary_folder
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.content import EXPANDED, Decompression
@@ -219,8 +220,7 @@ def _scan_mcap(file: _Scan, data: bytes, position: int, in_chunk: bool = False) 
 def read_sqlite(path: Path, wanted: Collection[str], data: bytes | None = None) -> Bag:
     """Return the same as `read_ros1` for a SQLite file, or for its bytes. Raises `RecordingError`."""
     size = path.stat().st_size if data is None else len(data)
-    if reason := excess(size, content.LARGEST_BAG, "bytes"):
-        raise RecordingError(f"{reason}")
+    require_limit(size, content.LARGEST_BAG, "bytes")
     # without a journal beside it the file is only read; with one, SQLite has to look into both
     journal = path.with_name(path.name + "-wal").exists()
     address = f"file:{urllib.parse.quote(str(path))}?mode=ro" + ("" if journal else "&immutable=1")

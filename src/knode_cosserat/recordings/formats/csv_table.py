@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from knode_cosserat._files import csv_rows
-from knode_cosserat._files.limits import excess
+from knode_cosserat._files.reading import require_limit
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.recordings import content
 from knode_cosserat.recordings.findings import Finding, RecordingError
@@ -37,18 +37,13 @@ def read_csv(data: bytes) -> Table:
     Raises:
         RecordingError: the bytes are no table of numbers, or have too many lines or columns.
     """
-    newlines = data.count(b"\n") + data.count(b"\r") - data.count(b"\r\n")
-    _require(excess(newlines, csv_rows.MOST_LINES, "lines"))
-    try:
-        text = data.decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise RecordingError("not a recording: no bag, and no CSV text: it is not UTF-8") from None
-    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    text = content.text_of(data)
+    lines = content.lines_of(text)
     metadata, first = _comments(lines)
     delimiter = delimiter_of(lines[first : first + 10 * _SAMPLE])
     # a quoted cell can have line breaks, so that the header may not be one of the lines
     columns = 1 + max((line.count(delimiter) for line in itertools.islice(lines, first, None)), default=0)
-    _require(excess(columns, csv_rows.MOST_COLUMNS, "columns"))
+    require_limit(columns, csv_rows.MOST_COLUMNS, "columns")
     table, about_units = _titled(cells_of(text, delimiter))
     return Table(metadata, numbers_of(table), (*_about_comments(lines, first), *about_units))
 
@@ -66,12 +61,6 @@ def delimiter_of(lines: Sequence[str]) -> str:
             *counts[delimiter][:1],
         ),
     )
-
-
-def _require(reason: str) -> None:
-    """Raise `RecordingError` if there is a reason to refuse a file."""
-    if reason:
-        raise RecordingError(f"{reason}")
 
 
 def _comments(lines: Sequence[str]) -> tuple[dict[str, str], int]:
