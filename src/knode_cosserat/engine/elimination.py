@@ -350,7 +350,7 @@ class EliminationCode(RodCode):
                 for at in rows:
                     f.store(scale * f.load(column(matrix, c), at, self.L), column(matrix, c), at)
         with f.loop(k) as c:
-            found = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in rows]
+            found = [self._wide_variable(0.0) for _ in rows]
             with f.loop(k) as r:
                 number = f.load(column(Q, r), c.value * component, self.P)
                 for each, at in zip(found, rows, strict=True):
@@ -422,7 +422,7 @@ class EliminationCode(RodCode):
         `slopes` and `rates` are functions at a place. The first corrections for each point have new factors.
         """
         f, ny = self._now, self.equations.ny
-        left, turns = Variable(f, f.value(float("inf"))), Variable(f, f.value(0, "i64"))
+        left, turns = Variable(f, f.value(math.inf)), Variable(f, f.value(0, "i64"))
         with f.while_(lambda: (left.get() > FILLED) & (turns.get() < most * FILLING)):
             turn = f.result(f"srem i64 {turns.get().name}, {FILLING}", "i64")
             with f.if_(turn < RENEWALS):

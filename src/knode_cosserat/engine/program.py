@@ -773,7 +773,7 @@ class Program:
             elif name in ("stack", "inputs"):
                 found[node] = self._stack_tangents(self.entries(node), found)
             elif name == "entry":
-                found[node] = self._entry_tangents(*operands, found)
+                found[node] = self._entry_tangents(operands[0], operands[1], found)
             elif (rule := self.rules.get(node)) is not None:
                 self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -468,8 +469,8 @@ class RodCode(Memory):
                 variable.set(f.select(value > variable.get(), value, variable.get()))
             finite.set(finite.get() + f.select(inside, totals[0] + totals[1], 0.0))
         # a comparison drops NaN; a sum keeps it
-        known = f.compare("lt", finite.get(), float("inf"))
-        return [self._largest(f.select(known, each.get(), float("inf"))) for each in found]
+        known = f.compare("lt", finite.get(), math.inf)
+        return [self._largest(f.select(known, each.get(), math.inf)) for each in found]
 
     def _unit(self, i: int, j: Index) -> Value:
         """Return 1 over the natural unit of a component of y at a point."""
@@ -482,7 +483,7 @@ class RodCode(Memory):
         for i in range(self.equations.k):
             size = f.apply("abs", self._get(self.tip, i)) * self._get(self.scale_tip, i)
             found = f.apply("max", found, size)
-        return f.select(found < float("inf"), found, float("inf"))
+        return f.select(found < math.inf, found, math.inf)
 
     def _write_base(self, unknowns: Array, y: Array, history: Array) -> None:
         e = self.equations

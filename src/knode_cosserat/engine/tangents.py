@@ -464,7 +464,7 @@ class CotangentCore(_TangentCode):
         """Add the cotangents of parameters from those of places and lengths: once a run."""
         e = self.equations
         self.by_geometry = f = self._function("by_geometry", "state")
-        total = Variable(f, f.splat(f.value(0.0), self.L))
+        total = self._wide_variable(0.0)
         for array, parts in (self.place, self.s_parts), (self.length_of_piece, self.h_parts):
             count = self._used_places(array)
             for _, j in self._components(1, count):
