@@ -154,8 +154,8 @@ class Core(EliminationCode):
             with f.if_(linearises):
                 f.call(self.linearise, memory)
                 f.call(self.weigh, memory)
-                for variable, value in (factors, NEW), (damping, 1.0), (size, infinity):
-                    variable.set(f.select(active, value, variable.get()))
+                for variable, initial in (factors, NEW), (damping, 1.0), (size, infinity):
+                    variable.set(f.select(active, initial, variable.get()))
                 linearisations.set(linearisations.get() + f.select(active, 1.0, 0.0))
                 self._write_point(self.trial, lambda y: y, self.iterate)
                 f.call(self.defects, memory)

@@ -389,12 +389,15 @@ class Elimination:
                 found[i, i] = apply("add", program.constant(part), int(found[i, i]))
             return found
 
-        def products(slopes: np.ndarray, matrix: Any) -> Any:
-            found = np.full((n, n), zero)
+        def change_of_rates(slopes: np.ndarray, right: Any) -> Any:
+            """Return the derivatives of rates times a matrix or a vector."""
+            right = np.asarray(right)
+            found = np.full(right.shape, zero)
             for node, (i, k) in zip(slopes, equations.pattern, strict=True):
-                for j in np.flatnonzero(matrix[k] != zero):
-                    term = apply("mul", int(node), int(matrix[k, j]))
-                    found[i, j] = apply("add", int(found[i, j]), term)
+                for at in np.ndindex(right.shape[1:]):
+                    if right[k, *at] != zero:
+                        term = apply("mul", int(node), int(right[k, *at]))
+                        found[i, *at] = apply("add", int(found[i, *at]), term)
             return found
 
         def derivative(side: int, sign: float) -> Any:
@@ -404,7 +407,7 @@ class Elimination:
                 rates[side][at] = node
             for slopes, stage in zip(self.slopes[2:], stages, strict=True):
                 part = (1.0 - stage.end, stage.end)[side]
-                rates.append(products(slopes, combine(part, stage.rates, rates)))
+                rates.append(change_of_rates(slopes, combine(part, stage.rates, rates)))
             return combine(1.0, [sign * weight for weight in weights], rates)
 
         A, B = derivative(0, 1.0), derivative(1, -1.0)
@@ -461,29 +464,22 @@ class Elimination:
         #: entries of A that are not constant
         self.entries = [(i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))]
 
-        def change_of_rates(slopes: np.ndarray, by: Sequence[int]) -> list[int]:
-            """Return the change of rates by a change of y."""
-            found = [zero] * n
-            for node, (i, k) in zip(slopes, equations.pattern, strict=True):
-                found[i] = apply("add", found[i], apply("mul", int(node), by[k]))
-            return found
-
-        def add_rates(to: list[int], factors: Sequence[float], rates: Sequence[list[int]]) -> list[int]:
+        def add_rates(to: list[int], factors: Sequence[float], rates: Sequence[np.ndarray]) -> list[int]:
             """Return numbers plus h Σ factor rate."""
             for factor, rate in zip(factors, rates, strict=False):
                 scaled = apply("mul", self.h, program.constant(factor))
-                to = [apply("add", a, apply("mul", scaled, b)) for a, b in zip(to, rate, strict=True)]
+                products = (apply("mul", scaled, int(each)) for each in rate)
+                to = [apply("add", a, b) for a, b in zip(to, products, strict=True)]
             return to
 
         start = [int(node) for node in self.x]
         for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
             start[i] = apply("add", start[i], apply("mul", int(node), int(self.x[j])))
-        rates = [change_of_rates(self.slopes[0], start), [zero] * n]
+        rates = [change_of_rates(self.slopes[0], start), np.full(n, zero)]
         for slopes, stage in zip(self.slopes[2:], stages, strict=True):
             part = program.constant(1.0 - stage.end)
-            rates.append(
-                change_of_rates(slopes, add_rates([apply("mul", part, x) for x in start], stage.rates, rates))
-            )
+            y = add_rates([apply("mul", part, x) for x in start], stage.rates, rates)
+            rates.append(change_of_rates(slopes, y))
         right = [apply("add", int(r), x) for r, x in zip(self.r, start, strict=True)]
         #: B⁻¹ (A x + r), with A x by slopes: less to store than A
         self.advance = solve(add_rates(right, weights, rates))
