@@ -119,7 +119,7 @@ class ArrayCode:
             return
         name = self.program.operations[node][0]
         if name == "stack":
-            self._values[node] = self._copied(self.program.arguments(node))
+            self._values[node] = self._copy(self.program.arguments(node))
             return
         if name == "spread":
             self._values[node] = self._spread(node)
@@ -141,19 +141,19 @@ class ArrayCode:
             return False
         return all(self.value(each) is not None for each, _ in self._sources(node))
 
-    def _reserved(self, count: int, lanes: int) -> Stored:
+    def _reserve(self, count: int, lanes: int) -> Stored:
         kind = "double" if lanes == 1 else f"<{lanes} x double>"
         return Stored(self.function.address(self.function.reserve(f"[{count} x {kind}]")), lanes, lanes)
 
     def _lanes(self, nodes: Iterable[int]) -> int:
         return max(self.value(each).lanes for node in nodes for each, _ in self._sources(node))
 
-    def _copied(self, scalars: Sequence[int]) -> Stored:
+    def _copy(self, scalars: Sequence[int]) -> Stored:
         """Write scalars to memory."""
         f, found = self.function, [self.value(each) for each in scalars]
         if all(self.program.is_constant(each) for each in scalars):
             return Stored(f.address(f.module.constants([self.program.values[each] for each in scalars])), 1)
-        target = self._reserved(len(found), max(each.lanes for each in found))
+        target = self._reserve(len(found), max(each.lanes for each in found))
         for k, each in enumerate(found):
             self._store(each, target, k * target.distance)
         return target
@@ -161,7 +161,7 @@ class ArrayCode:
     def _spread(self, node: int) -> Stored:
         """Write zeros with entries of an array added."""
         lanes, count = self._lanes([node]), math.prod(self.program.shapes[node])
-        target = self._reserved(count, lanes)
+        target = self._reserve(count, lanes)
         with self.function.loop(count) as k:
             self.function.store(0.0, target.base, k.value * target.distance, lanes)
         _, part, positions, _ = self.program.operations[node]
@@ -192,9 +192,9 @@ class ArrayCode:
     def load(self, node: int, k: int) -> Value:
         """Return an entry of an array in memory."""
         stored = self.value(node)
-        return self.loaded(node, stored.base, k * stored.distance)
+        return self.load_number(node, stored.base, k * stored.distance)
 
-    def loaded(self, node: int, base: Value, offset: int) -> Value:
+    def load_number(self, node: int, base: Value, offset: int) -> Value:
         """Return the number or truth of an array at an address."""
         found = self.function.load(base, offset, self.value(node).lanes)
         return self.function.compare("ne", found, 0.0) if self.program.is_boolean(node) else found
@@ -220,7 +220,7 @@ class ArrayCode:
     def _write_entries(self, nodes: Sequence[int]) -> None:
         """Write arrays of the same shape entry by entry."""
         shape, lanes = self.program.shapes[nodes[0]], self._lanes(nodes)
-        targets = [self._reserved(math.prod(shape), lanes) for _ in nodes]
+        targets = [self._reserve(math.prod(shape), lanes) for _ in nodes]
         strides = [stride * lanes for stride in Positions.whole(shape).strides]
         with contextlib.ExitStack() as loops:
             indices = [loops.enter_context(self.function.loop(count)) for count in shape]
@@ -228,7 +228,7 @@ class ArrayCode:
             terms = _Terms(self, self._pointers(sources, indices))
             at = self._offset(indices, strides)
             for node, target in zip(nodes, targets, strict=True):
-                self._store(terms.computed(node), target, at)
+                self._store(terms.compute(node), target, at)
         self._values.update(zip(nodes, targets, strict=True))
 
     def _rows(self, nodes: Sequence[int], width: int) -> tuple[int, int]:
@@ -241,7 +241,7 @@ class ArrayCode:
         f, added = self.function, [self.program.operations[node][1] for node in nodes]
         *outer, count = self.program.shapes[added[0]]
         lanes, size = self._lanes(nodes), math.prod(outer)
-        targets = [self._reserved(size, lanes) for _ in nodes]
+        targets = [self._reserve(size, lanes) for _ in nodes]
         strides = [stride * lanes for stride in Positions.whole(tuple(outer)).strides]
         start, end = self._rows(nodes, outer[-1] if outer else 1)
         most = min(end - start, ROWS, REGISTERS // len(nodes))
@@ -289,16 +289,16 @@ class _Terms:
             return code.value(node)
         place = code.place(node)
         if place is None:
-            return self.computed(node, shift)
+            return self.compute(node, shift)
         base, positions = place
         offset = positions.first + (shift * positions.strides[-2] if shift else 0)
         key = base, positions.strides, offset
         if key not in self._known:
             distance = code.value(base).distance
-            self._known[key] = code.loaded(base, self._pointers[key[:2]], offset * distance)
+            self._known[key] = code.load_number(base, self._pointers[key[:2]], offset * distance)
         return self._known[key]
 
-    def computed(self, node: int, shift: int = 0) -> Value:
+    def compute(self, node: int, shift: int = 0) -> Value:
         """Return the value of an operation on arrays."""
         name, *arguments = self._code.program.operations[node]
         values = [self.value(each, shift) for each in arguments]

@@ -424,7 +424,7 @@ class Function:
             raise EngineError(f"engine: no machine code for {name!r}")
         self.module.declarations.add(f"declare double @{name}({', '.join(['double'] * len(values))})")
         lanes = range(values[0].lanes)
-        return self.joined([self._call(name, [self.lane(each, k) for each in values]) for k in lanes])
+        return self.join([self._call(name, [self.lane(each, k) for each in values]) for k in lanes])
 
     def _call(self, name: str, values: Sequence[Value]) -> Value:
         given = ", ".join(f"{each.type} {each.name}" for each in values)
@@ -436,7 +436,7 @@ class Function:
             return value
         return self.result(f"extractelement {value.type} {value.name}, i32 {k}", value.kind)
 
-    def joined(self, numbers: Sequence[Value]) -> Value:
+    def join(self, numbers: Sequence[Value]) -> Value:
         """Return the vector of these numbers."""
         if len(numbers) == 1:
             return numbers[0]
@@ -448,7 +448,7 @@ class Function:
             found = one.name
         return one
 
-    def transposed(self, rows: Sequence[Value]) -> list[Value]:
+    def transpose(self, rows: Sequence[Value]) -> list[Value]:
         """Return the transpose of as many vectors as each has lanes."""
         found, n = list(rows), len(rows)
         for size in itertools.takewhile(lambda size: size < n, (1, 2, 4, 8)):
@@ -456,11 +456,11 @@ class Function:
             for i in (i for i in range(n) if not i & size):
                 pair = found[i], found[i + size]
                 found[i], found[i + size] = (
-                    self._shuffled(*pair, [k + shift for k in low]) for shift in (0, size)
+                    self._shuffle(*pair, [k + shift for k in low]) for shift in (0, size)
                 )
         return found
 
-    def _shuffled(self, a: Value, b: Value, lanes: Sequence[int]) -> Value:
+    def _shuffle(self, a: Value, b: Value, lanes: Sequence[int]) -> Value:
         """Return the vector of these lanes of two vectors."""
         picked = ", ".join(f"i32 {k}" for k in lanes)
         vector = f"shufflevector {a.type} {a.name}, {b.type} {b.name}, <{len(lanes)} x i32> <{picked}>"
@@ -468,11 +468,11 @@ class Function:
 
     def largest(self, value: Value) -> Value:
         """Return the largest number of all lanes."""
-        return self._folded(value, lambda a, b: self.select(a > b, a, b))
+        return self._fold(value, lambda a, b: self.select(a > b, a, b))
 
     def total(self, value: Value) -> Value:
         """Return the sum of all lanes."""
-        return self._folded(value, operator.add)
+        return self._fold(value, operator.add)
 
     def any(self, value: Value) -> Value:
         """Return true if a lane is true."""
@@ -482,7 +482,7 @@ class Function:
         self.module.declarations.add(f"declare i1 @{name}({value.type})")
         return self.result(f"call i1 @{name}({value.type} {value.name})", "i1")
 
-    def _folded(self, value: Value, operation: Operator) -> Value:
+    def _fold(self, value: Value, operation: Operator) -> Value:
         """Return an operation of all lanes, in pairs."""
         if value.lanes <= 2:
             return functools.reduce(operation, [self.lane(value, k) for k in range(value.lanes)])
@@ -494,7 +494,7 @@ class Function:
             )
             for each in indices
         ]
-        return self._folded(operation(*halves), operation)
+        return self._fold(operation(*halves), operation)
 
     # memory
 

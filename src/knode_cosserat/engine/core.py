@@ -114,7 +114,7 @@ class Core(EliminationCode):
         return self._states_of(self.motion), self._states_of(self.shape)
 
     def _states_of(self, parts: list[list[Array]]) -> _Packed:
-        arrays = self._packed([*itertools.chain(*parts)])
+        arrays = self._pack([*itertools.chain(*parts)])
         rest = iter(arrays)
         return sum(map(self._size_of, arrays)), [[next(rest) for _ in part] for part in parts]
 
@@ -154,8 +154,8 @@ class Core(EliminationCode):
             with f.if_(linearises):
                 f.call(self.linearise, memory)
                 f.call(self.weigh, memory)
-                for variable, value in (factors, NEW), (damping, 1.0), (size, infinity):
-                    variable.set(f.select(active, value, variable.get()))
+                for variable, initial in (factors, NEW), (damping, 1.0), (size, infinity):
+                    variable.set(f.select(active, initial, variable.get()))
                 linearisations.set(linearisations.get() + f.select(active, 1.0, 0.0))
                 self._write_point(self.trial, lambda y: y, self.iterate)
                 f.call(self.defects, memory)
@@ -226,10 +226,10 @@ class Core(EliminationCode):
 
     # the corrected motion
 
-    def _write_recorded(self) -> None:
+    def _write_record(self) -> None:
         """Rates and residual of y, the defects of the scheme's check formula, and the records."""
         e = self.equations
-        self.recorded = f = self._function("recorded", "n_estimates", "coefficients")
+        self.record = f = self._function("record", "n_estimates", "coefficients")
         memory, estimates, _ = f.arguments
         f.call(self.residual_of_y, memory)
         formula, check = self.space.formula, self.space.check
@@ -247,7 +247,7 @@ class Core(EliminationCode):
         e = self.equations
         self.check = f = self._function("check", "n_estimates", "coefficients")
         memory, estimates, coefficients = f.arguments
-        f.call(self.recorded, memory, estimates, coefficients)
+        f.call(self.record, memory, estimates, coefficients)
         f.call(self.weigh, memory)
         self._raise_error(self._residual_norm())
         # the residual of the solution is no part of its errors
@@ -396,21 +396,21 @@ class Core(EliminationCode):
         for i, j in self._components(self.equations.numbers, self._count("used")):
             self._write_wide(carried(i, j), self.time_dH, i, j)
         with f.if_(f.compare("ne", earlier[self.settings.stages - 1], 0.0)):
-            f.call(self.moved, memory)
+            f.call(self.respond, memory)
             # J / c0 times the defect: its product with the derivatives of the step, less the defect itself
             for i, j, product in self._numbers_of(self.tangents, "used between"):
                 added = -c0 * product - self._wide(self.move, i, j)
                 self._write_wide(carried(i, j) + added, self.time_dH, i, j)
 
-    def _write_moved(self) -> None:
+    def _write_response(self) -> None:
         """Changes of a linearised step by `move` of the history: of the solution, and of its record."""
         e = self.equations
-        self.moved = f = self._function("moved")
+        self.respond = f = self._function("respond")
         memory = f.arguments[0]
         self._write_each(self.dy, "points", lambda: 0.0)
         f.call(self.products, memory)
         state = self._base_state(self.unknowns, self.H) | self._tangents_of_history(self.bases)
-        moved = self._evaluated(e.products["base"], 0, False, state)
+        moved = self._evaluate(e.products["base"], 0, False, state)
         for k, value in enumerate(moved):
             self._put(value, self.w, k % e.ny, self.bases[k // e.ny])
         f.call(self.correct, memory)
@@ -433,12 +433,12 @@ class Core(EliminationCode):
         memory, changes, columns, size = f.arguments
         with f.loop(columns) as column:
             own = f.pointer(changes, column.value * size)
-            for inside, outside in self._packed_vectors([self.move], own):
+            for inside, outside in self._each_packed_vector([self.move], own):
                 f.store(f.load(outside, 0, self.L), inside, 0)
-            f.call(self.moved, memory)
+            f.call(self.respond, memory)
             for i, j, value in self._numbers_of(self.tangents, "used between"):
                 self._write_wide(value, self.move, i, j)
-            for inside, outside in self._packed_vectors([self.move], own):
+            for inside, outside in self._each_packed_vector([self.move], own):
                 f.store(f.load(inside, 0, self.L), outside, 0)
 
     def _write_products(self) -> None:
@@ -468,11 +468,11 @@ class Core(EliminationCode):
                 here = self._at_stage(k, j)
                 state = self._state_with_tangents(y, self._before_stage(k, j), here)
                 self._write_results(results, here, state)
-        self._write_missing(ends, rates)
+        self._write_defects_of_pieces(ends, rates)
         state = self._tip_state(self.y, self.H) | self._tangents_of_history(self.tips)
         for tip, nodes in zip(self.tips, e.dy, strict=True):
             state |= {int(node): self._get(self.dy, i, tip) for i, node in enumerate(nodes)}
-        for i, value in enumerate(self._evaluated(e.products["tip"], 0, False, state)):
+        for i, value in enumerate(self._evaluate(e.products["tip"], 0, False, state)):
             self._put(value, self.tip, i)
 
     def _tangents_of_history(self, points: Sequence[Any]) -> dict[int, Value]:
@@ -662,7 +662,7 @@ class Core(EliminationCode):
             own = f.pointer(motions, k * size)
             for condition, state in states:
                 with f.if_(condition):
-                    for inside, outside in self._packed_vectors(state, own):
+                    for inside, outside in self._each_packed_vector(state, own):
                         f.store(f.load(outside, 0, L), inside, 0)
             with f.loop(self.params.size * P, 0, P) as i:
                 value = f.load(parameters, k * (self.params.size * P) + i.value, P)
@@ -679,7 +679,7 @@ class Core(EliminationCode):
             moved = self._spread(f.load(reached, 0, P) >= least)
             for condition, state in states:
                 with f.if_(condition):
-                    for inside, outside in self._packed_vectors(state, own):
+                    for inside, outside in self._each_packed_vector(state, own):
                         f.store(f.select(moved, f.load(inside, 0, L), f.load(outside, 0, L)), outside, 0)
 
     def _write_evaluate(self) -> None:
@@ -691,7 +691,7 @@ class Core(EliminationCode):
         self._write_inputs(f.load(coefficients, 0), f.load(coefficients, self.settings.memory + 2), control)
         if self.near:
             self._write_filling(most, self.rates_and_slopes, self.rates)
-        f.call(self.recorded, memory, 1, coefficients)
+        f.call(self.record, memory, 1, coefficients)
 
     def _write(self) -> None:
         self._write_setup()
@@ -704,7 +704,7 @@ class Core(EliminationCode):
         self.defects = self._function("defects")
         self._write_defects(self.trial.y, self.H)
         if not self.batch:
-            self.solved = self._write_solved()
+            self.solve_piece = self._write_piece_solution()
         self._write_factor()
         self.advance = self._write_advance()
         self._write_along()
@@ -712,13 +712,13 @@ class Core(EliminationCode):
         self._write_correct()
         self._write_weights()
         self._write_newton()
-        self._write_recorded()
+        self._write_record()
         self._write_check()
         self.estimate_of_grid = self._write_estimate("estimate_of_grid", self.errors, self.dH, True, POSITION)
         self._write_static_estimate()
         if self.time_defect:
             self._write_products()
-            self._write_moved()
+            self._write_response()
             time = self.time_errors, self.time_dH
             self.estimate_of_time = self._write_estimate("estimate_of_time", *time, False, TIME)
             self._write_time_history()
@@ -755,8 +755,8 @@ class Core(EliminationCode):
             y, records, defects, inverse, tip = (self._numbers(memory[None], each)[0, 0] for each in arrays)
             pieces = slice(counts["pieces"])
             error = np.max(np.abs(defects[pieces]) * inverse[pieces])
-            y = self._joined(self.y, y, counts["points of strand"])
-            records = self._joined(self.records[0], records, counts.grid.count)
+            y = self._join(self.y, y, counts["points of strand"])
+            records = self._join(self.records[0], records, counts.grid.count)
             return Evaluated(y.copy(), records.copy(), error, tip[0].copy())
 
         return evaluate

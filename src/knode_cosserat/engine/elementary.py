@@ -65,7 +65,7 @@ def _power(f: Function, k: Value) -> Value:
     return _number(f, _whole(f, "shl", _bits(f, k + (WHOLE + 1023.0)), 52))
 
 
-def _reduced(f: Function, x: Value) -> tuple[Value, Value]:
+def _reduce(f: Function, x: Value) -> tuple[Value, Value]:
     """Return k and exp(r) - 1, with exp(x) = 2ᵏ exp(r)."""
     k = f.intrinsic("roundeven", x * (1.0 / math.log(2.0)))
     r = (x - k * LN2[0]) - k * LN2[1]
@@ -75,12 +75,12 @@ def _reduced(f: Function, x: Value) -> tuple[Value, Value]:
 
 def exp(f: Function, x: Value) -> Value:
     """Return the exponential function; very large and small results by two factors, rounded once."""
-    k, grown = _reduced(f, x)
+    k, grown = _reduce(f, x)
     shift = _whole(f, "shl", _bits(f, k + WHOLE), 52)
     found = f.variable(_number(f, _whole(f, "add", _bits(f, 1.0 + grown), shift)))
     with f.if_(f.any(~(f.apply("abs", x) < 708.0))):
         bounded = f.select(x > 720.0, 720.0, f.select(x < -760.0, -760.0, x))
-        k, grown = _reduced(f, bounded)
+        k, grown = _reduce(f, bounded)
         half = f.apply("floor", k * 0.5)
         found.set((1.0 + grown) * _power(f, half) * _power(f, k - half))
     return found.get()
@@ -89,7 +89,7 @@ def exp(f: Function, x: Value) -> Value:
 def expm1(f: Function, x: Value) -> Value:
     """Return the exponential function less 1."""
     x = f.select(x > 709.9, 709.9, f.select(x < -100.0, -100.0, x))
-    k, grown = _reduced(f, x)
+    k, grown = _reduce(f, x)
     scale = _power(f, k - 1.0)
     return f.select(f.compare("eq", k, 0.0), grown, 2.0 * (scale * grown + (scale - 0.5)))
 

@@ -35,7 +35,7 @@ RENEWALS, FILLED = 2, 1e-10
 class EliminationCode(RodCode):
     """Functions that factor a linearisation and solve for corrections."""
 
-    solved: Function
+    solve_piece: Function
     advance: Function
     #: true if A and B are needed, and not B⁻¹ A
     keeps_both = False
@@ -53,7 +53,7 @@ class EliminationCode(RodCode):
         if any(i // ny != c // self.own for i, c, _ in self.equations.base_slopes):
             raise EngineError("engine: the base of a strand depends on the unknowns of another")
         #: structural nonzeros of X, of a change of the unknowns, and of M
-        self.nonzero_X, self.nonzero_T = self._filled()
+        self.nonzero_X, self.nonzero_T = self._nonzeros_along()
         self.nonzero_M = np.zeros((k, ny), dtype=bool)
         for i, c, _ in self.equations.tip_slopes:
             self.nonzero_M[i, c % ny] = True
@@ -93,7 +93,7 @@ class EliminationCode(RodCode):
         """Number of pieces of a group, and of groups of a strand."""
         return self._count("pieces of group"), self._count("groups of strand")
 
-    def _filled(self) -> tuple[np.ndarray, np.ndarray]:
+    def _nonzeros_along(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the structural nonzeros of X and of T anywhere along the rod."""
         ny, X, T = (
             self.equations.ny,
@@ -107,11 +107,13 @@ class EliminationCode(RodCode):
             X = X | self.elimination.nonzero @ X | X @ T
         return X, T
 
-    def _used(self, nonzero: np.ndarray) -> list[bool]:
+    def _nonzero_blocks(self, nonzero: np.ndarray) -> list[bool]:
         """Return true for the blocks of a column that are not zero."""
         return [bool(nonzero[row : row + self._rows_at_once].any()) for row in self._blocks(len(nonzero))]
 
-    def _write_solved(self, name: str = "solved", columns: int = 1, rows: Sequence[int] = ()) -> Function:
+    def _write_piece_solution(
+        self, name: str = "solve_piece", columns: int = 1, rows: Sequence[int] = ()
+    ) -> Function:
         """A piece's B⁻¹ r, of one column or of several one after the other, which are zero in other rows."""
         f, el = self._function(name, "from", "to", "n_piece"), self.elimination
         _, source, target, piece = f.arguments
@@ -122,9 +124,9 @@ class EliminationCode(RodCode):
         for c in range(columns):
             own = {int(el.r[i]): f.load(source, (c * n + i) * component, self.L) for i in rows}
             every.append(factors | own)
-        for c, values in enumerate(f.side_by_side(el.program, [el.solved[i] for i in rows], every)):
+        for c, values in enumerate(f.side_by_side(el.program, [el.solution[i] for i in rows], every)):
             for i in rows:
-                f.store(values[el.solved[i]], target, (c * n + i) * component, self.L)
+                f.store(values[el.solution[i]], target, (c * n + i) * component, self.L)
         return f
 
     def _blocks_of_rows(self) -> list[range]:
@@ -137,14 +139,15 @@ class EliminationCode(RodCode):
         """Factors and the matrix B⁻¹ A of all pieces, from the slopes at their ends and stages."""
         el, n, blocks = self.elimination, self.equations.ny, self._blocks_of_rows()
         # a function for each block: LLVM's time grows faster than the size of a function
-        self.factors = [self._write_factor_of(f"factored{k}", rows) for k, rows in enumerate(blocks)]
+        self.factors = [self._write_factor_of(f"factorise{k}", rows) for k, rows in enumerate(blocks)]
         # nothing is to be solved for a constant field
-        blocks = [rows for rows in blocks if any(el.solved[i] != int(el.r[i]) for i in rows)]
+        blocks = [rows for rows in blocks if any(el.solution[i] != int(el.r[i]) for i in rows)]
         if self.has_matrix:
             solved_columns = [
-                self._write_solved(f"solved_columns{k}", COLUMNS, rows) for k, rows in enumerate(blocks)
+                self._write_piece_solution(f"solved_columns{k}", COLUMNS, rows)
+                for k, rows in enumerate(blocks)
             ]
-        self.factored = f = self._function("factored")
+        self.factorise = f = self._function("factorise")
         memory = f.arguments[0]
         for function in self.factors:
             f.call(function, memory)
@@ -209,8 +212,8 @@ class EliminationCode(RodCode):
             for i, node in enumerate(el.r):
                 own[int(node)] = f.load(added[0], i * self.L, self.L) if has_added else zero
             every.append(known | own)
-        for c, values in enumerate(f.side_by_side(el.program, el.advanced, every)):
-            for i, node in enumerate(el.advanced):
+        for c, values in enumerate(f.side_by_side(el.program, el.advance, every)):
+            for i, node in enumerate(el.advance):
                 f.store(values[node], target, (c * n + i) * self.L, self.L)
         return f
 
@@ -242,7 +245,7 @@ class EliminationCode(RodCode):
             others = [c for c in range(k) if c != r and self.nonzero_X[pivot, c]]
             factors = {c: self._entry(columns[c], pivot) * scale for c in others}
             for matrix, nonzero in ((columns, self.nonzero_X), (eye, self.nonzero_T)):
-                pivotal, used = matrix[r], self._used(nonzero[:, r])
+                pivotal, used = matrix[r], self._nonzero_blocks(nonzero[:, r])
                 for c in others:
                     blocks = zip(matrix[c], pivotal, used, strict=True)
                     matrix[c] = [a - factors[c] * b if some else a for a, b, some in blocks]
@@ -254,7 +257,7 @@ class EliminationCode(RodCode):
         if self.batch:
             return [f.splat(f.value(float(i == c)), self.L) for i in range(rows)]
         lanes = range(self.L)
-        return [f.joined([f.value(float(row + i == c)) for i in lanes]) for row in self._blocks(rows)]
+        return [f.join([f.value(float(row + i == c)) for i in lanes]) for row in self._blocks(rows)]
 
     def _write_along(self) -> None:
         """X along the strands from their bases; at the tips the inverse of M X."""
@@ -347,7 +350,7 @@ class EliminationCode(RodCode):
                 for at in rows:
                     f.store(scale * f.load(column(matrix, c), at, self.L), column(matrix, c), at)
         with f.loop(k) as c:
-            found = [Variable(f, f.splat(f.value(0.0), self.L)) for _ in rows]
+            found = [self._wide_variable(0.0) for _ in rows]
             with f.loop(k) as r:
                 number = f.load(column(Q, r), c.value * component, self.P)
                 for each, at in zip(found, rows, strict=True):
@@ -364,7 +367,7 @@ class EliminationCode(RodCode):
         """Return a matrix times a vector; `nonzero` are the matrix's structural nonzeros."""
         found: list[Any] = [None] * len(columns[0])
         for c, (column, number) in enumerate(zip(columns, x, strict=True)):
-            used = [True] * len(column) if nonzero is None else self._used(nonzero[:, c])
+            used = [True] * len(column) if nonzero is None else self._nonzero_blocks(nonzero[:, c])
             for block, part in enumerate(column):
                 if used[block]:
                     product = number * part
@@ -379,14 +382,14 @@ class EliminationCode(RodCode):
         memory = f.arguments[0]
         self._write_places(self.rates_and_slopes, self.y, self.H, slopes=True)
         self._write_ends(self.slope, self.slope_end)
-        f.call(self.factored, memory)
+        f.call(self.factorise, memory)
         state = self._base_state(self.unknowns, self.H)
-        values = self._evaluated([node for *_, node in self.equations.base_slopes], 0, False, state)
+        values = self._evaluate([node for *_, node in self.equations.base_slopes], 0, False, state)
         for (i, c, _), value in zip(self.equations.base_slopes, values, strict=True):
             strand, row = divmod(i, e.ny)
             self._put(value, self.X, self._of_X(row, c % self.own), self.bases[strand])
         state = self._tip_state(self.y, self.H)
-        values = self._evaluated([node for *_, node in self.equations.tip_slopes], 0, False, state)
+        values = self._evaluate([node for *_, node in self.equations.tip_slopes], 0, False, state)
         for (i, c, _), value in zip(self.equations.tip_slopes, values, strict=True):
             strand, column = divmod(c, e.ny)
             self._put(value, self.M, column * self._padded(e.k) + i, strand)
@@ -400,7 +403,7 @@ class EliminationCode(RodCode):
         if not self.batch:
             with self._places(self._count("pieces")) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
-                f.call(self.solved, memory, *points, j.value)
+                f.call(self.solve_piece, memory, *points, j.value)
             wide = self._pointer(self.wide_added, 0), self.wide_added.component
             columns = self._pointer(self.added, 0), self.added.place
             self._transpose(ny, self._count("pieces"), wide, columns)
@@ -419,7 +422,7 @@ class EliminationCode(RodCode):
         `slopes` and `rates` are functions at a place. The first corrections for each point have new factors.
         """
         f, ny = self._now, self.equations.ny
-        left, turns = Variable(f, f.value(float("inf"))), Variable(f, f.value(0, "i64"))
+        left, turns = Variable(f, f.value(math.inf)), Variable(f, f.value(0, "i64"))
         with f.while_(lambda: (left.get() > FILLED) & (turns.get() < most * FILLING)):
             turn = f.result(f"srem i64 {turns.get().name}, {FILLING}", "i64")
             with f.if_(turn < RENEWALS):
@@ -432,7 +435,7 @@ class EliminationCode(RodCode):
             self._write_defects(self.y, self.H)
             with self._places(self._count("pieces")) as j:
                 points = self._pointer(self.r, j), self._pointer(self.wide_added, j)
-                f.call(self.solved, f.arguments[0], *points, j.value)
+                f.call(self.solve_piece, f.arguments[0], *points, j.value)
             left.set(0.0)
             with f.loop(self._count("filled")) as cut:
                 point = self._from_table(self.filled.offset, cut.value * 3)
@@ -466,7 +469,7 @@ class EliminationCode(RodCode):
                 )
                 self._set_column([a - b for a, b in zip(w, moved, strict=True)], self.w, ny, 0, last)
                 group = f.index(strand.value * count + g.value)
-                self._set_column(self._gathered(w, self.pivots), self.beta, own, 0, group)
+                self._set_column(self._gather(w, self.pivots), self.beta, own, 0, group)
             tip = f.index(base + self._count("tip 0"))
             with f.loop(tip.value, base + count * size) as j:
                 piece(j)
@@ -480,7 +483,7 @@ class EliminationCode(RodCode):
         unknowns = [-each for each in self._product(inverse, [self._entry(tip_values, c) for c in range(k)])]
         for q in range(self.strands):
             rows = list(range(q * own, (q + 1) * own))
-            self._set_column(self._gathered(unknowns, rows), self.alpha, own, 0, q)
+            self._set_column(self._gather(unknowns, rows), self.alpha, own, 0, q)
 
         def correct(start: Any, stop: Any) -> None:
             """Write the corrections of points that share their unknowns."""
@@ -509,10 +512,10 @@ class EliminationCode(RodCode):
             correct(base, base + 1)
             self._set_column([each.get() for each in alpha], self.alpha, own, 0, strand)
 
-    def _gathered(self, column: list[Value], rows: list[int]) -> list[Value]:
+    def _gather(self, column: list[Value], rows: list[int]) -> list[Value]:
         """Return rows of a column as a column."""
         if self._rows_at_once == 1:
             return [column[row] for row in rows]
         f, numbers = self._now, [self._now.lane(column[p // self.L], p % self.L) for p in rows]
         numbers += [f.value(0.0)] * (self._padded(len(rows)) - len(rows))
-        return [f.joined(numbers[first : first + self.L]) for first in self._blocks(len(rows))]
+        return [f.join(numbers[first : first + self.L]) for first in self._blocks(len(rows))]

@@ -68,7 +68,7 @@ class Sizes:
         parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
         return np.concatenate([part.reshape(*part.shape[:-1], self.strands, -1) for part in parts], axis=-1)
 
-    def joined(self, values: np.ndarray) -> np.ndarray:
+    def join(self, values: np.ndarray) -> np.ndarray:
         """Return y or records by strand (…, strands, x of one) packed: (…, x of all)."""
         sizes = np.array([self.ny, self.ny + self.nz])
         parts = np.split(values, sizes[sizes < values.shape[-1]], axis=-1)
@@ -113,7 +113,7 @@ class Equations(Sizes):
             [nodes, *(program.inputs(f"{name}{q}", nodes.shape, STATE) for q in range(1, self.strands))]
             for name, nodes in (("y", self.y), ("history", self.history))
         )
-        whole_y, whole_history = np.concatenate(self.strand_y), self.joined(np.array(self.strand_history))
+        whole_y, whole_history = np.concatenate(self.strand_y), self.join(np.array(self.strand_history))
         self.unknowns = program.inputs("unknowns", (self.k,), STATE)
 
         def problem(step: Any, record: Any) -> StepProblem:
@@ -218,10 +218,10 @@ class Equations(Sizes):
         return sum(count for *_, count in self.slots(terms))
 
     def _hoist(self) -> None:
-        self.step_terms = self._hoisted(self._outputs, {STEP, RUN})
-        self.place_terms = self._hoisted(self._outputs, {PLACE})
+        self.step_terms = self._hoisted_terms(self._outputs, {STEP, RUN})
+        self.place_terms = self._hoisted_terms(self._outputs, {PLACE})
 
-    def _hoisted(self, outputs: Sequence[int] | np.ndarray, levels: set[int]) -> list[int]:
+    def _hoisted_terms(self, outputs: Sequence[int] | np.ndarray, levels: set[int]) -> list[int]:
         """Return the operations of these levels that operations of higher levels need."""
         program, found = self.program, set()
         for node in program.needed(outputs):
@@ -297,11 +297,11 @@ class TangentEquations(Equations):
         self.ds = program.inputs("ds", (), PLACE)
         tangents[self.s.item()] = self.ds.item()
         #: tangents of the results by the system, at fixed y, history and control
-        self.moved = {name: program.derivative(nodes, tangents) for name, nodes in results.items()}
-        outputs = [node for nodes in self.moved.values() for node in nodes]
-        self.moved_terms = self._hoisted(outputs, {STEP, RUN})
+        self.by_system = {name: program.derivative(nodes, tangents) for name, nodes in results.items()}
+        outputs = [node for nodes in self.by_system.values() for node in nodes]
+        self.moved_terms = self._hoisted_terms(outputs, {STEP, RUN})
         #: operations of the rates that all directions have in common
-        self.common = self._common(self.moved["rates"], [*self.dparameters, self.ds.item()])
+        self.common = self._common(self.by_system["rates"], [*self.dparameters, self.ds.item()])
 
     def _common(self, outputs: Sequence[int], directions: Sequence[int]) -> list[int]:
         """Return the operations at a state that are the same for all directions, and that others need."""
@@ -330,7 +330,7 @@ class TangentEquations(Equations):
             name: program.inputs(f"cotangent of {name}", (len(nodes),), STATE)
             for name, nodes in results.items()
         }
-        needed = self._scalars_of(self._hoisted([*itertools.chain(*results.values())], {STEP, RUN}))
+        needed = self._scalars_of(self._hoisted_terms([*itertools.chain(*results.values())], {STEP, RUN}))
         #: terms of a step by which moving parameters act
         self.moving_terms = sorted(program.dependent([*needed], moving).intersection(needed))
         #: cotangents of these terms, of the place, and of moving arrays, from those of the results at a place
@@ -341,7 +341,7 @@ class TangentEquations(Equations):
             for name, nodes in results.items()
         }
         outputs = [node for nodes in self.pulled.values() for node in nodes]
-        self.pulled_terms = self._hoisted(outputs, {STEP, RUN})
+        self.pulled_terms = self._hoisted_terms(outputs, {STEP, RUN})
         #: cotangents of the parameters from those of the terms, and of the length
         self.of_terms = program.inputs("cotangent of term", (len(self.moving_terms),), STEP)
         self.of_length = program.inputs("cotangent of length", (), RUN)
@@ -377,7 +377,7 @@ class Elimination:
             for name in ("start", "end", *(f"stage{k}" for k in range(len(stages))))
         ]
 
-        def combined(part: float, factors: Sequence[float], rates: Sequence[Any]) -> Any:
+        def combine(part: float, factors: Sequence[float], rates: Sequence[Any]) -> Any:
             """Return part 1 + h Σ factor rate."""
             found = np.full((n, n), zero)
             for factor, rate in zip(factors, rates, strict=False):
@@ -389,12 +389,15 @@ class Elimination:
                 found[i, i] = apply("add", program.constant(part), int(found[i, i]))
             return found
 
-        def products(slopes: np.ndarray, matrix: Any) -> Any:
-            found = np.full((n, n), zero)
+        def change_of_rates(slopes: np.ndarray, right: Any) -> Any:
+            """Return the derivatives of rates times a matrix or a vector."""
+            right = np.asarray(right)
+            found = np.full(right.shape, zero)
             for node, (i, k) in zip(slopes, equations.pattern, strict=True):
-                for j in np.flatnonzero(matrix[k] != zero):
-                    term = apply("mul", int(node), int(matrix[k, j]))
-                    found[i, j] = apply("add", int(found[i, j]), term)
+                for at in np.ndindex(right.shape[1:]):
+                    if right[k, *at] != zero:
+                        term = apply("mul", int(node), int(right[k, *at]))
+                        found[i, *at] = apply("add", int(found[i, *at]), term)
             return found
 
         def derivative(side: int, sign: float) -> Any:
@@ -404,8 +407,8 @@ class Elimination:
                 rates[side][at] = node
             for slopes, stage in zip(self.slopes[2:], stages, strict=True):
                 part = (1.0 - stage.end, stage.end)[side]
-                rates.append(products(slopes, combined(part, stage.rates, rates)))
-            return combined(1.0, [sign * weight for weight in weights], rates)
+                rates.append(change_of_rates(slopes, combine(part, stage.rates, rates)))
+            return combine(1.0, [sign * weight for weight in weights], rates)
 
         A, B = derivative(0, 1.0), derivative(1, -1.0)
         self.jump = program.inputs("jump", (len(equations.jumping),), 1)
@@ -457,34 +460,29 @@ class Elimination:
 
         self.r, self.x = program.inputs("r", (n,), 1), program.inputs("x", (n,), 1)
         #: B⁻¹ r
-        self.solved = solve([int(node) for node in self.r])
+        self.solution = solve([int(node) for node in self.r])
         #: entries of A that are not constant
         self.entries = [(i, j) for i, j in np.ndindex(A.shape) if not program.is_constant(int(A[i, j]))]
 
-        def moved(slopes: np.ndarray, by: Sequence[int]) -> list[int]:
-            """Return the change of rates by a change of y."""
-            found = [zero] * n
-            for node, (i, k) in zip(slopes, equations.pattern, strict=True):
-                found[i] = apply("add", found[i], apply("mul", int(node), by[k]))
-            return found
-
-        def added(to: list[int], factors: Sequence[float], rates: Sequence[list[int]]) -> list[int]:
+        def add_rates(to: list[int], factors: Sequence[float], rates: Sequence[np.ndarray]) -> list[int]:
             """Return numbers plus h Σ factor rate."""
             for factor, rate in zip(factors, rates, strict=False):
                 scaled = apply("mul", self.h, program.constant(factor))
-                to = [apply("add", a, apply("mul", scaled, b)) for a, b in zip(to, rate, strict=True)]
+                products = (apply("mul", scaled, int(each)) for each in rate)
+                to = [apply("add", a, b) for a, b in zip(to, products, strict=True)]
             return to
 
         start = [int(node) for node in self.x]
         for node, (i, j, _) in zip(self.jump, equations.jumping, strict=True):
             start[i] = apply("add", start[i], apply("mul", int(node), int(self.x[j])))
-        rates = [moved(self.slopes[0], start), [zero] * n]
+        rates = [change_of_rates(self.slopes[0], start), np.full(n, zero)]
         for slopes, stage in zip(self.slopes[2:], stages, strict=True):
             part = program.constant(1.0 - stage.end)
-            rates.append(moved(slopes, added([apply("mul", part, x) for x in start], stage.rates, rates)))
+            y = add_rates([apply("mul", part, x) for x in start], stage.rates, rates)
+            rates.append(change_of_rates(slopes, y))
         right = [apply("add", int(r), x) for r, x in zip(self.r, start, strict=True)]
         #: B⁻¹ (A x + r), with A x by slopes: less to store than A
-        self.advanced = solve(added(right, weights, rates))
+        self.advance = solve(add_rates(right, weights, rates))
 
 
 def _least_fill(nonzero: np.ndarray) -> list[int]:

@@ -54,7 +54,7 @@ class Add:
     coefficient: Coefficient = 1.0
     is_negative: bool = False
 
-    def transposed(self) -> Add:
+    def transpose(self) -> Add:
         """Return the transposed operation."""
         return dataclasses.replace(self, target=self.source, source=self.target)
 
@@ -66,7 +66,7 @@ class Scale:
     target: Number
     coefficient: Coefficient | None = None
 
-    def transposed(self) -> Scale:
+    def transpose(self) -> Scale:
         """Return the transposed operation."""
         return self
 
@@ -78,7 +78,7 @@ class Show:
     target: Number
     source: Number
 
-    def transposed(self) -> Add:
+    def transpose(self) -> Add:
         """Return the transposed operation."""
         return Add(self.source, self.target)
 
@@ -102,7 +102,7 @@ def write(memory: Memory, operations: Sequence[Operation], lanes: int, transpose
     sums = _Sums(memory, lanes)
     for operation in reversed(operations) if transposed else operations:
         if not isinstance(operation, Loop):
-            sums.add(operation.transposed() if transposed else operation)
+            sums.add(operation.transpose() if transposed else operation)
             continue
         sums.write_all()
         start, stop, f = operation.start, operation.stop, memory._now

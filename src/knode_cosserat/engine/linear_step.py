@@ -31,13 +31,13 @@ class LinearStep:
             core._numbers(self._memory[None], each)[0, 0] for each in (core.scale_y, core.scale_tip)
         )
         bases = [counts[f"base {q}"] for q in range(core.strands)]
-        self.scale_y, self.scale_tip = 1.0 / core.equations.joined(inverse[bases]), 1.0 / tip[0]
+        self.scale_y, self.scale_tip = 1.0 / core.equations.join(inverse[bases]), 1.0 / tip[0]
         #: where the numbers of a record are in the memory of a change
-        [packed] = core._packed([core.move])
+        [packed] = core._pack([core.move])
         self._size = core._size_of(packed)
         places = np.arange(self._size).reshape(packed.size, packed.component).T
         used = counts.grid.ends + len(core.space.formula.stages) * counts.grid.tip
-        self._at = core._joined(core.move, places, used).reshape(-1)
+        self._at = core._join(core.move, places, used).reshape(-1)
 
     @property
     def unit(self) -> Float[np.ndarray, " n"]:

@@ -97,9 +97,9 @@ def motions_of(system: System, steps: StepCoefficients, states: Any) -> Motions:
 
 def evaluators(system: System, settings: Settings) -> Iterator[Callable[..., Evaluated]]:
     """Yield a function that evaluates states, for each robot of a batch or for one (see `Core.evaluator`)."""
-    core, memory = core_of(Pattern.of(system), settings, robots=False), None
+    core = core_of(Pattern.of(system), settings, robots=False)
+    memory = core._empty_memory()
     for parameters in np.atleast_2d(packed(system)):
-        memory = core._empty_memory() if memory is None else memory
         yield core.evaluator(parameters, memory)
 
 

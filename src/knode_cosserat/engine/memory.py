@@ -126,7 +126,7 @@ class Memory:
         """Return the number of an array's places that are used."""
         return self._count(array.where) if array.where else array.count
 
-    def _packed_vectors(self, arrays: Sequence[Array], outside: Value) -> Iterator[tuple[Value, Value]]:
+    def _each_packed_vector(self, arrays: Sequence[Array], outside: Value) -> Iterator[tuple[Value, Value]]:
         """Write loops over vectors of arrays, and yield their addresses in memory and outside (`_packed`)."""
         f = self._now
         for array in arrays:
@@ -164,7 +164,7 @@ class Memory:
         if not self.batch:
             target[:, :, count:] = values[:, :, -1:]
 
-    def _packed(self, arrays: Sequence[Array]) -> list[Array]:
+    def _pack(self, arrays: Sequence[Array]) -> list[Array]:
         """Return arrays one after the other outside of the memory, of the places that are used."""
         found, at = list[Array](), 0
         for array in arrays:
@@ -287,7 +287,7 @@ class Memory:
                 first, then = (columns, inside) if back else (inside, columns)
                 values = [f.load(*at, L) for at in first]
                 values += [zero] * (L - len(values))
-                for value, at in zip(f.transposed(values), then, strict=False):
+                for value, at in zip(f.transpose(values), then, strict=False):
                     f.store(value, *at)
 
     def _variable(self, value: Any) -> Variable:
@@ -321,7 +321,7 @@ class Memory:
         if self.batch:
             return True
         f = self._now
-        numbers = f.joined([f.value(float(k)) for k in range(self.L)])
+        numbers = f.join([f.value(float(k)) for k in range(self.L)])
         here, stop = (
             f.result(f"sitofp i64 {each.name} to double") for each in (j.value, f.value(end, "i64"))
         )

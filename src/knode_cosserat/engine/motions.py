@@ -127,7 +127,7 @@ class Motions:
         for arrays, shape in zip(self._arrays, self._shapes, strict=True):
             count = math.prod(shape) // (len(arrays) * self.core._width(arrays[0]))
             view = self._view(motions, arrays)
-            values = self.core._joined(arrays[0], view, count)
+            values = self.core._join(arrays[0], view, count)
             found.append(values.reshape(-1, *shape)[: self.size])
         return self._kind(*found)
 
@@ -242,7 +242,7 @@ class Motions:
         )
         done = ends[:, 0].astype(int)
         if core.strands > 1:
-            rows = core.equations.joined(rows.reshape(*rows.shape[:-1], core.strands, -1))
+            rows = core.equations.join(rows.reshape(*rows.shape[:-1], core.strands, -1))
         numbers, unknowns = infos[..., :8], infos[..., 8:]
         error = np.max(numbers[..., ERROR], axis=-1)
         off, angle = numbers[..., -1, POSITION], numbers[..., -1, ANGLE]

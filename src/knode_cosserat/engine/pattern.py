@@ -122,7 +122,7 @@ def _kept_on_disk(
     from knode_cosserat.engine import sidecars  # which need all of the engine
 
     name = sidecars.name_of([each.system if isinstance(each, Pattern) else each for each in key])
-    attributes = None if name is None else sidecars.restored(name)
+    attributes = None if name is None else sidecars.restore(name)
     if attributes is not None:
         code = kind.__new__(kind)
         vars(code).update(attributes, **given)

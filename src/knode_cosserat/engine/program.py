@@ -124,7 +124,7 @@ class _Rule:
     #: places of the arguments with tangents, and the results' tangents, once needed
     product: tuple[list[int], _Product] | None = None
 
-    def traced(self) -> tuple[list[int], Any]:
+    def trace(self) -> tuple[list[int], Any]:
         """Return the places of the arguments with tangents, and the jaxpr of the results' tangents."""
         active = [k for k, each in enumerate(self.shapes) if np.issubdtype(each.dtype, np.floating)]
 
@@ -243,13 +243,13 @@ class Program:
         found = self._memo.get(key)
         if found is None:
             arguments = tuple(map(int, arguments))
-            found = self._simplified(operation, *arguments)
+            found = self._simplify(operation, *arguments)
             if found is None:
-                found = self._created(operation, *arguments)
+                found = self._create(operation, *arguments)
             self._memo[key] = found
         return found
 
-    def _created(self, operation: str, *arguments: int) -> int:
+    def _create(self, operation: str, *arguments: int) -> int:
         self._count += 1
         if self._count > self.limit:
             raise EngineError(f"engine: more than {self.limit} operations; use smaller laws")
@@ -263,7 +263,7 @@ class Program:
             self.choices.add(node)
         return node
 
-    def _simplified(self, operation: str, *arguments: int) -> int | None:
+    def _simplify(self, operation: str, *arguments: int) -> int | None:
         """Return an equal node that is simpler than the operation, or None."""
         values = [self.values[a] for a in arguments]
         if None not in values and operation in FOLDED:
@@ -296,14 +296,14 @@ class Program:
         ]
         return self.apply("select", p, *results)
 
-    def _negated(self, node: int) -> int | None:
+    def _opposite(self, node: int) -> int | None:
         """Return x if the node is -x."""
         name, *arguments = self.operations[node]
         return arguments[0] if name == "neg" else None
 
     def _simple_add(self, a: int, b: int) -> int | None:
         for x, y in ((a, b), (b, a)):
-            negated = self._negated(y)
+            negated = self._opposite(y)
             if negated is not None:
                 return self.apply("sub", x, negated)
         return None
@@ -315,7 +315,7 @@ class Program:
             return a
         if self.is_constant(a, 0.0):
             return self.apply("neg", b)
-        left, right = self._negated(a), self._negated(b)
+        left, right = self._opposite(a), self._opposite(b)
         if right is not None:
             return self.apply("add", a, right)
         return None if left is None else self.apply("neg", self.apply("add", left, b))
@@ -324,13 +324,13 @@ class Program:
         name, *arguments = self.operations[a]
         if name == "sub":
             return self._memo.get(("sub", *arguments[::-1]))
-        return self._negated(a)
+        return self._opposite(a)
 
     def _simple_mul(self, a: int, b: int) -> int | None:
         for x, y in ((a, b), (b, a)):
             if self.is_constant(x, -1.0):
                 return self.apply("neg", y)
-            negated = self._negated(y)
+            negated = self._opposite(y)
             if negated is not None:
                 return self.apply("neg", self.apply("mul", x, negated))
             name, *factors = self.operations[y]
@@ -345,7 +345,7 @@ class Program:
             return a
         if self.is_constant(b) and self.values[b] != 0.0:
             return self.apply("mul", a, self.constant(1.0 / self.values[b]))
-        negated = self._negated(b)
+        negated = self._opposite(b)
         if negated is not None:
             return self.apply("neg", self.apply("div", a, negated))
         one = self.constant(1.0)
@@ -354,7 +354,7 @@ class Program:
     def _simple_abs(self, a: int) -> int | None:
         if self.operations[a][0] in ("abs", "sqrt", "exp"):
             return a
-        negated = self._negated(a)
+        negated = self._opposite(a)
         return None if negated is None else self.apply("abs", negated)
 
     def _simple_pow(self, a: int, b: int) -> int | None:
@@ -394,9 +394,9 @@ class Program:
 
     def _simple_hold(self, a: int) -> int:
         stopped = self.operations[a][0] == "hold" and self.rules[a] is None
-        return a if stopped else self.held(a, None)
+        return a if stopped else self.hold(a, None)
 
-    def held(self, node: int, rule: _Rule | None) -> int:
+    def hold(self, node: int, rule: _Rule | None) -> int:
         """Return a node of the same value whose derivative follows a rule; None: it is zero."""
         while (known := self._memo.get(("held", node))) is not None:
             if self.rules[known] is rule:
@@ -408,7 +408,7 @@ class Program:
             self.shapes[new] = self.shapes[node]
         return new
 
-    def ruled(
+    def apply_rule(
         self, name: str, function: Any, shapes: Any, arguments: list[Nodes], values: Any
     ) -> list[Nodes]:
         """Return the results of a function with a derivative rule; `values` evaluates it."""
@@ -418,7 +418,7 @@ class Program:
             # before the results, because nodes are in the order of evaluation
             self._all_parts(arguments)
             for array in values():
-                held = [self.held(node, rule) for node in self.parts(array)]
+                held = [self.hold(node, rule) for node in self.parts(array)]
                 rule.results.append(self._nodes(held, array.shape))
             self._memo[key] = rule.results
         return self._memo[key]
@@ -447,7 +447,7 @@ class Program:
         self.shapes[node] = shape
         return node
 
-    def located(self, nodes: Nodes) -> tuple[Any, Positions] | None:
+    def locate(self, nodes: Nodes) -> tuple[Any, Positions] | None:
         """Return the array, or the operation of an array of inputs, of which scalars are regular entries."""
         at = bisect.bisect_right(self._families, nodes.flat[0], key=lambda family: family[0]) - 1
         if at < 0:
@@ -460,12 +460,12 @@ class Program:
 
     def is_computed(self, nodes: Nodes) -> bool:
         """Return True if scalars are regular entries of one array that is no input."""
-        found = self.located(nodes) if nodes.size > LARGEST_SPREAD else None
+        found = self.locate(nodes) if nodes.size > LARGEST_SPREAD else None
         return found is not None and isinstance(found[0], int)
 
     def array(self, nodes: Nodes) -> int:
         """Return an array of scalars: a view if they are regular entries of one array, otherwise a copy."""
-        found = self.located(nodes)
+        found = self.locate(nodes)
         if found is None:
             scalars = nodes.ravel().tolist()
             level = max(self.levels[node] for node in scalars)
@@ -533,7 +533,7 @@ class Program:
             return self.apply("neg", self.total(rest[0], count))
         if name == "mul":
             for factor, other in (rest, rest[::-1]):
-                found = self._chosen(factor, other)
+                found = self._choose(factor, other)
                 if found is not None:
                     return found
         return self._array(("sum", node, count), self.shapes[node][:-1], self.levels[node], False)
@@ -551,7 +551,7 @@ class Program:
         self._memo["unit", found] = k
         return found
 
-    def _chosen(self, factor: int, other: int) -> int | None:
+    def _choose(self, factor: int, other: int) -> int | None:
         """Return the entries that a product with a unit vector along the last axis chooses, or None."""
         base, *rest = self.operations[factor][1:] if self.operations[factor][0] == "view" else (factor,)
         one = self._memo.get(("unit", base))
@@ -728,7 +728,7 @@ class Program:
     ) -> set[int]:
         """Return the nodes from variables to outputs that move with the variables; see `gradient`."""
         independent, found = set(map(int, variables)), set[int]()
-        arguments = self.arguments if linear else self._differentiated
+        arguments = self.arguments if linear else self._sources_of_tangents
 
         def sources(node: int) -> Iterable[int]:
             return () if node in independent else arguments(node)
@@ -754,7 +754,7 @@ class Program:
         """Return tangents of the nodes needed, by variable; zero ones are left out."""
 
         def sources(node: int) -> Iterable[int]:
-            return () if node in seeds else self._differentiated(node)
+            return () if node in seeds else self._sources_of_tangents(node)
 
         found = {node: self._nonzero(each) for node, each in seeds.items()}
         for node in self._order(outputs, sources):
@@ -762,18 +762,18 @@ class Program:
                 continue
             name, *operands = self.operations[node]
             if name == "select":
-                found[node] = self._selected(node, found)
+                found[node] = self._select_tangents(node, found)
             elif name in PARTIALS:
-                found[node] = self._chained(node, found)
+                found[node] = self._chain_tangents(node, found)
             elif name in LINEAR:
                 argument, *parameters = operands
                 tangents = found.get(argument, {}).items()
                 images = {key: LINEAR[name].image(self, each, *parameters) for key, each in tangents}
                 found[node] = self._nonzero(images)
             elif name in ("stack", "inputs"):
-                found[node] = self._stacked(self.entries(node), found)
+                found[node] = self._stack_tangents(self.entries(node), found)
             elif name == "entry":
-                found[node] = self._of_entry(*operands, found)
+                found[node] = self._entry_tangents(operands[0], operands[1], found)
             elif (rule := self.rules.get(node)) is not None:
                 self._by_rule(rule, found)
             elif name == "loop" and any(found.get(a) for a in self.arguments(node)):
@@ -783,13 +783,13 @@ class Program:
     def _nonzero(self, tangents: dict[Any, int]) -> dict[Any, int]:
         return {key: node for key, node in tangents.items() if not self.is_constant(node, 0.0)}
 
-    def _selected(self, node: int, found: Tangents) -> dict[Any, int]:
+    def _select_tangents(self, node: int, found: Tangents) -> dict[Any, int]:
         _, p, *branches = self.operations[node]
         no, yes = (found.get(branch, {}) for branch in branches)
         zero = self.constant(0.0)
         return {k: self.apply("select", p, no.get(k, zero), yes.get(k, zero)) for k in {**no, **yes}}
 
-    def _chained(self, node: int, found: Tangents) -> dict[Any, int]:
+    def _chain_tangents(self, node: int, found: Tangents) -> dict[Any, int]:
         name, *arguments = self.operations[node]
         partials, zero = dict[int, int](), self.constant(0.0)
         for argument, partial in zip(arguments, PARTIALS[name], strict=True):
@@ -802,7 +802,7 @@ class Program:
                 total[key] = self.apply("add", total.get(key, zero), self.apply("mul", own, tangent))
         return self._nonzero(total)
 
-    def _stacked(self, scalars: Nodes, found: Tangents) -> dict[Any, int]:
+    def _stack_tangents(self, scalars: Nodes, found: Tangents) -> dict[Any, int]:
         """Return the tangents of an array of scalars.
 
         The variables are these scalars themselves if that takes fewer products: unit vectors choose columns
@@ -822,7 +822,7 @@ class Program:
             tangents[key] = self.array(own)
         return tangents
 
-    def _of_entry(self, array: int, k: int, found: Tangents) -> dict[Any, int]:
+    def _entry_tangents(self, array: int, k: int, found: Tangents) -> dict[Any, int]:
         """Return the tangents of an entry of an array, by variables that are no components of arrays."""
         total, zero = dict[Any, int](), self.constant(0.0)
         for key, tangent in found.get(array, {}).items():
@@ -832,7 +832,7 @@ class Program:
                 total[variable] = self.apply("add", total.get(variable, zero), self.apply("mul", own, slope))
         return self._nonzero(total)
 
-    def _differentiated(self, node: int) -> Iterable[int]:
+    def _sources_of_tangents(self, node: int) -> Iterable[int]:
         """Return the nodes that the derivative of a node depends on."""
         if self.operations[node][0] != "hold":
             return self.arguments(node)
@@ -849,7 +849,7 @@ class Program:
             active, product = self._product(rule)
             places = self._all_parts(rule.arguments[k] for k in active)
             own = [moving.get(node, {}).get(key, zero) for node in places]
-            tangents = self._replaced(product, dict(zip(product.inputs, own, strict=True)))
+            tangents = self._replace(product, dict(zip(product.inputs, own, strict=True)))
             for node, tangent in zip(results, tangents, strict=True):
                 if not self.is_constant(tangent, 0.0):
                     found[node][key] = tangent
@@ -857,7 +857,7 @@ class Program:
     def _product(self, rule: _Rule) -> tuple[list[int], _Product]:
         """Return the active arguments of a rule, and its results' tangents."""
         if rule.product is None:
-            active, jaxpr = rule.traced()
+            active, jaxpr = rule.trace()
             prefix, tangents = f"tangent {len(self.operations)}", []
             for k, nodes in enumerate(rule.arguments[k] for k in active):
                 if self.is_computed(nodes):
@@ -882,7 +882,7 @@ class Program:
         results = self._all_parts(rule.results)
         return (*self._all_parts(rule.arguments), *(self.operations[each][1] for each in results))
 
-    def _replaced(self, product: _Product, new: dict[int, int]) -> list[int]:
+    def _replace(self, product: _Product, new: dict[int, int]) -> list[int]:
         """Return the outputs with other nodes in the place of the inputs."""
         for node in product.steps:
             rule = self.rules.get(node)
@@ -897,7 +897,7 @@ class Program:
             for array in rule.results:
                 parts = self.parts(array)
                 values = [self.operations[each][1] for each in parts]
-                held = [self.held(new.get(each, each), copy) for each in values]
+                held = [self.hold(new.get(each, each), copy) for each in values]
                 new.update(zip(parts, held, strict=True))
                 copy.results.append(self._nodes(held, array.shape))
         return [new.get(node, node) for node in product.outputs]
@@ -1067,7 +1067,7 @@ def _cbrt(x: _Scalar) -> _Scalar:
     return x.of("sign") * x.of("eq", 0.0).of("select", size, 0.0)
 
 
-def _rounded_to_even(x: _Scalar) -> _Scalar:
+def _round_to_even(x: _Scalar) -> _Scalar:
     up = (x + 0.5).of("floor")
     odd = up.of("rem", 2.0).of("ne", 0.0)
     return odd.of("and", (up - x).of("eq", 0.5)).of("select", up, up - 1.0)
@@ -1184,9 +1184,9 @@ class _Evaluation:
         if name in RESHAPED:
             return [RESHAPED[name](arguments, params)]
         if name in REDUCED:
-            return [self._reduced(REDUCED[name], arguments[0], params["axes"])]
+            return [self._reduce(REDUCED[name], arguments[0], params["axes"])]
         if name in ACCUMULATED:
-            return [self._accumulated(ACCUMULATED[name], equation, *arguments)]
+            return [self._accumulate(ACCUMULATED[name], equation, *arguments)]
         if name in SCATTERED:
             return [self._do_scatter(equation, *arguments)]
         inner = next((params[key] for key in CALLS if key in params), None)
@@ -1215,13 +1215,13 @@ class _Evaluation:
         if name in ("and", "or", "not") and not boolean:
             raise self.error(equation, "of integers is not covered by the engine", "use booleans")
         if name == "div" and np.issubdtype(dtype, np.integer):
-            return lambda a, b: self.truncated(self.apply("div", a, b))
+            return lambda a, b: self.truncate(self.apply("div", a, b))
         return name
 
     def _differs(self, a: int, b: int) -> int:
         return self.apply("select", a, b, self.apply("not", b))
 
-    def truncated(self, a: int) -> int:
+    def truncate(self, a: int) -> int:
         """Return a number rounded towards zero."""
         return self.apply("mul", self.apply("sign", a), self.apply("floor", self.apply("abs", a)))
 
@@ -1243,7 +1243,7 @@ class _Evaluation:
         """Return an array, or the scalar that all entries are; None if the entries are few and different."""
         if (nodes == nodes.flat[0]).all():
             return int(nodes.flat[0])
-        few = nodes.size <= LARGEST_PRODUCT and self.program.located(nodes) is None
+        few = nodes.size <= LARGEST_PRODUCT and self.program.locate(nodes) is None
         return None if few else self.program.array(nodes)
 
     def where(self, condition: int, no: list[Nodes], yes: list[Nodes]) -> list[Nodes]:
@@ -1299,7 +1299,7 @@ class _Evaluation:
         if np.issubdtype(new_dtype, np.bool_):
             return self.elementwise(lambda a: self.apply("ne", a, zero), x)
         if np.issubdtype(old, np.floating) and np.issubdtype(new_dtype, np.integer):
-            return self.elementwise(self.truncated, x)
+            return self.elementwise(self.truncate, x)
         return x
 
     def _do_integer_pow(self, e: Any, x: Nodes) -> Nodes:
@@ -1307,7 +1307,7 @@ class _Evaluation:
 
     def _do_round(self, e: Any, x: Nodes) -> Nodes:
         is_even = int(e.params["rounding_method"]) == 1
-        return self._of_one(_rounded_to_even if is_even else FORMULAS["round"], x)
+        return self._of_one(_round_to_even if is_even else FORMULAS["round"], x)
 
     def _of_one(self, formula: Callable[[_Scalar], _Scalar], x: Nodes) -> Nodes:
         return self.elementwise(lambda node: formula(_Scalar(self.program, node)).node, x)
@@ -1335,7 +1335,7 @@ class _Evaluation:
 
     # reductions
 
-    def _accumulated(self, operation: str, e: Any, x: Nodes) -> Nodes:
+    def _accumulate(self, operation: str, e: Any, x: Nodes) -> Nodes:
         way = slice(None, None, -1 if e.params["reverse"] else 1)
         x = np.moveaxis(x, e.params["axis"], 0)[way]
         found = x.copy()
@@ -1343,7 +1343,7 @@ class _Evaluation:
             found[k] = self.elementwise(operation, found[k - 1], x[k])
         return np.moveaxis(found[way], 0, e.params["axis"])
 
-    def _reduced(self, operation: str, x: Nodes, axes: Sequence[int]) -> Nodes:
+    def _reduce(self, operation: str, x: Nodes, axes: Sequence[int]) -> Nodes:
         rest = tuple(k for k in range(x.ndim) if k not in axes)
         shape = tuple(x.shape[k] for k in rest)
         rows = x.transpose(*axes, *rest).reshape(-1, *shape)
@@ -1544,7 +1544,7 @@ class _Evaluation:
             total = program.total(self.apply("mul", *views), count)
             return program.entries(total).reshape((*batch, *free_a, *free_b))
         products = self.elementwise("mul", a[:, :, None, :], b[:, None, :, :])
-        return self._reduced("add", products, (3,)).reshape((*batch, *free_a, *free_b))
+        return self._reduce("add", products, (3,)).reshape((*batch, *free_a, *free_b))
 
     def _nonzero(self, x: Nodes) -> Any:
         """Return 1 for entries that are not structural zeros."""
@@ -1647,7 +1647,7 @@ class _Evaluation:
         jaxpr = Jaxpr((), list(known), list(e.outvars), [e], debug_info=info)
         function, shapes = jaxpr_as_fun(ClosedJaxpr(jaxpr, ())), [var.aval for var in known]
         name = f"{name} {[atom.val for atom in e.invars if isinstance(atom, Literal)]}"
-        return self.program.ruled(name, function, shapes, list(known.values()), values)
+        return self.program.apply_rule(name, function, shapes, list(known.values()), values)
 
     def _do_custom_jvp_call(self, e: Any, *arguments: Nodes) -> list[Nodes]:
         call_jaxpr = e.params["call_jaxpr"]

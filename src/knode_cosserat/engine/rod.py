@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import math
 import operator
 from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -112,13 +113,13 @@ class RodCode(Memory):
         strand, place = np.transpose([each for each in origins if each[1] < packed.shape[-2]])
         return self.equations.by_strand(packed)[..., place, strand, :]
 
-    def _joined(self, array: Array, values: np.ndarray, count: int) -> np.ndarray:
+    def _join(self, array: Array, values: np.ndarray, count: int) -> np.ndarray:
         """Return the numbers of all strands at the first places of the grid (…, count, width)."""
         if self._width(array) == array.size:
             return values[..., :count, :]
         first = {origin: k for k, origin in reversed(list(enumerate(self.counts.origins)))}
         places = [[first[q, j] for q in range(self.strands)] for j in range(count)]
-        return self.equations.joined(values[..., places, :])
+        return self.equations.join(values[..., places, :])
 
     def _node(self, node: Index) -> Index:
         """Return the point of a node."""
@@ -171,7 +172,7 @@ class RodCode(Memory):
             first += nodes.size
         return found
 
-    def _evaluated(
+    def _evaluate(
         self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any],
         sums: Sums = ((), True), stores: Stores | None = None,
     ) -> list[Value]:  # fmt: skip
@@ -265,7 +266,7 @@ class RodCode(Memory):
     def _write_results(self, results: Sequence[tuple[Array, Any]], j: Any, state: dict[int, Value]) -> None:
         """Write the values of nodes at a place into arrays."""
         stores = self._stores(((array, enumerate(nodes)) for array, nodes in results), j)
-        self._evaluated([node for _, nodes in results for node in nodes], j, True, state, stores=stores)
+        self._evaluate([node for _, nodes in results for node in nodes], j, True, state, stores=stores)
 
     def _rates_at(
         self, function: Function, y: Array, history: Array, j: Index, place: Index | None = None
@@ -343,7 +344,7 @@ class RodCode(Memory):
         """Write y at stage k, from y at starts of pieces and at points, and earlier rates."""
         for i, j in self._components(self.equations.ny, self._count("pieces")):
             ends = self._wide(y[0], i, j), self._wide(y[1], i, j + 1)
-            mean = self._weighted((1.0 - stage.end, stage.end), ends)
+            mean = self._weighted_sum((1.0 - stage.end, stage.end), ends)
             moved = self._increment(stage.rates, rates, i, j)
             self._write_wide(mean + moved, target, i, self._before_stage(k, j))
         with self._idle_pieces() as j:
@@ -360,7 +361,7 @@ class RodCode(Memory):
         """Return h times the weighted sum of a piece's rates: at its start, its end and its stages."""
         places = self._places_of(rates, j)
         values = [self._wide(array, i, place) for array, place in places[: len(weights)]]
-        return self._weighted(weights, values, self._wide(self.h, 0, j))
+        return self._weighted_sum(weights, values, self._wide(self.h, 0, j))
 
     def _places_of(self, rates: tuple[Array, Array], j: Index) -> list[tuple[Array, Index]]:
         """Return where a piece's rates are: at its start, its end and its stages."""
@@ -368,7 +369,7 @@ class RodCode(Memory):
         stages = ((at, self._at_stage(k, j)) for k in self.check_stages)
         return [(at, j), (end, j + int(end is at)), *stages]
 
-    def _weighted(self, weights: Sequence[float], values: Sequence[Value], unit: Any = 1.0) -> Value:
+    def _weighted_sum(self, weights: Sequence[float], values: Sequence[Value], unit: Any = 1.0) -> Value:
         """Return a weighted sum times a unit, by one product for each size of a weight."""
         found = self._now.value(0.0)
         for size in dict.fromkeys(abs(weight) for weight in weights if weight):
@@ -382,9 +383,9 @@ class RodCode(Memory):
 
     def _write_defects(self, y: Array, history: Array) -> None:
         e, far = self.equations, y if self.far is None else self.far
-        self._write_missing((far, y), (self.f, self.fe))
+        self._write_defects_of_pieces((far, y), (self.f, self.fe))
         at_tip = self._tip_state(y, history)
-        for i, value in enumerate(self._evaluated(e.tip, 0, False, at_tip)):
+        for i, value in enumerate(self._evaluate(e.tip, 0, False, at_tip)):
             self._put(value - self._get(self.tip_offset, i), self.tip, i)
 
     def _state_arrays(self, y: Array) -> StateArrays:
@@ -407,7 +408,7 @@ class RodCode(Memory):
                         yield i + first, here, self._wide(array, i, at)
                     first += size
 
-    def _write_missing(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
+    def _write_defects_of_pieces(self, y: tuple[Array, Array], rates: tuple[Array, Array]) -> None:
         """Write the defects of all pieces: y at their ends by the scheme, minus y."""
         for i, j in self._components(self.equations.ny, self._count("pieces")):
             change = self._wide(y[0], i, j) - self._wide(y[1], i, j + 1)
@@ -468,8 +469,8 @@ class RodCode(Memory):
                 variable.set(f.select(value > variable.get(), value, variable.get()))
             finite.set(finite.get() + f.select(inside, totals[0] + totals[1], 0.0))
         # a comparison drops NaN; a sum keeps it
-        known = f.compare("lt", finite.get(), float("inf"))
-        return [self._largest(f.select(known, each.get(), float("inf"))) for each in found]
+        known = f.compare("lt", finite.get(), math.inf)
+        return [self._largest(f.select(known, each.get(), math.inf)) for each in found]
 
     def _unit(self, i: int, j: Index) -> Value:
         """Return 1 over the natural unit of a component of y at a point."""
@@ -482,10 +483,10 @@ class RodCode(Memory):
         for i in range(self.equations.k):
             size = f.apply("abs", self._get(self.tip, i)) * self._get(self.scale_tip, i)
             found = f.apply("max", found, size)
-        return f.select(found < float("inf"), found, float("inf"))
+        return f.select(found < math.inf, found, math.inf)
 
     def _write_base(self, unknowns: Array, y: Array, history: Array) -> None:
         e = self.equations
         state = self._base_state(unknowns, history)
-        for k, value in enumerate(self._evaluated(e.base, 0, False, state)):
+        for k, value in enumerate(self._evaluate(e.base, 0, False, state)):
             self._put(value, y, k % e.ny, self.bases[k // e.ny])

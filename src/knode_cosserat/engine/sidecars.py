@@ -66,7 +66,7 @@ def name_of(key: Any) -> str | None:
     """Return the name of the sidecar of code that depends on a key; None if there can be none."""
     try:
         described = hashlib.sha256()
-        for part in _described(key, set()):
+        for part in _describe(key, set()):
             described.update(f"{len(part)} {part}".encode())
         described.update(f"{_surroundings()} {os.environ.get('KNODE_COSSERAT_CODE')}".encode())
     except (UnknownError, OSError, RecursionError):
@@ -74,7 +74,7 @@ def name_of(key: Any) -> str | None:
     return f"core-{described.hexdigest()}"
 
 
-def _described(value: Any, seen: set[int]) -> Iterator[str]:
+def _describe(value: Any, seen: set[int]) -> Iterator[str]:
     """Yield texts that are equal in two processes only if the value computes the same."""
     if value is None or value is ... or isinstance(value, (bool, int, float, complex, str, bytes, np.dtype)):
         yield f"{type(value).__name__} {value!r}"
@@ -87,7 +87,7 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         yield f"array {numbers.dtype} {numbers.shape} {hashlib.sha256(numbers.tobytes()).hexdigest()}"
     elif isinstance(value, types.CodeType):
         yield f"code {value.co_name} {value.co_code.hex()} {value.co_names} {value.co_varnames}"
-        yield from _all_described(value.co_consts, seen)
+        yield from _describe_all(value.co_consts, seen)
     elif id(value) in seen:
         yield "again"
     elif isinstance(value, (type, types.FunctionType)):
@@ -99,25 +99,25 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         yield f"{type(value).__module__} {type(value).__qualname__} {len(value)}"
         if isinstance(value, dict):
             value = list(value.items())
-        yield from _all_described(
+        yield from _describe_all(
             sorted(value, key=repr) if isinstance(value, (set, frozenset)) else value, seen
         )
     elif isinstance(value, functools.partial):
-        yield from _all_described((value.func, value.args, value.keywords), seen)
+        yield from _describe_all((value.func, value.args, value.keywords), seen)
     elif isinstance(value, (staticmethod, classmethod, types.MethodType)):
         yield f"{type(value).__qualname__}"
-        yield from _all_described((value.__func__, getattr(value, "__self__", None)), seen)
+        yield from _describe_all((value.__func__, getattr(value, "__self__", None)), seen)
     elif isinstance(value, (property, functools.cached_property)):
-        yield from _all_described([getattr(value, part, None) for part in ("fget", "fset", "func")], seen)
+        yield from _describe_all([getattr(value, part, None) for part in ("fget", "fset", "func")], seen)
     elif dataclasses.is_dataclass(value):
-        yield from _described(type(value), seen)
+        yield from _describe(type(value), seen)
         for field in dataclasses.fields(value):
             yield field.name
-            yield from _described(getattr(value, field.name, None), seen)
+            yield from _describe(getattr(value, field.name, None), seen)
     elif isinstance(value, types.ModuleType) and _is_versioned(value.__name__):
         yield f"module {value.__name__}"
     elif callable(inner := getattr(value, "__wrapped__", getattr(value, "method", None))):
-        yield from _all_described((type(value), inner), seen)
+        yield from _describe_all((type(value), inner), seen)
     elif _is_versioned(type(value).__module__) and _is_versioned(str(getattr(value, "__module__", "-"))):
         if (name := getattr(value, "__qualname__", getattr(value, "__name__", None))) is None:
             raise UnknownError
@@ -126,9 +126,9 @@ def _described(value: Any, seen: set[int]) -> Iterator[str]:
         raise UnknownError
 
 
-def _all_described(values: Any, seen: set[int]) -> Iterator[str]:
+def _describe_all(values: Any, seen: set[int]) -> Iterator[str]:
     for value in values:
-        yield from _described(value, seen)
+        yield from _describe(value, seen)
 
 
 def _is_versioned(module: str) -> bool:
@@ -137,24 +137,24 @@ def _is_versioned(module: str) -> bool:
     return top != "__main__" and (top == PACKAGE or top in LIBRARIES or top in sys.stdlib_module_names)
 
 
-def _captured(function: Any) -> list[Any]:
+def _captures(function: Any) -> list[Any]:
     cells = getattr(function, "__closure__", None) or ()
     return [cell.cell_contents for cell in cells]
 
 
 def _class(kind: type, seen: set[int]) -> Iterator[str]:
-    yield from _all_described(kind.__bases__, seen)
+    yield from _describe_all(kind.__bases__, seen)
     for name, value in sorted(vars(kind).items()):
         is_special = name.startswith("__") and not isinstance(value, types.FunctionType)
         if not is_special and name not in _GENERATED and name != "_abc_impl":
             yield name
-            yield from _described(value, seen)
+            yield from _describe(value, seen)
 
 
 def _function(function: types.FunctionType, seen: set[int]) -> Iterator[str]:
     """Describe a function with its defaults, what it captures, and the globals to which it refers."""
-    own = function.__code__, function.__defaults__, function.__kwdefaults__, _captured(function)
-    yield from _all_described(own, seen)
+    own = function.__code__, function.__defaults__, function.__kwdefaults__, _captures(function)
+    yield from _describe_all(own, seen)
     todo = [function.__code__]
     for code in todo:
         todo += [each for each in code.co_consts if isinstance(each, types.CodeType)]
@@ -164,9 +164,9 @@ def _function(function: types.FunctionType, seen: set[int]) -> Iterator[str]:
                 yield name
                 if isinstance(value, types.ModuleType) and not _is_versioned(value.__name__):
                     names = [each for each in code.co_names if hasattr(value, each)]
-                    yield from _all_described([getattr(value, each) for each in names], seen)
+                    yield from _describe_all([getattr(value, each) for each in names], seen)
                 else:
-                    yield from _described(value, seen)
+                    yield from _describe(value, seen)
 
 
 # content
@@ -209,7 +209,7 @@ def _object(module: str, name: str, fields: dict[str, Any]) -> Any:
     kind = getattr(importlib.import_module(module), name) if module.startswith(f"{PACKAGE}.") else None
     if kind is None or _fields(kind) is None:
         raise UnknownError
-    values = {key: _restored(each) for key, each in fields.items()}
+    values = {key: _restore(each) for key, each in fields.items()}
     if issubclass(kind, tuple):
         return tuple.__new__(kind, values.values())
     found = object.__new__(kind)
@@ -218,7 +218,7 @@ def _object(module: str, name: str, fields: dict[str, Any]) -> Any:
     return found
 
 
-def _restored(data: Any) -> Any:
+def _restore(data: Any) -> Any:
     """Return the value of JSON."""
     if not isinstance(data, dict):
         return data
@@ -235,9 +235,9 @@ def _restored(data: Any) -> Any:
     if name == "object":
         return _object(*content)
     if isinstance(content, list):
-        values = [_restored(each) for each in content]
+        values = [_restore(each) for each in content]
         return slice(*values) if name == "slice" else tuple(values) if name == "tuple" else values
-    return {key: _restored(each) for key, each in content.items()}
+    return {key: _restore(each) for key, each in content.items()}
 
 
 def _writes(value: Any) -> bool:
@@ -254,11 +254,11 @@ def forget_writers(found: Any) -> None:
             setattr(found, key, Sizes(*(getattr(value, each) for each in _fields(Sizes) or ())))
 
 
-def restored(name: str) -> dict[str, Any] | None:
+def restore(name: str) -> dict[str, Any] | None:
     """Return the attributes of an object from its sidecar; None if it is not complete on disk."""
     content = stored(name)
     try:
-        return None if content is None else _restored(json.loads(content))
+        return None if content is None else _restore(json.loads(content))
     except UnknownError:
         return None
 

@@ -146,7 +146,7 @@ class StepMap(EliminationCode):
         self.along = f = self._function("along")
         size, count = self.groups
 
-        advance = functools.partial(Loop, body=self._columns_advanced)
+        advance = functools.partial(Loop, body=self._advance_columns)
         with f.loop(self.strands) as strand:
             base = strand.value * self._count("points of strand")
             with f.loop(count) as g:
@@ -167,7 +167,7 @@ class StepMap(EliminationCode):
                     f.store(f.lane(row, c - block), f.pointer(f.arguments[0], column), place)
         self._write_inverse()
 
-    def _columns_advanced(self, j: Index) -> list[Operation]:
+    def _advance_columns(self, j: Index) -> list[Operation]:
         """Set X at the end of a piece."""
         found = list[Operation]()
         for block in range(0, self.own, COLUMNS):
@@ -181,7 +181,7 @@ class StepMap(EliminationCode):
     def _write_change(self, point: Index, group: Index) -> None:
         """Replace X at a point by X T, with T the inverse of X's rows of pivots: columns in turn."""
         f, L, own, blocks = self._now, COLUMNS, self.own, range(0, self.own, COLUMNS)
-        lanes = [f.joined([f.value(float(b + n)) for n in range(L)]) for b in blocks]
+        lanes = [f.join([f.value(float(b + n)) for n in range(L)]) for b in blocks]
         for i, (b, numbers) in itertools.product(range(own), zip(blocks, lanes, strict=True)):
             unit = f.select(f.compare("eq", numbers, float(i)), 1.0, 0.0)
             self._put(unit, self.T, self._of_X(i, b), group, L)
@@ -252,15 +252,15 @@ class StepMap(EliminationCode):
             near = t.y, self._place(f"near {k}")
             found += _copies(self.equations.ny, (t.newest, self._place("points") + k), near)
         if self.far is not None:
-            found.append(Loop(0, self._count("pieces"), self._jumped))
+            found.append(Loop(0, self._count("pieces"), self._add_jumps))
         if self.stages or self.equations.system.mixed:
             found += [Loop(0, self._count("ends"), self._change_of_rates), *self._near_ends(t.change)]
             for k in range(len(self.stages)):
-                found.append(Loop(0, self._count("pieces"), functools.partial(self._solved_between, k)))
+                found.append(Loop(0, self._count("pieces"), functools.partial(self._solve_stage, k)))
         if self.far is not None and self.rows["far"]:
-            found.append(Loop(0, self._count("pieces"), self._behind))
-        found.append(Loop(0, self._count("used"), functools.partial(self._recorded, c0)))
-        found.append(Loop(0, self._count("nodes"), functools.partial(self._shown, row)))
+            found.append(Loop(0, self._count("pieces"), self._add_jumps_at_fixed_y))
+        found.append(Loop(0, self._count("used"), functools.partial(self._set_record, c0)))
+        found.append(Loop(0, self._count("nodes"), functools.partial(self._show, row)))
         last = ((c % self.own, self._place(f"first alpha {c // self.own}")) for c in range(self.equations.k))
         return found + [Show(Number(unknowns, c), Number(t.alpha, *at)) for c, at in enumerate(last)]
 
@@ -342,7 +342,7 @@ class StepMap(EliminationCode):
         """Return a stage, its place in a piece, and that among the places between ends."""
         return self.space.formula.stages[k], self._at_stage(k, j), self._before_stage(k, j)
 
-    def _advanced(self, j: Index) -> list[Operation]:
+    def _advance(self, j: Index) -> list[Operation]:
         """Set w at the end of a piece: its defect at fixed y, and w at its start by the factors."""
         e, t, formula = self.equations, self.tangents, self.space.formula
         end, found = [Number(t.w, i, j + 1) for i in range(e.ny)], self._moved(j)
@@ -395,7 +395,7 @@ class StepMap(EliminationCode):
             )
             for i in range(t.base.size)
         )
-        found.append(Loop(0, self.strands, self._strand_ahead))
+        found.append(Loop(0, self.strands, self._sweep_to_tip))
         for i, c, _ in e.tip_slopes:
             strand, component = divmod(c, e.ny)
             entry = self._entry_at(self.M, k, i, component, strand)
@@ -405,9 +405,9 @@ class StepMap(EliminationCode):
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
             found.append(Add(alpha[i], Number(t.tip, c), entry, is_negative=True))
-        return [*found, Loop(0, self.strands, self._strand_back)]
+        return [*found, Loop(0, self.strands, self._sweep_to_base)]
 
-    def _strand_ahead(self, strand: Index) -> list[Operation]:
+    def _sweep_to_tip(self, strand: Index) -> list[Operation]:
         """Set w along a strand; after every few pieces the unknowns change."""
         t, (size, count), base = self.tangents, self.groups, strand.value * self._count("points of strand")
 
@@ -416,11 +416,11 @@ class StepMap(EliminationCode):
             last, at = self._now.index(first + size), self._now.index(strand.value * count + g.value)
             pivots = ((Number(t.beta, c, at), Number(t.w, p, last)) for c, p in enumerate(self.pivots))
             changed = self._by_unknowns(t.w, last, t.beta, at, is_negative=True)
-            return [Loop(first, last.value, self._advanced), *_set(pivots), *changed]
+            return [Loop(first, last.value, self._advance), *_set(pivots), *changed]
 
-        return [Loop(0, count, group), Loop(base + count * size, base + self._count("tip 0"), self._advanced)]
+        return [Loop(0, count, group), Loop(base + count * size, base + self._count("tip 0"), self._advance)]
 
-    def _strand_back(self, strand: Index) -> list[Operation]:
+    def _sweep_to_base(self, strand: Index) -> list[Operation]:
         """Set y along a strand from its tip, by the unknowns of each group of pieces."""
         t, (size, count), own, f = self.tangents, self.groups, self.own, self._now
         base, first = (
@@ -428,7 +428,7 @@ class StepMap(EliminationCode):
             f.index(strand.value * (count + 1)),
         )
 
-        def solved(group: Any, j: Any) -> list[Operation]:
+        def solve(group: Any, j: Any) -> list[Operation]:
             copies = _copies(self.equations.ny, (t.y, j), (t.w, j))
             return copies + self._by_unknowns(t.y, j, t.alpha, group)
 
@@ -440,28 +440,28 @@ class StepMap(EliminationCode):
                 f.index(group.value + strand.value),
                 [Number(t.beta, c, group) for c in range(own)],
             )
-            found = solved(alpha + 1, end)
+            found = solve(alpha + 1, end)
             found += [Scale(Number(t.alpha, c, alpha)) for c in range(own)]
             found += [Add(change[c], Number(t.alpha, c, alpha + 1), is_negative=True) for c in range(own)]
             for i, c in zip(*map(np.ndarray.tolist, np.nonzero(self.nonzero_T)), strict=True):
                 entry = Number(self.T, self._of_X(i, c), group)
                 found.append(Add(Number(t.alpha, i, alpha), change[c], entry, is_negative=True))
-            return [*found, Loop(start + 1, end.value, functools.partial(solved, alpha))]
+            return [*found, Loop(start + 1, end.value, functools.partial(solve, alpha))]
 
         stop = base.value + self._count("points of strand")
         return [
-            Loop(base.value + (count * size + 1), stop, functools.partial(solved, first + count)),
-            Loop(0, count, group_back, descends=True), *solved(first, base),
+            Loop(base.value + (count * size + 1), stop, functools.partial(solve, first + count)),
+            Loop(0, count, group_back, descends=True), *solve(first, base),
         ]  # fmt: skip
 
     # the new record
 
-    def _jumped(self, j: Index) -> list[Operation]:
+    def _add_jumps(self, j: Index) -> list[Operation]:
         """Add the changes of jumps by y."""
         t, nonzeros = self.tangents, [(i, c, 0) for i, c, _ in self.equations.jumping]
         return _products(nonzeros, (self.jump, j), (t.newest, j), lambda c: Number(t.y, c, j))
 
-    def _behind(self, j: Index) -> list[Operation]:
+    def _add_jumps_at_fixed_y(self, j: Index) -> list[Operation]:
         """Add the changes of jumps at fixed y."""
         t = self.tangents
         return [Add(Number(t.newest, i, j), Number(t.far, i, j)) for i in self.rows["far"]]
@@ -472,7 +472,7 @@ class StepMap(EliminationCode):
         found: list[Operation] = [Scale(Number(t.change, i, j)) for i in self._rows_of(t.change)]
         return found + self._slopes((t.change, j), lambda c: Number(t.newest, c, j), j)
 
-    def _solved_between(self, k: int, j: Index) -> list[Operation]:
+    def _solve_stage(self, k: int, j: Index) -> list[Operation]:
         """Add the change of y at a stage, and set that of the rates there."""
         e, t, stage, first, at = self.equations, self.tangents, *self._stage(k, j)
         own, found = [Number(None, i) for i in range(e.ny)], list[Operation]()
@@ -485,7 +485,7 @@ class StepMap(EliminationCode):
         found += [Add(Number(t.between, i, at), own[i]) for i in range(e.ny)]
         return found + _copies(e.ny, (t.newest, first), (t.between, at))
 
-    def _recorded(self, c0: Value, j: Index) -> list[Operation]:
+    def _set_record(self, c0: Value, j: Index) -> list[Operation]:
         """Set strains, y_s and the rate of the new record at a place."""
         e, t, rows = self.equations, self.tangents, self.rows["rates"]
         strains = [(e.ny + i, c, node) for i, c, node in e.z_by_y]
@@ -504,7 +504,7 @@ class StepMap(EliminationCode):
             found += [Add(Number(t.rate, i, j), Number(t.newest, i, j), c0) for i in range(e.numbers)]
         return found
 
-    def _shown(self, row: Columns, node: Index) -> list[Operation]:
+    def _show(self, row: Columns, node: Index) -> list[Operation]:
         """Copy y and strains at a node to its row."""
         t, point = self.tangents, self._node(node)
         own = Columns(self._now.pointer(row.base, node.value * (row.width * self.packed.size)), row.width)

@@ -79,7 +79,7 @@ class _TangentCode(StepMap):
         if self.transposed or self.near:
             self.rates = self._write_rates("rates")
         if self.near:
-            self.solved = self._write_solved()
+            self.solve_piece = self._write_piece_solution()
             self.slopes = self._write_rates("slopes", [(self.slope, e.nonzeros)])
         self._write_data()
         self._write_solution()
@@ -130,7 +130,7 @@ class _TangentCode(StepMap):
             for array, nonzeros in (
                 (self.by_history[name], e.by_history[name]), (self.by_control[name], e.by_control[name])
             ):  # fmt: skip
-                for i, value in enumerate(self._evaluated(_nodes(nonzeros), 0, False, state)):
+                for i, value in enumerate(self._evaluate(_nodes(nonzeros), 0, False, state)):
                     self._put(value, array, i)
 
     def _end_states(self) -> Sequence[tuple[str, dict[int, Value]]]:
@@ -237,7 +237,7 @@ class _TangentCode(StepMap):
             records = [f.pointer(state, place.get()) for place in self.turning]
             f.call(self.step, f.arguments[0], state, *records, table, *own, *given)
 
-    def _begun(self, solved: SolvedSteps) -> list[np.ndarray]:
+    def _prepare(self, solved: SolvedSteps) -> list[np.ndarray]:
         """Return the memory before a run, controls, coefficients, rows and unknowns."""
         memory = self._empty_memory()
         self._put_in(memory[None], self.params, solved.parameters[None, None, None])
@@ -265,7 +265,7 @@ class TangentCore(_TangentCode):
         # of one direction of the system
         self.dparameters = a(len(e.dparameters), memory=1)
         self.ds, self.dh = a(1, "used", 1), a(1, "pieces" if e.moves_lengths else 0, 1)
-        self.moved = {name: a(len(rows), self.places[name], 1) for name, rows in e.moving_rows.items()}
+        self.by_system = {name: a(len(rows), self.places[name], 1) for name, rows in e.moving_rows.items()}
         self.direction_size, self._size = self._size, whole
 
     def _write(self) -> None:
@@ -274,9 +274,9 @@ class TangentCore(_TangentCode):
         self._write_tangents()
         self._write_run()
 
-    def _moved_nodes(self, name: str) -> list[int]:
+    def _nodes_by_system(self, name: str) -> list[int]:
         """Return the nodes of the tangents of results by the system, those that are not always zero."""
-        return [self.equations.moved[name][i] for i in self.equations.moving_rows[name]]
+        return [self.equations.by_system[name][i] for i in self.equations.moving_rows[name]]
 
     def _write_direction(self) -> None:
         """Tangents of rates, strains, jumps, tip and base by one direction of the system, at fixed y."""
@@ -295,10 +295,10 @@ class TangentCore(_TangentCode):
                 if name == "rates":
                     here |= {node: self._wide(self.common, i, j) for i, node in enumerate(e.common)}
                     here[e.ds.item()] = self._wide(self.ds, 0, j)
-                self._write_results([(self.moved[name], self._moved_nodes(name))], j, here)
+                self._write_results([(self.by_system[name], self._nodes_by_system(name))], j, here)
         for name, here in self._end_states():
-            for i, value in enumerate(self._evaluated(self._moved_nodes(name), 0, False, here | known)):
-                self._put(value, self.moved[name], i)
+            for i, value in enumerate(self._evaluate(self._nodes_by_system(name), 0, False, here | known)):
+                self._put(value, self.by_system[name], i)
 
     def _write_tangents(self) -> None:
         """Tangents of the step, of as many columns as there are lanes."""
@@ -313,13 +313,13 @@ class TangentCore(_TangentCode):
             own = f.pointer(directions, d.value * self.direction_size)
             weight = f.load(weights, d.value * width, COLUMNS)
             with f.if_(f.any(f.apply("abs", weight) > 0.0)):
-                self._write_moved(own, weight)
+                self._write_change_of_system(own, weight)
         write(self, self._solution(coefficients, row, unknowns), COLUMNS, False)
 
-    def _write_moved(self, direction: Value, weight: Value) -> None:
+    def _write_change_of_system(self, direction: Value, weight: Value) -> None:
         """Add a direction of the system to the results at fixed y, with a weight in each column."""
         f, e = self._now, self.equations
-        parts = [(self.moved[name], e.moving_rows[name], target) for name, target in self.results.items()]
+        parts = [(self.by_system[name], e.moving_rows[name], target) for name, target in self.results.items()]
         for source, rows, target in (*parts, (self.dh, [0], self.tangents.lengths)):
             if not source.size or (source is self.dh and not e.moves_lengths):
                 continue
@@ -363,7 +363,7 @@ class TangentCore(_TangentCode):
         m, places = d_controls.shape[-1], len(solved.rate)
         blocks = -(-m // L)
 
-        def filled(values: Any) -> np.ndarray:
+        def pad(values: Any) -> np.ndarray:
             """Return tangents with columns of zeros, so that their number is a multiple of the lanes."""
             if np.shape(values)[-1] == blocks * L:
                 return np.ascontiguousarray(values, float)
@@ -371,24 +371,24 @@ class TangentCore(_TangentCode):
             found[..., :m] = values
             return found
 
-        begun = self._begun(solved)
+        begun = self._prepare(solved)
         moved = np.zeros((len(directions), self.direction_size))
         if directions.size:
             self._put_in(moved, self.dparameters, directions[:, None, None])
         states = aligned_zeros(blocks * self.state_size).reshape(blocks, -1)
         d_records, d_rate = d_states
-        columns = filled(np.concatenate([d_records, d_rate[None]])).reshape(-1, *d_rate.shape[:2], blocks, L)
+        columns = pad(np.concatenate([d_records, d_rate[None]])).reshape(-1, *d_rate.shape[:2], blocks, L)
         self._lasting(states, L)[:] = self._by_strand(self.records[0], columns.transpose(3, 4, 0, 1, 2))
         if np.any(d_tip):
-            added = filled(np.broadcast_to(d_tip, (k, m))).reshape(k, blocks, L).transpose(1, 0, 2)
+            added = pad(np.broadcast_to(d_tip, (k, m))).reshape(k, blocks, L).transpose(1, 0, 2)
             states[:, self.added_tip.offset :][:, : k * L] = added.reshape(blocks, -1)
         shapes = (self.counts["nodes"], self.packed.size), (k,)
         d_rows, d_unknowns = (np.empty((count, *shape, blocks * L)) for shape in shapes)
-        arrays = *begun, moved, states, filled(weights), filled(d_controls), d_rows, d_unknowns
+        arrays = *begun, moved, states, pad(weights), pad(d_controls), d_rows, d_unknowns
         self._functions.run("run", *arrays, count, len(directions), blocks * L)
         motion = (self._numbers(begun[0][None], each)[0, 0] for each in (*self.records, self.rate))
-        *records, rate = (self._joined(self.rate, each, places) for each in motion)
-        columns = self._joined(self.rate, self._lasting(states, L, -count), places).transpose(2, 3, 4, 0, 1)
+        *records, rate = (self._join(self.rate, each, places) for each in motion)
+        columns = self._join(self.rate, self._lasting(states, L, -count), places).transpose(2, 3, 4, 0, 1)
         columns = columns.reshape(*columns.shape[:3], blocks * L)[..., :m]
         after = np.stack(records), rate, columns[:-1], columns[-1]
         return after, (d_rows[..., :m], d_unknowns[..., :m])
@@ -411,21 +411,21 @@ class CotangentCore(_TangentCode):
 
     def _write(self) -> None:
         super()._write()
-        self._write_recorded()
+        self._write_rates_of_step()
         self._write_products()
         self._write_geometry()
         self._write_cotangents()
         self._write_run()
 
-    def _write_recorded(self) -> None:
+    def _write_rates_of_step(self) -> None:
         """Rates and strains at all ends of pieces."""
-        self.recorded = self._function("recorded")
+        self.rates_of_step = self._function("rates_of_step")
         self._write_places(self.rates, self.y, self.H)
 
     def _write_products(self) -> None:
         """Add the cotangents of parameters, places and lengths, from those of the results at fixed y."""
         e, t = self.equations, self.tangents
-        self.pulled = f = self._function("pulled", "state")
+        self.pull = f = self._function("pull", "state")
         terms = self._terms_known(e.pulled_terms)
         known = {node: terms[node] for node in e.pulled_terms}
         count, zero = len(e.moving_terms), f.splat(f.value(0.0), self.L)
@@ -438,8 +438,8 @@ class CotangentCore(_TangentCode):
                 here |= known
                 for i, node in enumerate(e.cotangents[name]):
                     here[int(node)] = self._wide(self.results[name], i, j)
-                nodes, added = self._parted(e.pulled[name])
-                *values, place = self._evaluated(nodes, j, True, here, (added, inside))
+                nodes, added = self._split(e.pulled[name])
+                *values, place = self._evaluate(nodes, j, True, here, (added, inside))
                 for k, value in enumerate(values):
                     own = f.select(inside, f.splat(value, self.L), 0.0)
                     self._put(self._get(self.term, k, 0, self.L) + own, self.term, k, 0, self.L)
@@ -450,8 +450,8 @@ class CotangentCore(_TangentCode):
         for name, here in self._end_states():
             for i, node in enumerate(e.cotangents[name]):
                 here[int(node)] = self._get(self.results[name], i)
-            nodes, added = self._parted(e.pulled[name])
-            values = self._evaluated(nodes, 0, False, here | known, (added, True))
+            nodes, added = self._split(e.pulled[name])
+            values = self._evaluate(nodes, 0, False, here | known, (added, True))
             sums = [a + b for a, b in zip(sums, values, strict=False)]
         given = self._parameters(e.by_terms) | terms
         given |= {int(node): each for node, each in zip(e.of_terms, sums, strict=True)}
@@ -464,7 +464,7 @@ class CotangentCore(_TangentCode):
         """Add the cotangents of parameters from those of places and lengths: once a run."""
         e = self.equations
         self.by_geometry = f = self._function("by_geometry", "state")
-        total = Variable(f, f.splat(f.value(0.0), self.L))
+        total = self._wide_variable(0.0)
         for array, parts in (self.place, self.s_parts), (self.length_of_piece, self.h_parts):
             count = self._used_places(array)
             for _, j in self._components(1, count):
@@ -473,7 +473,7 @@ class CotangentCore(_TangentCode):
         known = self._parameters(e.by_geometry) | {e.of_length.item(): f.total(total.get())}
         self._add_parameters(e.by_geometry, known)
 
-    def _parted(self, cotangents: Sequence[int]) -> tuple[list[int], list[tuple[int, Value]]]:
+    def _split(self, cotangents: Sequence[int]) -> tuple[list[int], list[tuple[int, Value]]]:
         """Return the cotangents of scalars, and those of moving arrays with the addresses of their sums."""
         arrays, zero = self.equations.moving_arrays, self.equations.program.constant(0.0)
         first = len(cotangents) - len(arrays)
@@ -486,7 +486,7 @@ class CotangentCore(_TangentCode):
 
     def _add_parameters(self, cotangents: Sequence[int], known: dict[int, Any]) -> None:
         """Add cotangents of the moving parameters to those known."""
-        (nodes, added), program = self._parted(cotangents), self.equations.program
+        (nodes, added), program = self._split(cotangents), self.equations.program
         moving = {k: node for k, node in enumerate(nodes) if not program.is_constant(node, 0.0)}
         values = self._now.evaluate(program, [*moving.values()], known, 1, (added, True))
         for k, node in moving.items():
@@ -497,7 +497,7 @@ class CotangentCore(_TangentCode):
         coefficients, control, row, unknowns, _ = self._begin_step()
         write(self, self._solution(coefficients, row, unknowns), 1, True)
         if self.equations.by_terms:
-            self._now.call(self.pulled, *self._now.arguments[:2])
+            self._now.call(self.pull, *self._now.arguments[:2])
         write(self, self._at_fixed_y(coefficients, control), 1, True)
 
     def _write_run(self) -> None:
@@ -510,7 +510,7 @@ class CotangentCore(_TangentCode):
 
         def copy(step: Index, forth: bool) -> None:
             """Keep the arrays that a step starts from, or restore them."""
-            for inside, outside in self._packed_vectors(self._kept, f.pointer(kept, step.value * size)):
+            for inside, outside in self._each_packed_vector(self._kept, f.pointer(kept, step.value * size)):
                 source, target = (inside, outside) if forth else (outside, inside)
                 f.store(f.load(source, 0, self.L), target, 0)
 
@@ -520,7 +520,7 @@ class CotangentCore(_TangentCode):
             f.call(self.data, memory, table, control, unknown)
             f.call(self.solution, memory, row)
             copy(step, True)
-            f.call(self.recorded, memory)
+            f.call(self.rates_of_step, memory)
             f.call(self.shift, memory, table)
         with f.loop(0, steps - 1, -1) as step:
             table, control, row, unknown = self._data_of(step, coefficients, controls, rows, unknowns)
@@ -544,7 +544,7 @@ class CotangentCore(_TangentCode):
         `cotangents` are those of rows (solves, nodes, x, m) and unknowns (solves, k, m), and of records and
         rate after the last step.
         """
-        begun, count = self._begun(solved), len(solved.controls)
+        begun, count = self._prepare(solved), len(solved.controls)
         d_rows, d_unknowns, d_records, d_rate = (np.ascontiguousarray(each, float) for each in cotangents)
         m, places = d_rate.shape[-1], len(d_rate)
         states = np.zeros((m, self.state_size))
@@ -554,11 +554,11 @@ class CotangentCore(_TangentCode):
         # idle pieces have no results
         lasting[..., self.counts.idle, :] = 0.0
         d_controls = np.zeros((count, self.equations.nc, m))
-        size = sum(map(self._size_of, self._packed(self._kept)))
+        size = sum(map(self._size_of, self._pack(self._kept)))
         kept = np.empty((count, size))
         arrays = *begun, kept, states, d_controls, d_rows, d_unknowns
         self._functions.run("run", *arrays, size, count, m)
-        before = self._joined(self.rate, self._lasting(states, 1, count)[:, 0], places).transpose(1, 2, 3, 0)
+        before = self._join(self.rate, self._lasting(states, 1, count)[:, 0], places).transpose(1, 2, 3, 0)
         return self._numbers(states, self.parameter)[:, 0, 0].T, d_controls, before[:-1], before[-1]
 
 
