@@ -195,6 +195,8 @@ def _names(kind: Any) -> list[str]:
 def _words(kind: Any) -> str:
     """Return an annotation in words."""
     origin, inner = typing.get_origin(kind), typing.get_args(kind)
+    if kind is Any:
+        return "values"
     if len(parts := _parts(kind)) > 1:
         if any("numpy._typing" in repr(one) for one in parts):  # anything that NumPy makes an array of
             own = [_words(one) for one in parts if f"{__name__.partition('.')[0]}." in repr(one)]

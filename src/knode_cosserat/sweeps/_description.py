@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Self
 
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, mapping_of, read_yaml, shown
 from knode_cosserat._reprs import quantity
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.initial import STARTS
 
 #: stored quantities by name: meaning and unit
 STORED = {
@@ -40,55 +40,21 @@ class SweepError(KnodeCosseratError, ValueError):
     code = "sweep"
 
 
-def _is_number(value: Any) -> bool:
-    real = isinstance(value, int | float | np.number) and not isinstance(value, bool)
-    return real and bool(np.isfinite(value))
+#: least values of whole numbers
+LEAST = {"steps": 1, "samples": 1, "seed": 0, "shard": 1, "count": 2}
 
 
-def _is_whole(value: Any, least: int = 1) -> bool:
-    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
+def _require_least(settings: Any) -> None:
+    """Raise `SweepError` if a whole number is too small."""
+    for name, least in LEAST.items():
+        value = getattr(settings, name, None)
+        if value is not None and value < least:
+            raise SweepError(f"{name} is {value}; allowed is a whole number from {least} on")
 
 
-#: allowed values of fields: a test and its words, or a collection of names
-RULES: dict[str, tuple[Callable[[Any], bool], str] | Collection[Any]] = {
-    "low": (_is_number, "a finite number"),
-    "high": (_is_number, "a finite number"),
-    "scale": ("linear", "log"),
-    "count": (lambda value: value is None or _is_whole(value, 2), "a whole number from 2 on"),
-    "steps": (_is_whole, "a whole number from 1 on"),
-    "dt": (lambda value: _is_number(value) and value > 0.0, "a number of seconds above 0"),
-    "vary": (lambda value: isinstance(value, Mapping), "a mapping from names to ranges or lists"),
-    "sampler": SAMPLERS,
-    "samples": (lambda value: value is None or _is_whole(value), "a whole number from 1 on"),
-    "seed": (lambda value: _is_whole(value, 0), "a whole number from 0 on"),
-    "seeds": (
-        lambda value: isinstance(value, Sequence | np.ndarray) and all(_is_whole(seed, 0) for seed in value),
-        "a list of whole numbers from 0 on",
-    ),
-    "store": (lambda value: len(set(value)) == len(value), "each name once"),
-    "precision": ("double", "single"),
-    "initial": STARTS,
-    "recovery": (False, True),
-    "shard": (lambda value: value is None or _is_whole(value), "a whole number from 1 on"),
-}
-
-
-def _require_allowed(settings: Any) -> None:
-    """Raise `SweepError` unless all fields of a dataclass have values that `RULES` allow."""
-    for field in dataclasses.fields(settings):
-        value, rule = getattr(settings, field.name), RULES.get(field.name)
-        if isinstance(rule, tuple) and callable(rule[0]):
-            is_allowed, words = rule
-            if not is_allowed(value):
-                raise SweepError(f"{field.name} is {shown(value)}; allowed is {words}")
-        elif rule is not None:
-            _require_known(f"{field.name} is {shown(value)}", value, rule)
-
-
-def _require_known(problem: str, name: Any, known: Collection[Any]) -> None:
-    if not any(name == each for each in known):
-        names = list(map(str, known))
-        raise SweepError(f"{problem}; allowed is {', '.join(names)}{did_you_mean(name, names)}")
+def _require_known(problem: str, name: Any, known: Collection[str]) -> None:
+    if name not in known:
+        raise SweepError(f"{problem}; allowed is {', '.join(known)}{did_you_mean(name, known)}")
 
 
 def _require_keys(mapping: Mapping[Any, Any], cls: type) -> None:
@@ -116,11 +82,14 @@ class Range:
     count: int | None = None
 
     def __post_init__(self) -> None:
-        _require_allowed(self)
+        check_arguments(Range.__init__, vars(self), SweepError)
+        _require_least(self)
         for name in ("low", "high"):
             object.__setattr__(self, name, float(getattr(self, name)))
-        if not self.low < self.high:
-            raise SweepError(f"low is {self.low:g} and high {self.high:g}; allowed is low below high")
+        if not -math.inf < self.low < self.high < math.inf:
+            raise SweepError(
+                f"low is {self.low:g} and high {self.high:g}; allowed is low below high, both finite"
+            )
         if self.scale == "log" and not self.low > 0.0:
             raise SweepError(f"low is {self.low:g}; allowed with the scale log is a number above 0")
 
@@ -179,11 +148,11 @@ class Sweep:
     controls: Any
     steps: int
     dt: float
-    vary: Any = dataclasses.field(default_factory=dict)
+    vary: dict[str, Any] = dataclasses.field(default_factory=dict)
     sampler: str = "grid"
     samples: int | None = None
     seed: int = 0
-    seeds: Any = ()
+    seeds: Sequence[int] = ()
     store: Any = ("tip_position",)
     precision: Literal["double", "single"] = "double"
     time: str = "sdirk2"
@@ -193,11 +162,16 @@ class Sweep:
     shard: int | None = None
 
     def __post_init__(self) -> None:
+        check_arguments(Sweep.__init__, vars(self), SweepError)
+        _require_least(self)
+        if min(self.seeds, default=0) < 0:
+            raise SweepError(f"seeds is {shown(self.seeds)}; allowed is a list of whole numbers from 0 on")
+        _require_known(f"sampler is {self.sampler!r}", self.sampler, SAMPLERS)
         store = _words("store", self.store) if self.store else ()
         for name in store:
             _require_known(f"store: {name!r} is unknown", name, STORED)
-        object.__setattr__(self, "store", store)
-        _require_allowed(self)
+        if len(set(store)) < len(store):
+            raise SweepError(f"store is {', '.join(store)}; allowed is each name once")
         robots = self.robots if isinstance(self.robots, list | tuple) else [self.robots]
         if not robots:
             raise SweepError("robots is empty; allowed is one robot or more")
@@ -206,7 +180,8 @@ class Sweep:
             "robots": tuple(map(_robot, robots)),
             "controls": _words("controls", self.controls),
             "vary": {name: _variation(name, values) for name, values in self.vary.items()},
-            "seeds": tuple(self.seeds),
+            "seeds": tuple(map(int, self.seeds)),
+            "store": store,
         }.items():
             object.__setattr__(self, name, value)
         if self.sampler == "grid":
@@ -272,7 +247,7 @@ class Sweep:
                 {"robot": robot.name, "set": dict(robot.changes)} if robot.changes else robot.name
                 for robot in self.robots
             ],
-            "controls": list(self.controls), "vary": varied, "seeds": [int(seed) for seed in self.seeds],
+            "controls": list(self.controls), "vary": varied, "seeds": list(self.seeds),
             "store": list(self.store),
         }  # fmt: skip
 

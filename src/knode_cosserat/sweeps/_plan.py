@@ -70,7 +70,6 @@ class Plan:
         Raises:
             SweepError: a robot, a varied name, a value or a word of controls is not allowed.
         """
-        checked_dt(sweep.dt)
         systems = tuple(_loaded(robot) for robot in sweep.robots)
         used = {name for word in sweep.controls for name in placeholders(word)}
         for name in used - {"seed"}:
@@ -87,6 +86,7 @@ class Plan:
             for name, variation in sweep.vary.items():
                 _check_variation(system, name, variation, name in used)
         try:
+            checked_dt(sweep.dt)
             settings = Settings.of(sweep.time, sweep.space, "consistent", NewtonOptions())
         except ValueError as error:
             raise SweepError(str(error)) from None
