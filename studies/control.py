@@ -41,7 +41,7 @@ from knode_cosserat.rods.tendon_robots import TendonRod
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from studies import stand_in
-from studies.report import Report, as_json, check_row, checks_table, markdown_table, write_texts
+from studies.report import Report, as_json, check_row, checks_table, markdown_table, write_report
 from studies.runner import Job, Product, run
 
 #: the robot, period (s) of control, and limits of the tensions (N, N/s)
@@ -151,12 +151,9 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     facts = run(jobs(quick), out, **how)
     cells = [cell for name, found in facts.items() if name.startswith("tracking-") for cell in found["cells"]]
     made = checks(facts, cells)
-    texts = {
-        "control.md": as_markdown(cells, made),
-        "control.json": as_json(made),
-        "tracking.json": as_json(cells),
-    }
-    return Report(made, write_texts(out, texts), [])
+    return write_report(
+        out, "control", made, as_markdown(cells, made), others={"tracking.json": as_json(cells)}
+    )
 
 
 def tracking(settings: Any) -> Product:

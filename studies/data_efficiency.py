@@ -27,12 +27,10 @@ from studies.report import (
     MEASURES,
     PAPER_MEASURES,
     Report,
-    as_json,
     in_words,
     markdown_table,
     spreads,
-    write_figures,
-    write_texts,
+    write_report,
 )
 from studies.runner import Job, Product
 
@@ -167,9 +165,8 @@ def rerun(
     made = jobs(seeds, rows, methods)
     facts = runner.run(made, out, **how)
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    texts = {"data.md": as_markdown(cells), "data.json": as_json(cells)}
     drawn = {f"data-{measure.replace('_', '-')}": figure(cells, measure) for measure in PAPER_MEASURES}
-    return Report(cells, write_texts(out, texts), write_figures(out, drawn))
+    return write_report(out, "data", cells, as_markdown(cells), drawn)
 
 
 def as_markdown(cells: Sequence[Any]) -> str:

@@ -41,7 +41,7 @@ from knode_cosserat_hardware.emulation import (
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.serial_board import SerialBoard
-from studies.report import Report, as_json, check_row, checks_table, write_texts
+from studies.report import Report, check_row, checks_table, write_report
 from studies.runner import Job, Product, run
 from studies.stand_in import DAMPING, NOISE, OFFSETS
 
@@ -414,8 +414,7 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     if reason := missing():
         raise HardwareError(f"the study needs the firmware's tools: {reason}")
     made = checks(facts_of(jobs(quick), out, **how))
-    texts = {"hardware.json": as_json(made), "hardware.md": as_markdown(made)}
-    return Report(made, write_texts(out, texts), [])
+    return write_report(out, "hardware", made, as_markdown(made))
 
 
 def facts_of(jobs: Sequence[Job], out: Path, **how: Any) -> dict[str, dict[str, Any]]:

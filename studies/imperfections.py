@@ -8,7 +8,7 @@ training data a model need not be better than the nominal model, but must not be
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -30,11 +30,12 @@ from studies.methods import METHODS
 from studies.report import (
     MEASURES,
     PAPER_MEASURES,
+    Cells,
     Report,
-    as_json,
+    failures,
     markdown_table,
-    write_figures,
-    write_texts,
+    spreads,
+    write_report,
 )
 from studies.runner import Job, Product, StudyError
 
@@ -266,32 +267,29 @@ def rerun(out: Path, *, seeds: Sequence[int], names: Sequence[str] | None = None
     made = jobs(names or list(IMPERFECTIONS), seeds)
     facts = runner.run(made, out, **how)
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    texts = {"imperfections.md": as_markdown(cells), "imperfections.json": as_json(cells)}
-    return Report(cells, write_texts(out, texts), write_figures(out, {"imperfections": figure(cells)}))
+    figures = {"imperfections": figure(cells)}
+    return write_report(out, "imperfections", cells, as_markdown(cells), figures)
 
 
-def ratios(cells: Sequence[Mapping[str, Any]], measure: str) -> dict[tuple[str, str], float | None]:
+def ratios(cells: Cells, measure: str) -> dict[tuple[str, ...], float | None]:
     """Return the worst seed's error relative to the baseline's, by imperfection and control.
 
     The ratio is None if a seed could not be simulated. It is zero if only the baseline could not be
     simulated. Cases whose true robot could not be simulated are left out.
     """
-    of: dict[tuple[str, str], dict[bool, list[Any]]] = {}
-    for cell in cells:
-        both = of.setdefault((cell["imperfection"], cell["control"]), {True: [], False: []})
-        both[cell["method"] == "baseline"].append(cell[measure])
-    found: dict[tuple[str, str], float | None] = {}
-    for case, both in of.items():
-        baseline, learned = both[True][0], both[False]
-        if None in learned:
-            if baseline is not None or any(each is not None for each in learned):
+    found: dict[tuple[str, ...], float | None] = {}
+    for case, both in spreads(cells, measure).items():
+        baseline = both.pop("baseline").mean
+        (learned,) = both.values()
+        if learned.failures:
+            if baseline is not None or learned.values:
                 found[case] = None
         else:
-            found[case] = 0.0 if baseline is None else max(learned) / baseline
+            found[case] = 0.0 if baseline is None else max(learned.values) / baseline
     return found
 
 
-def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+def missed(cells: Cells) -> list[tuple[str, ...]]:
     """Return the imperfections and controls in which the learned model misses its target.
 
     The target is an error of at most `LEFT` times the baseline's in the paper's two metrics; at twice the
@@ -307,7 +305,7 @@ def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     return wrong
 
 
-def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
+def as_markdown(cells: Cells) -> str:
     """Return one table per metric with a line per imperfection, and the missed targets."""
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
@@ -317,38 +315,26 @@ def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
         f"Allowed is {LEFT:g}, and 1 at twice the tension; what is more than that is in bold."
     ]
     for measure, (title, factor) in MEASURES.items():
-        left = ratios(cells, measure)
+        left, errors = ratios(cells, measure), spreads(cells, measure, factor)
         rows = []
         for name in names:
             row = [name if name in NAMED else f"*{name}*"]
             for control in controls:
-                baseline = _baseline(cells, name, control, measure)
-                row.append(_words(left.get((name, control), "?"), baseline and factor * baseline))
+                baseline = errors[name, control]["baseline"].mean
+                row.append(_words(left.get((name, control), "?"), baseline))
                 allowed = 1.0 if control in FAR else LEFT
                 ratio = left.get((name, control), 0.0)
                 if measure in PAPER_MEASURES and (ratio is None or ratio > allowed):
                     row[-1] = f"**{row[-1]}**"
             rows.append(row)
         parts += [f"## {title}", markdown_table(["imperfection", *controls], rows)]
-    failures = [
-        "- {imperfection}, {control}, {method}, seed {seed}: {failed}".format(**cell)
-        for cell in cells
-        if "failed" in cell
-    ]
-    if failures:
-        parts += ["What failed:", "\n".join(failures)]
-    count = len(names) - len({name for name, _ in wrong})
+    if failed := failures(cells, "imperfection", "control", "method", "seed"):
+        parts += ["What failed:", "\n".join(failed)]
+    count = len(names) - len({case[0] for case in wrong})
     parts.append(
         f"{count} of {len(names)} imperfections are learned as well as asked for, under every control."
     )
     return "\n\n".join(parts) + "\n"
-
-
-def _baseline(cells: Sequence[Mapping[str, Any]], name: str, control: str, measure: str) -> float | None:
-    for cell in cells:
-        if (cell["imperfection"], cell["control"], cell["method"]) == (name, control, "baseline"):
-            return cell[measure]
-    return None
 
 
 def _words(ratio: float | str | None, baseline: float | None) -> str:
@@ -356,7 +342,7 @@ def _words(ratio: float | str | None, baseline: float | None) -> str:
     return left + (" (failed)" if baseline is None else f" ({baseline:.2g})")
 
 
-def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
+def figure(cells: Cells) -> Figure:
     """Return a figure of errors relative to the baseline's: a line per imperfection, a point per control.
 
     A cross at the right edge is a failure; the dotted line is the target.
