@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat_hardware.cli import motion, options
+from knode_cosserat_hardware.cli import options
 from knode_cosserat_hardware.description import HardwareDescription
 from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
@@ -105,7 +105,7 @@ def test_words_of_drivers():
     opened = open_driver("simulated?noise=0,fault=slack:2,after=0.1", HardwareDescription(), lambda: ROD)
     with opened.driver as driver:
         opened.driver.advance(0.2)
-        assert driver.fault == "slack:2" and opened.poses((1.0,)).shape == (1, 7)
+        assert driver.fault == "slack:2" and opened.robot.poses((1.0,)).shape == (1, 7)
     assert "tares" in open_driver("COM3", HardwareDescription(), lambda: ROD).connecting_moves
     with pytest.raises(HardwareError, match="must be a number"):
         open_driver("simulated?noise=much", HardwareDescription(), lambda: ROD)
@@ -314,7 +314,7 @@ def test_the_measured_tip_is_relative_to_the_clamped_end():
     stamp, tip = options.tip_source(opened, Capture())()
     np.testing.assert_allclose(tip, [0.1, 0.0, 0.5 + 0.0635])
     assert stamp == 3.0 and options.tip_source(opened, None) is None
-    config = motion._recording_config(4, ["base", "rib", "tip"], opened)
+    config = options.recording_config(opened, ["base", "rib", "tip"])
     assert config.base.height == 0.0635 and [each.fraction for each in config.markers] == [0.5, 1.0]
 
 
