@@ -24,6 +24,7 @@ from studies import runner, simulation
 from studies.comparisons import NoKnowledge, compared, linear_predictor
 from studies.methods import METHODS, LearnedSystems, Method, fitted
 from studies.report import (
+    CASE,
     MEASURES,
     PAPER_MEASURES,
     Report,
@@ -176,21 +177,13 @@ def as_markdown(cells: Sequence[Any]) -> str:
     parts = []
     for measure, (title, factor) in MEASURES.items():
         heads = ["imperfection", "control", "method", *(f"{sines} x {rows} rows" for sines, rows in amounts)]
-        found = {
-            amount: spreads([c for c in cells if (c["sines"], c["rows"]) == amount], measure, factor)
-            for amount in [*amounts, NONE]
-        }
-
-        def words(line: tuple[str, str, str], amount: tuple[int, int], found: Any = found) -> str:
-            imperfection, control, method = line
+        found = spreads(cells, measure, factor, by=(*CASE, "sines", "rows"))
+        rows = []
+        for *case, method in lines:
             # without data the figures are the same for every amount
-            for of in (amount, NONE):
-                spread = found[of].get((imperfection, control), {}).get(method)
-                if spread is not None:
-                    return in_words(spread)
-            return ""
-
-        rows = [[*line, *(words(line, amount) for amount in amounts)] for line in lines]
+            constant = found.get((*case, *NONE), {})
+            spread = [(constant | found.get((*case, *amount), {})).get(method) for amount in amounts]
+            rows.append([*case, method, *("" if each is None else in_words(each) for each in spread)])
         parts += [f"## {title}", markdown_table(heads, rows)]
     return "\n\n".join(parts) + "\n"
 

@@ -7,7 +7,6 @@ training data a model need not be better than the nominal model, but must not be
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -125,44 +124,17 @@ OTHERS: dict[str, dict[str, Any]] = {
 IMPERFECTIONS = {**NAMED, **OTHERS}
 
 
-def jobs(names: Sequence[str], seeds: Sequence[int], **changes: Any) -> list[Job]:
-    """Return one job for each imperfection: the baseline and the best method under all controls.
-
-    Args:
-        names: some of `IMPERFECTIONS`.
-        seeds: seeds of the fits.
-        changes: other settings than those of the study; see `settings`.
-    """
+def jobs(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
+    """Return one job for each of some of `IMPERFECTIONS`: the nominal and the best model, all controls."""
     return [
-        Job(name.replace(", ", "-").replace(" ", "-"), assess, settings(name, seeds, **changes))
+        Job(
+            name.replace(", ", "-").replace(" ", "-"),
+            assess,
+            {"imperfection": name, "seeds": list(seeds), "steps": STEPS, "controls": {**CONTROLS, **FAR}}
+            | {"training": list(TRAINING), **IMPERFECTIONS[name]},
+        )
         for name in names
     ]
-
-
-def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
-    """Return the settings of a job; these may be changed.
-
-    method               name of one of `METHODS`
-    training, rows       training controls, and the number of rows of each
-    training_dt, dt      time steps (s) of the training and of the predictions
-    steps, controls      steps and controls of the predictions
-    space, nodes         scheme along the rod, and number of nodes
-    noise                noise on the training data, as a fraction of each value's variation
-    """
-    if name not in IMPERFECTIONS:
-        raise ValueError(f"imperfection {name!r} is unknown; allowed is some of {', '.join(IMPERFECTIONS)}")
-    usual = {
-        "imperfection": name, "robot": ROBOT, "seeds": list(seeds), "method": "best",
-        "training": list(TRAINING), "rows": TRAINING_ROWS, "training_dt": DT, "dt": DT, "steps": STEPS,
-        "controls": {**CONTROLS, **FAR}, "space": "euler", "nodes": 10, "noise": 0.0,
-        **IMPERFECTIONS[name],
-    }  # fmt: skip
-    unknown = sorted(set(changes) - set(usual))
-    if unknown:
-        raise ValueError(
-            f"a job of imperfections has no setting {unknown[0]!r}; there are {', '.join(usual)}"
-        )
-    return {**usual, **changes}
 
 
 # the work
@@ -170,12 +142,21 @@ def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
 
 def assess(settings: Any) -> Product:
     """Return the cells of one imperfection: the nominal and the learned model, under every control."""
-    knowledge: Any = load_robot(settings["robot"]).replace(nodes=settings["nodes"])
+    knowledge: Any = load_robot(ROBOT)
     truth = truths.derived_robot(KINDS[settings["kind"]], knowledge, **settings["truth"])
-    training, references = _truths(truth, settings)
-    learned = METHODS[settings["method"]](knowledge, training, settings["seeds"])
+    training, steps = settings["training"], settings["steps"]
+    # one batch, so that one program is compiled
+    moved = _moved(truth, [*training, *settings["controls"].values()], steps)
+    seen, references = moved[: len(training)], moved[len(training) :]
+    for each in seen:
+        if isinstance(each, str):
+            raise StudyError(
+                f"{settings['imperfection']}: the truth cannot be simulated for training: {each}"
+            )
+    usable = [each[:TRAINING_ROWS] for each in seen if isinstance(each, Trajectory)]
+    learned = METHODS["best"](knowledge, usable, settings["seeds"])
     systems: list[tuple[str, int, System | str]] = [("baseline", 0, knowledge)]
-    systems += [(settings["method"], seed, system) for seed, system in learned.systems.items()]
+    systems += [("best", seed, system) for seed, system in learned.systems.items()]
     cells = [
         cell
         for method, seed, system in systems
@@ -184,45 +165,16 @@ def assess(settings: Any) -> Product:
     return Product({"cells": cells, "found": learned.found}, {})
 
 
-def _truths(truth: System, settings: Any) -> tuple[list[Trajectory], list[Trajectory | str]]:
-    """Return the training trajectories and the reference trajectories."""
-    training, asked = settings["training"], list(settings["controls"].values())
-    if settings["training_dt"] == settings["dt"]:
-        # one batch, so that one program is compiled
-        moved = _moved(truth, [*training, *asked], settings["steps"], settings["dt"], settings["space"])
-        seen, references = moved[: len(training)], moved[len(training) :]
-    else:
-        seen = _moved(truth, training, settings["rows"], settings["training_dt"], settings["space"])
-        references = _moved(truth, asked, settings["steps"], settings["dt"], settings["space"])
-    usable = [trajectory for trajectory in seen if isinstance(trajectory, Trajectory)]
-    if len(usable) < len(training):
-        failed = next(each for each in seen if isinstance(each, str))
-        raise StudyError(f"{settings['imperfection']}: the truth cannot be simulated for training: {failed}")
-    noise, rows = settings["noise"], settings["rows"]
-    return [with_noise(each[:rows], noise, seed) for seed, each in enumerate(usable)], references
-
-
-def with_noise(trajectory: Trajectory, level: float, seed: int) -> Trajectory:
-    """Return a trajectory with normal noise on y and z, relative to each value's variation."""
-    if level == 0.0:
-        return trajectory
-    draw = np.random.default_rng(seed)
-    y, z = np.array(trajectory.y), np.array(trajectory.z)
-    for values in (y, z):
-        values += level * values.std(axis=(0, 1)) * draw.normal(size=values.shape)
-    return dataclasses.replace(trajectory, y=y, z=z)
-
-
-def _moved(system: System, asked: Sequence[str], steps: int, dt: float, space: str) -> list[Trajectory | str]:
+def _moved(system: System, asked: Sequence[str], steps: int) -> list[Trajectory | str]:
     """Return trajectories of as many rows as steps, or the reasons of failure."""
-    tensions = np.stack([controls.parse(control, steps, dt, sampled="end") for control in asked])
+    tensions = np.stack([controls.parse(control, steps, DT, sampled="end") for control in asked])
     batch = simulate(
         system,
         tensions,
-        dt,
+        DT,
         time="bdf2",
         start="paper",
-        space=space,
+        space="euler",
         initial="unstressed",
         on_failure="return",
     )
@@ -239,8 +191,7 @@ def _cells(
     if isinstance(system, str):
         predictions: list[Trajectory | str] = [system] * len(names)
     else:
-        asked = list(names.values())
-        predictions = _moved(system, asked, settings["steps"], settings["dt"], settings["space"])
+        predictions = _moved(system, list(names.values()), settings["steps"])
     of = {"imperfection": settings["imperfection"], "method": method, "seed": seed}
     return [
         {**of, "control": name, **compared(prediction, reference)}

@@ -57,7 +57,8 @@ class Spread(NamedTuple):
         return statistics.stdev(self.values) if len(self.values) > 1 else None
 
 
-Case = tuple[str, ...]
+#: values of the keys of a case
+Case = tuple[Any, ...]
 #: keys of a cell that are its case in the paper's table
 CASE = ("imperfection", "control")
 
