@@ -20,7 +20,7 @@ from knode_cosserat_hardware.open_driver import open_driver
 from knode_cosserat_hardware.simulated import SimulatedRobot
 from tests.commands import run
 from tests.hardware.fake_board import FakeBoard
-from tests.hardware.waiting import free_computation
+from tests.hardware.waiting import eventually, free_computation
 
 pytestmark = pytest.mark.slow
 
@@ -242,15 +242,11 @@ def test_a_signal_stops_a_real_port(folder, number):
         process = subprocess.Popen(
             [*program, *more], stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
         )
-        end = time.monotonic() + 60.0
-        while sum(board.wanted) < 100 and time.monotonic() < end and process.poll() is None:
-            time.sleep(0.01)
+        eventually(lambda: sum(board.wanted) >= 100 or process.poll() is not None, 60.0)
         assert board.state == "armed"
         process.send_signal(number)
         sent = time.monotonic()
-        while board.fault != "stopped:0" and time.monotonic() - sent < 5.0:
-            time.sleep(0.005)
-        assert board.fault == "stopped:0" and time.monotonic() - sent < 1.0
+        assert eventually(lambda: board.fault == "stopped:0") and time.monotonic() - sent < 1.0
         assert board.received.count(b"stop") == 1
         stderr = process.communicate(timeout=30)[1]
     assert process.returncode == 2 and f"error: stopped by {signal.Signals(number).name}" in stderr
