@@ -35,7 +35,7 @@ from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
-from studies.report import Report, as_json, markdown_table, write_figures, write_texts
+from studies.report import Report, markdown_table, write_report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -470,10 +470,8 @@ def rerun(
         for each in recordings
     }
     cells = _cells(recordings, names, predictions)
-    out.mkdir(parents=True, exist_ok=True)
-    texts = {"beam.md": as_markdown(cells, beam), "beam.json": as_json(cells)}
-    figure = drops(recordings, predictions, names)
-    return Report(cells, write_texts(out, texts), write_figures(out, {"beam": figure}))
+    figures = {"beam": drops(recordings, predictions, names)}
+    return write_report(out, "beam", cells, as_markdown(cells, beam), figures)
 
 
 def _no_such(folder: Path, option: str, name: str, known: Sequence[str]) -> str:

@@ -41,7 +41,7 @@ from knode_cosserat.rods.tendon_robots import TendonRod
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 from studies import stand_in
-from studies.report import Report, as_json, check_row, checks_table, markdown_table, write_texts
+from studies.report import Report, as_json, check_row, checks_table, markdown_table, write_report
 from studies.runner import Job, Product, run
 
 #: the robot, period (s) of control, and limits of the tensions (N, N/s)
@@ -151,12 +151,9 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     facts = run(jobs(quick), out, **how)
     cells = [cell for name, found in facts.items() if name.startswith("tracking-") for cell in found["cells"]]
     made = checks(facts, cells)
-    texts = {
-        "control.md": as_markdown(cells, made),
-        "control.json": as_json(made),
-        "tracking.json": as_json(cells),
-    }
-    return Report(made, write_texts(out, texts), [])
+    return write_report(
+        out, "control", made, as_markdown(cells, made), others={"tracking.json": as_json(cells)}
+    )
 
 
 def tracking(settings: Any) -> Product:
@@ -172,19 +169,9 @@ def tracking(settings: Any) -> Product:
             reference = references()[path]
             _fresh(controller)
             log = run_loop(controller, plant, reference, SECONDS)
-            found = {name: values[-1] for name, values in log.parameters.items()}
-            cells.append(
-                {
-                    "controller": settings["controller"],
-                    "robot": name,
-                    "reference": path,
-                    "rmse_percent": 100.0 * _rmse(log, path) / float(truth.length),
-                    "offset_percent": 100.0 * float(log.tip_distance[-1] / truth.length),
-                    "fallbacks": log.fallbacks,
-                    "parameters": found,
-                    "true_modulus": float(truth.youngs_modulus),
-                }
-            )
+            at = {"controller": settings["controller"], "robot": name, "reference": path}
+            offset = float(log.tip_distance[-1])
+            cells.append(at | stand_in.tracking_facts(log, _rmse(log, path), offset, truth))
     return Product({"cells": cells}, {})
 
 
@@ -226,6 +213,19 @@ def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list
         for cell in own if cell["robot"].startswith("stiffness") and "steps" not in cell["reference"]
     ]  # fmt: skip
     slow, fast = facts["times"]["0.05"], facts["times"]["0.02"]
+    smooth = facts["smoother"]["shape_error_percent"]
+    observed = []
+    for name, found in facts["observer"].items():
+        error = found["shape_error_percent"]
+        observed += [
+            (f"shape 1 s after a wrong start, {name} (% of length)", error, 0.5),
+            (f"the same, {name}, relative to the offline smoother with all bodies", error / smooth, 2.0),
+            (
+                f"95 % regions, {name}: distance of their coverage from 94 % (%)",
+                abs(100.0 * found["coverage"] - 94.0), 4.0,
+            ),
+            (f"step, {name} (ms)", found["step_ms"], 5.0),
+        ]  # fmt: skip
     steady = max(
         cell["offset_percent"]
         for cell in own
@@ -238,27 +238,7 @@ def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list
         ("stiffness after 12 s (relative error)", max(modulus), 0.03),
         ("external force at the tip after 6 s (relative error)", facts["force"]["error"], 0.1),
         (f"hard limits exceeded in {facts['limits']['runs']} runs (times)", facts["limits"]["exceeded"], 0),
-        *(
-            (f"shape 1 s after a wrong start, {name} (% of length)", found["shape_error_percent"], 0.5)
-            for name, found in facts["observer"].items()
-        ),
-        *(
-            (
-                f"the same, {name}, relative to the offline smoother with all bodies",
-                found["shape_error_percent"] / facts["smoother"]["shape_error_percent"],
-                2.0,
-            )
-            for name, found in facts["observer"].items()
-        ),
-        *(
-            (
-                f"95 % regions, {name}: distance of their coverage from 94 % (%)",
-                abs(100.0 * found["coverage"] - 94.0),
-                4.0,
-            )
-            for name, found in facts["observer"].items()
-        ),
-        *((f"step, {name} (ms)", found["step_ms"], 5.0) for name, found in facts["observer"].items()),
+        *observed,
         ("drift of the stiffness at rest (%)", facts["rest"]["drift_percent"], 3.0),
         ("feedback at 20 Hz, p99 (ms)", slow["feedback_p99_ms"], 5.0),
         ("cycle at 20 Hz, p99 (ms)", slow["cycle_p99_ms"], 25.0),

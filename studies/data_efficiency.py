@@ -23,15 +23,14 @@ from studies import runner, simulation
 from studies.comparisons import NoKnowledge, compared, linear_predictor
 from studies.methods import METHODS, LearnedSystems, Method, fitted
 from studies.report import (
+    CASE,
     MEASURES,
     PAPER_MEASURES,
     Report,
-    as_json,
     in_words,
     markdown_table,
     spreads,
-    write_figures,
-    write_texts,
+    write_report,
 )
 from studies.runner import Job, Product
 
@@ -166,9 +165,8 @@ def rerun(
     made = jobs(seeds, rows, methods)
     facts = runner.run(made, out, **how)
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    texts = {"data.md": as_markdown(cells), "data.json": as_json(cells)}
     drawn = {f"data-{measure.replace('_', '-')}": figure(cells, measure) for measure in PAPER_MEASURES}
-    return Report(cells, write_texts(out, texts), write_figures(out, drawn))
+    return write_report(out, "data", cells, as_markdown(cells), drawn)
 
 
 def as_markdown(cells: Sequence[Any]) -> str:
@@ -178,21 +176,13 @@ def as_markdown(cells: Sequence[Any]) -> str:
     parts = []
     for measure, (title, factor) in MEASURES.items():
         heads = ["imperfection", "control", "method", *(f"{sines} x {rows} rows" for sines, rows in amounts)]
-        found = {
-            amount: spreads([c for c in cells if (c["sines"], c["rows"]) == amount], measure, factor)
-            for amount in [*amounts, NONE]
-        }
-
-        def words(line: tuple[str, str, str], amount: tuple[int, int], found: Any = found) -> str:
-            imperfection, control, method = line
+        found = spreads(cells, measure, factor, by=(*CASE, "sines", "rows"))
+        rows = []
+        for *case, method in lines:
             # without data the figures are the same for every amount
-            for of in (amount, NONE):
-                spread = found[of].get((imperfection, control), {}).get(method)
-                if spread is not None:
-                    return in_words(spread)
-            return ""
-
-        rows = [[*line, *(words(line, amount) for amount in amounts)] for line in lines]
+            constant = found.get((*case, *NONE), {})
+            spread = [(constant | found.get((*case, *amount), {})).get(method) for amount in amounts]
+            rows.append([*case, method, *("" if each is None else in_words(each) for each in spread)])
         parts += [f"## {title}", markdown_table(heads, rows)]
     return "\n\n".join(parts) + "\n"
 

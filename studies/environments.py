@@ -42,14 +42,12 @@ from studies.elastica.rod import ElasticaRod
 from studies.ppo import Policy, PolicyTraining
 from studies.report import (
     Report,
-    as_json,
     check_row,
     checks_table,
     markdown_table,
-    write_figures,
-    write_texts,
+    write_report,
 )
-from studies.runner import Job, Product, run
+from studies.runner import Job, Product, file_bytes, run
 
 #: episodes at once, and periods, of the rate; a rate is the median of so many rounds
 EPISODES, PERIODS, ROUNDS = 1024, 40, 5
@@ -73,8 +71,8 @@ def jobs(quick: bool) -> list[Job]:
 def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     """Run the study, and write environments.json, environments.md, and what PPO has learned.
 
-    The learned policy is written as follow.npz, with a figure of its rewards and an animation if there is
-    matplotlib. Interrupted runs are continued.
+    The learned policy is written as follow.npz, with a figure of its rewards and an animation. Interrupted
+    runs are continued.
 
     Args:
         out: the folder; an earlier run in it is continued.
@@ -88,14 +86,8 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
         raise TaskError("the study needs Gymnasium: pip install '.[rl]'")
     facts = run(jobs(quick), out, **how)
     made = checks(facts)
-    texts = {"environments.json": as_json(made), "environments.md": as_markdown(made, facts)}
-    figures = {"ppo": curve_figure(facts["ppo"])} if has_matplotlib() else {}
-    return Report(made, write_texts(out, texts), write_figures(out, figures))
-
-
-def has_matplotlib() -> bool:
-    """Return whether figures can be drawn."""
-    return importlib.util.find_spec("matplotlib") is not None
+    figures = {"ppo": curve_figure(facts["ppo"])}
+    return write_report(out, "environments", made, as_markdown(made, facts), figures)
 
 
 def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
@@ -229,10 +221,10 @@ def ppo(settings: Any) -> Product:
         "reference": reference, "score": score, "ratio": score / reference,
         "until": until if np.isfinite(until) else 1e9, "curve": curve,
     }  # fmt: skip
-    files = {"follow.npz": saved(training.policy)}
-    if has_matplotlib():
-        files["follow.gif"] = animated(environment, training.policy, held_out[0])
-    return Product(facts, files)
+    gif = file_bytes(
+        "episode.gif", lambda path: animate_episode(environment, training.policy, held_out[0], path)
+    )
+    return Product(facts, {"follow.npz": saved(training.policy), "follow.gif": gif})
 
 
 def curve_figure(facts: Mapping[str, Any]) -> Any:
@@ -248,18 +240,9 @@ def curve_figure(facts: Mapping[str, Any]) -> Any:
     return figure
 
 
-def animated(environment: Environment, policy: Policy, key: Any) -> bytes:
-    """Return the GIF of a policy's episode."""
-    with tempfile.TemporaryDirectory() as folder:
-        return animate_episode(environment, policy, key, Path(folder) / "episode.gif").read_bytes()
-
-
 def saved(policy: Policy) -> bytes:
     """Return the file of a policy."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "policy.npz"
-        policy.save(path)
-        return path.read_bytes()
+    return file_bytes("policy.npz", policy.save)
 
 
 def real(settings: Any) -> Product:

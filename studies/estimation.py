@@ -19,7 +19,7 @@ from knode_cosserat.recordings.virtual import Sensors, record_virtual, virtual_r
 from knode_cosserat.rods.robot_file import load_robot
 from knode_cosserat.rods.system import System
 from knode_cosserat.trajectory import Trajectory
-from studies.report import Report, as_json, markdown_table, write_figures, write_texts
+from studies.report import Report, markdown_table, write_report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,10 +71,9 @@ def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Rep
                     cells.append({**about, "method": method, "quantity": quantity, **error._asdict()})
             if balance == TRUE and (drawn is None or name == "random"):
                 drawn = truth, found
-    texts = {"estimation.md": as_markdown(cells), "estimation.json": as_json(cells)}
-    tables = write_texts(out, texts)
     assert drawn is not None
-    return Report(cells, tables, write_figures(out, {"estimation": estimated_states(*drawn, DRAWN)}))
+    figures = {"estimation": estimated_states(*drawn, DRAWN)}
+    return write_report(out, "estimation", cells, as_markdown(cells), figures)
 
 
 def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:

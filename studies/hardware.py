@@ -41,7 +41,7 @@ from knode_cosserat_hardware.emulation import (
 from knode_cosserat_hardware.lines import GRAM_FORCE
 from knode_cosserat_hardware.plant import HardwarePlant
 from knode_cosserat_hardware.serial_board import SerialBoard
-from studies.report import Report, as_json, check_row, checks_table, write_texts
+from studies.report import Report, check_row, checks_table, write_report
 from studies.runner import Job, Product, run
 from studies.stand_in import DAMPING, NOISE, OFFSETS
 
@@ -124,9 +124,8 @@ def measured_tip(robot: EmulatedRobot, random: np.random.Generator) -> tuple[flo
 
 #: faults of robot, board and host
 KINDS = (
-    *("sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted"),
-    "emergency-stop",
-)
+    "sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted", "emergency-stop",
+)  # fmt: skip
 #: burst of bit errors: its duration (s), and bounds of the part of flipped bits. With the least, half of the
 #: lines come through, and the loop goes on; with the greatest none, and the watchdog latches
 BURST, BURST_RATES = 0.4, (2e-3, 2e-2)
@@ -148,33 +147,6 @@ EARLIEST, LATEST, CAUGHT = 2.0, 4.0, 3.0
 RESUMED = 4.0
 
 
-def faults(settings: Any) -> Product:
-    """Inject faults at random; each must be caught, and the robot work again after it was mended."""
-    robot, random = EmulatedRobot(), np.random.default_rng(2)
-    board = connected(robot)
-    missed: list[str] = []
-    dead: list[str] = []
-    for k in range(settings["runs"]):
-        kind, tendon = KINDS[k % len(KINDS)], int(random.integers(0, 4))
-        board.arm()
-        tensions(board, robot, random.uniform(150.0, 500.0, 4), 0.4)
-        offset = robot.cells.offset.copy()
-        inject(robot, board, kind, tendon, random)
-        caught = _is_caught(robot, board)
-        if not caught or not board.fault.startswith(kind):
-            missed.append(f"{kind} ({board.fault or 'none'})")
-        robot.cells.offset[:] = offset
-        mend(robot)
-        board.wait(0.7)
-        try:
-            recover(board)
-        except HardwareError as error:
-            dead.append(f"{kind}: {error}")
-            robot = EmulatedRobot()
-            board = connected(robot)
-    return Product({"missed": len(missed), "dead": len(dead), "listed": missed + dead}, {})
-
-
 def inject(robot: EmulatedRobot, board: SerialBoard, kind: str, tendon: int, random: Any) -> None:
     """Cause a fault."""
     if kind == "sensor-rail":
@@ -191,18 +163,6 @@ def inject(robot: EmulatedRobot, board: SerialBoard, kind: str, tendon: int, ran
         robot.switch = random.choice(["pressed", "broken"])
     else:
         robot.chip.reset()
-
-
-def _is_caught(robot: EmulatedRobot, board: SerialBoard) -> bool:
-    """Return True if the driver refuses commands within 3 s, and no motor reels in afterwards."""
-    try:
-        for k in range(60):
-            board.command(np.full(4, 3.0 + 0.2 * k))
-            board.wait(DT)
-    except HardwareError:
-        robot.advance(0.05)
-        return max(robot.chip.drives()) <= 0.0
-    return False
 
 
 def mend(robot: EmulatedRobot) -> None:
@@ -390,7 +350,6 @@ def jobs(quick: bool) -> list[Job]:
         Job("fuzz", fuzz, {"frames": 1_000_000}),
         Job("steps", steps, {}),
         Job("watchdog", watchdog, {"runs": 5 if quick else 50}),
-        Job("faults", faults, {"runs": 20 if quick else 200}),
         Job("repeat", repeat, {}),
         Job("loop-faults", loop_faults, {"runs": 8 if quick else 40}),
         Job("loop", loop, {"seconds": 60.0 if quick else 600.0}),
@@ -414,8 +373,7 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
     if reason := missing():
         raise HardwareError(f"the study needs the firmware's tools: {reason}")
     made = checks(facts_of(jobs(quick), out, **how))
-    texts = {"hardware.json": as_json(made), "hardware.md": as_markdown(made)}
-    return Report(made, write_texts(out, texts), [])
+    return write_report(out, "hardware", made, as_markdown(made))
 
 
 def facts_of(jobs: Sequence[Job], out: Path, **how: Any) -> dict[str, dict[str, Any]]:
@@ -436,8 +394,6 @@ def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
         ("tension steps: time to stay within 5 % (s)", found["settling"], 0.1),
         ("tension steps: overshoot (% of the step)", found["overshoot"], 10.0),
         ("tension left 100 ms after the last line (gf)", facts["watchdog"]["left"], 20.0),
-        ("injected faults that were not caught", facts["faults"]["missed"], 0),
-        ("faults after which the robot did not work again", facts["faults"]["dead"], 0),
         ("bits that differ between two runs", facts["repeat"]["different"], 0),
         ("closed loop: tip RMSE, worst reference (% of length)", fastest["rmse"], FACTOR * STAND_IN),
         ("closed loop: periods above the tension limit", fastest["unsafe"], 0),

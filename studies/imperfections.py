@@ -7,8 +7,7 @@ training data a model need not be better than the nominal model, but must not be
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -29,11 +28,12 @@ from studies.methods import METHODS
 from studies.report import (
     MEASURES,
     PAPER_MEASURES,
+    Cells,
     Report,
-    as_json,
+    failures,
     markdown_table,
-    write_figures,
-    write_texts,
+    spreads,
+    write_report,
 )
 from studies.runner import Job, Product, StudyError
 
@@ -123,44 +123,17 @@ OTHERS: dict[str, dict[str, Any]] = {
 IMPERFECTIONS = {**NAMED, **OTHERS}
 
 
-def jobs(names: Sequence[str], seeds: Sequence[int], **changes: Any) -> list[Job]:
-    """Return one job for each imperfection: the baseline and the best method under all controls.
-
-    Args:
-        names: some of `IMPERFECTIONS`.
-        seeds: seeds of the fits.
-        changes: other settings than those of the study; see `settings`.
-    """
+def jobs(names: Sequence[str], seeds: Sequence[int]) -> list[Job]:
+    """Return one job for each of some of `IMPERFECTIONS`: the nominal and the best model, all controls."""
     return [
-        Job(name.replace(", ", "-").replace(" ", "-"), assess, settings(name, seeds, **changes))
+        Job(
+            name.replace(", ", "-").replace(" ", "-"),
+            assess,
+            {"imperfection": name, "seeds": list(seeds), "steps": STEPS, "controls": {**CONTROLS, **FAR}}
+            | {"training": list(TRAINING), **IMPERFECTIONS[name]},
+        )
         for name in names
     ]
-
-
-def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
-    """Return the settings of a job; these may be changed.
-
-    method               name of one of `METHODS`
-    training, rows       training controls, and the number of rows of each
-    training_dt, dt      time steps (s) of the training and of the predictions
-    steps, controls      steps and controls of the predictions
-    space, nodes         scheme along the rod, and number of nodes
-    noise                noise on the training data, as a fraction of each value's variation
-    """
-    if name not in IMPERFECTIONS:
-        raise ValueError(f"imperfection {name!r} is unknown; allowed is some of {', '.join(IMPERFECTIONS)}")
-    usual = {
-        "imperfection": name, "robot": ROBOT, "seeds": list(seeds), "method": "best",
-        "training": list(TRAINING), "rows": TRAINING_ROWS, "training_dt": DT, "dt": DT, "steps": STEPS,
-        "controls": {**CONTROLS, **FAR}, "space": "euler", "nodes": 10, "noise": 0.0,
-        **IMPERFECTIONS[name],
-    }  # fmt: skip
-    unknown = sorted(set(changes) - set(usual))
-    if unknown:
-        raise ValueError(
-            f"a job of imperfections has no setting {unknown[0]!r}; there are {', '.join(usual)}"
-        )
-    return {**usual, **changes}
 
 
 # the work
@@ -168,12 +141,21 @@ def settings(name: str, seeds: Sequence[int], **changes: Any) -> dict[str, Any]:
 
 def assess(settings: Any) -> Product:
     """Return the cells of one imperfection: the nominal and the learned model, under every control."""
-    knowledge: Any = load_robot(settings["robot"]).replace(nodes=settings["nodes"])
+    knowledge: Any = load_robot(ROBOT)
     truth = truths.derived_robot(KINDS[settings["kind"]], knowledge, **settings["truth"])
-    training, references = _truths(truth, settings)
-    learned = METHODS[settings["method"]](knowledge, training, settings["seeds"])
+    training, steps = settings["training"], settings["steps"]
+    # one batch, so that one program is compiled
+    moved = _moved(truth, [*training, *settings["controls"].values()], steps)
+    seen, references = moved[: len(training)], moved[len(training) :]
+    for each in seen:
+        if isinstance(each, str):
+            raise StudyError(
+                f"{settings['imperfection']}: the truth cannot be simulated for training: {each}"
+            )
+    usable = [each[:TRAINING_ROWS] for each in seen if isinstance(each, Trajectory)]
+    learned = METHODS["best"](knowledge, usable, settings["seeds"])
     systems: list[tuple[str, int, System | str]] = [("baseline", 0, knowledge)]
-    systems += [(settings["method"], seed, system) for seed, system in learned.systems.items()]
+    systems += [("best", seed, system) for seed, system in learned.systems.items()]
     cells = [
         cell
         for method, seed, system in systems
@@ -182,45 +164,16 @@ def assess(settings: Any) -> Product:
     return Product({"cells": cells, "found": learned.found}, {})
 
 
-def _truths(truth: System, settings: Any) -> tuple[list[Trajectory], list[Trajectory | str]]:
-    """Return the training trajectories and the reference trajectories."""
-    training, asked = settings["training"], list(settings["controls"].values())
-    if settings["training_dt"] == settings["dt"]:
-        # one batch, so that one program is compiled
-        moved = _moved(truth, [*training, *asked], settings["steps"], settings["dt"], settings["space"])
-        seen, references = moved[: len(training)], moved[len(training) :]
-    else:
-        seen = _moved(truth, training, settings["rows"], settings["training_dt"], settings["space"])
-        references = _moved(truth, asked, settings["steps"], settings["dt"], settings["space"])
-    usable = [trajectory for trajectory in seen if isinstance(trajectory, Trajectory)]
-    if len(usable) < len(training):
-        failed = next(each for each in seen if isinstance(each, str))
-        raise StudyError(f"{settings['imperfection']}: the truth cannot be simulated for training: {failed}")
-    noise, rows = settings["noise"], settings["rows"]
-    return [with_noise(each[:rows], noise, seed) for seed, each in enumerate(usable)], references
-
-
-def with_noise(trajectory: Trajectory, level: float, seed: int) -> Trajectory:
-    """Return a trajectory with normal noise on y and z, relative to each value's variation."""
-    if level == 0.0:
-        return trajectory
-    draw = np.random.default_rng(seed)
-    y, z = np.array(trajectory.y), np.array(trajectory.z)
-    for values in (y, z):
-        values += level * values.std(axis=(0, 1)) * draw.normal(size=values.shape)
-    return dataclasses.replace(trajectory, y=y, z=z)
-
-
-def _moved(system: System, asked: Sequence[str], steps: int, dt: float, space: str) -> list[Trajectory | str]:
+def _moved(system: System, asked: Sequence[str], steps: int) -> list[Trajectory | str]:
     """Return trajectories of as many rows as steps, or the reasons of failure."""
-    tensions = np.stack([controls.parse(control, steps, dt, sampled="end") for control in asked])
+    tensions = np.stack([controls.parse(control, steps, DT, sampled="end") for control in asked])
     batch = simulate(
         system,
         tensions,
-        dt,
+        DT,
         time="bdf2",
         start="paper",
-        space=space,
+        space="euler",
         initial="unstressed",
         on_failure="return",
     )
@@ -237,8 +190,7 @@ def _cells(
     if isinstance(system, str):
         predictions: list[Trajectory | str] = [system] * len(names)
     else:
-        asked = list(names.values())
-        predictions = _moved(system, asked, settings["steps"], settings["dt"], settings["space"])
+        predictions = _moved(system, list(names.values()), settings["steps"])
     of = {"imperfection": settings["imperfection"], "method": method, "seed": seed}
     return [
         {**of, "control": name, **compared(prediction, reference)}
@@ -265,32 +217,29 @@ def rerun(out: Path, *, seeds: Sequence[int], names: Sequence[str] | None = None
     made = jobs(names or list(IMPERFECTIONS), seeds)
     facts = runner.run(made, out, **how)
     cells = [cell for each in facts.values() for cell in each["cells"]]
-    texts = {"imperfections.md": as_markdown(cells), "imperfections.json": as_json(cells)}
-    return Report(cells, write_texts(out, texts), write_figures(out, {"imperfections": figure(cells)}))
+    figures = {"imperfections": figure(cells)}
+    return write_report(out, "imperfections", cells, as_markdown(cells), figures)
 
 
-def ratios(cells: Sequence[Mapping[str, Any]], measure: str) -> dict[tuple[str, str], float | None]:
+def ratios(cells: Cells, measure: str) -> dict[tuple[str, ...], float | None]:
     """Return the worst seed's error relative to the baseline's, by imperfection and control.
 
     The ratio is None if a seed could not be simulated. It is zero if only the baseline could not be
     simulated. Cases whose true robot could not be simulated are left out.
     """
-    of: dict[tuple[str, str], dict[bool, list[Any]]] = {}
-    for cell in cells:
-        both = of.setdefault((cell["imperfection"], cell["control"]), {True: [], False: []})
-        both[cell["method"] == "baseline"].append(cell[measure])
-    found: dict[tuple[str, str], float | None] = {}
-    for case, both in of.items():
-        baseline, learned = both[True][0], both[False]
-        if None in learned:
-            if baseline is not None or any(each is not None for each in learned):
+    found: dict[tuple[str, ...], float | None] = {}
+    for case, both in spreads(cells, measure).items():
+        baseline = both.pop("baseline").mean
+        (learned,) = both.values()
+        if learned.failures:
+            if baseline is not None or learned.values:
                 found[case] = None
         else:
-            found[case] = 0.0 if baseline is None else max(learned) / baseline
+            found[case] = 0.0 if baseline is None else max(learned.values) / baseline
     return found
 
 
-def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+def missed(cells: Cells) -> list[tuple[str, ...]]:
     """Return the imperfections and controls in which the learned model misses its target.
 
     The target is an error of at most `LEFT` times the baseline's in the paper's two metrics; at twice the
@@ -306,7 +255,7 @@ def missed(cells: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
     return wrong
 
 
-def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
+def as_markdown(cells: Cells) -> str:
     """Return one table per metric with a line per imperfection, and the missed targets."""
     names = list(dict.fromkeys(cell["imperfection"] for cell in cells))
     controls = list(dict.fromkeys(cell["control"] for cell in cells))
@@ -316,38 +265,26 @@ def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
         f"Allowed is {LEFT:g}, and 1 at twice the tension; what is more than that is in bold."
     ]
     for measure, (title, factor) in MEASURES.items():
-        left = ratios(cells, measure)
+        left, errors = ratios(cells, measure), spreads(cells, measure, factor)
         rows = []
         for name in names:
             row = [name if name in NAMED else f"*{name}*"]
             for control in controls:
-                baseline = _baseline(cells, name, control, measure)
-                row.append(_words(left.get((name, control), "?"), baseline and factor * baseline))
+                baseline = errors[name, control]["baseline"].mean
+                row.append(_words(left.get((name, control), "?"), baseline))
                 allowed = 1.0 if control in FAR else LEFT
                 ratio = left.get((name, control), 0.0)
                 if measure in PAPER_MEASURES and (ratio is None or ratio > allowed):
                     row[-1] = f"**{row[-1]}**"
             rows.append(row)
         parts += [f"## {title}", markdown_table(["imperfection", *controls], rows)]
-    failures = [
-        "- {imperfection}, {control}, {method}, seed {seed}: {failed}".format(**cell)
-        for cell in cells
-        if "failed" in cell
-    ]
-    if failures:
-        parts += ["What failed:", "\n".join(failures)]
-    count = len(names) - len({name for name, _ in wrong})
+    if failed := failures(cells, "imperfection", "control", "method", "seed"):
+        parts += ["What failed:", "\n".join(failed)]
+    count = len(names) - len({case[0] for case in wrong})
     parts.append(
         f"{count} of {len(names)} imperfections are learned as well as asked for, under every control."
     )
     return "\n\n".join(parts) + "\n"
-
-
-def _baseline(cells: Sequence[Mapping[str, Any]], name: str, control: str, measure: str) -> float | None:
-    for cell in cells:
-        if (cell["imperfection"], cell["control"], cell["method"]) == (name, control, "baseline"):
-            return cell[measure]
-    return None
 
 
 def _words(ratio: float | str | None, baseline: float | None) -> str:
@@ -355,7 +292,7 @@ def _words(ratio: float | str | None, baseline: float | None) -> str:
     return left + (" (failed)" if baseline is None else f" ({baseline:.2g})")
 
 
-def figure(cells: Sequence[Mapping[str, Any]]) -> Figure:
+def figure(cells: Cells) -> Figure:
     """Return a figure of errors relative to the baseline's: a line per imperfection, a point per control.
 
     A cross at the right edge is a failure; the dotted line is the target.

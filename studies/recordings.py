@@ -6,10 +6,8 @@ capture. All settings are passed to the jobs as plain values.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
-import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -25,7 +23,6 @@ from knode_cosserat.identification.fit import fit as learn
 from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.learning.config import FitConfig, FitError
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.states import fit_states
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.estimation.estimate import estimate_states
 from knode_cosserat.recordings.load import load_recording
@@ -40,16 +37,18 @@ from knode_cosserat.solvers.segments import DataError
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 from studies import figures, runner
+from studies.methods import fitted
 from studies.report import (
     MEASURES,
     PAPER_MEASURES,
+    Cells,
     Report,
-    Spread,
     as_json,
+    failures,
     in_words,
     markdown_table,
-    write_figures,
-    write_texts,
+    spreads,
+    write_report,
 )
 from studies.runner import Job, Product, StudyError
 
@@ -214,27 +213,17 @@ class _Read:
 
 
 def measured(settings: Any) -> Product:
-    """Return the measurements: tip paths, tensions, and the origin of the recordings."""
+    """Return the measurements: tip paths, and the origin of the recordings."""
     read = _Read(settings)
     facts: dict[str, Any] = {}
     for name in settings["recordings"]:
-        rows = _compared(read.rows(name), read.window(name).seconds)
-        command = None
-        if read[name].command is not None:
-            _, start, seconds = read.window(name)
-            asked = read[name].sampled(DT, start, start + seconds, "commanded")
-            command = _plain(_compared(asked, seconds).tension, 3)
+        # the rows that the paper keeps: rest, and the states after all controls but the last
+        rows = read.rows(name).rows(0, round(read.window(name).seconds / DT))
         facts[name] = {
-            "time": _plain(rows.time, 6), "tip": _plain(rows.tip_position, 6), "command": command,
-            "tension": _plain(rows.tension, 3), "simulated": rows.simulated,
+            "time": _plain(rows.time, 6), "tip": _plain(rows.tip_position, 6), "simulated": rows.simulated,
             "findings": [f"{it.topic}: {it.message}" for it in read[name].findings if it.severity != "note"],
         }  # fmt: skip
     return Product(facts, {})
-
-
-def _compared(rows: Measurements, seconds: float) -> Measurements:
-    """Return the rows that the paper keeps: rest, and the states after all controls but the last."""
-    return rows.rows(0, round(seconds / DT))
 
 
 def _plain(values: Any, digits: int) -> Any:
@@ -266,16 +255,8 @@ def _paper(knowledge: System, train: Sequence[str], read: _Read, seeds: Sequence
     for name in train:
         _, start, seconds = read.window(name)
         states.append(estimate_states(read[name], knowledge, "paper", DT, start, start + seconds))
-    try:
-        models = fit_states(knowledge, states, FitConfig.paper_recordings(seed=tuple(seeds)))
-    except FitError as error:
-        return TrainedSystems(dict.fromkeys(seeds, str(error)))
-    losses = {
-        str(model.about.facts["seed"]): np.asarray(model.about.facts["segments"]["loss"]).tolist()
-        for model in models
-    }
-    systems = dict(zip(seeds, models, strict=True))
-    return TrainedSystems(systems, space=PAPER_SPACE, loss=losses, resting=knowledge)
+    learned = fitted(knowledge, states, FitConfig.paper_recordings(seed=tuple(seeds)))
+    return TrainedSystems(learned.systems, space=PAPER_SPACE, loss=learned.loss, resting=knowledge)
 
 
 def _best(knowledge: System, rows: Sequence[Measurements]) -> tuple[System, str]:
@@ -415,12 +396,9 @@ def _paper_motion(
 
 TIP = {"tip_rmse": ("Tip RMSE [cm]", 100.0)}
 Facts = Mapping[str, Mapping[str, Any]]
-Cells = Sequence[Mapping[str, Any]]
 
 #: percent by which the paper improves its two metrics on average, on its own robot, from Dataset B
 PAPER_GAIN = 58.7
-#: tensions of one control differ by less than this (N, root mean square) from one recording to another
-SAME = 0.15
 
 
 def rerun(
@@ -456,12 +434,9 @@ def rerun(
     cells = [cell for name in rest for cell in every if cell["recording"] == name]
     seen = [cell for name in learned for cell in every if cell["recording"] == name]
     said = _said(facts["measured"], simulated)
-    texts = {
-        "table2.md": as_markdown(cells, seen, facts, methods, said),
-        "table2.json": as_json(cells),
-        "training.json": as_json(seen),
-    }
-    return Report(cells, write_texts(out, texts), draw(facts, methods, rest, out))
+    text = as_markdown(cells, seen, facts, methods, said)
+    training = {"training.json": as_json(seen)}
+    return write_report(out, "table2", cells, text, draw(facts, methods, rest), training)
 
 
 def _said(measured: Mapping[str, Any], simulated: bool | None) -> str:
@@ -507,30 +482,24 @@ def as_markdown(cells: Cells, seen: Cells, facts: Facts, methods: Sequence[str],
     told = facts.get("best", {}).get("told")
     if told:
         parts += ["## What `best` found", f"```\n{told}\n```"]
-    for title, lines in (("What failed", _failures([*cells, *seen])), ("What was mended", _mended(facts))):
+    failed = failures([*cells, *seen], "recording", "method", "seed")
+    for title, lines in (("What failed", failed), ("What was mended", _mended(facts))):
         if lines:
             parts += [f"## {title}", "\n".join(lines)]
     return "\n\n".join(parts) + "\n"
 
 
-def _spread(cells: Cells, recording: str, method: str, measure: str, factor: float = 1.0) -> Spread:
-    own = [cell for cell in cells if (cell["recording"], cell["method"]) == (recording, method)]
-    values = tuple(factor * cell[measure] for cell in own if cell[measure] is not None)
-    return Spread(values, tuple(cell["failed"] for cell in own if "failed" in cell))
-
-
 def table_of(cells: Cells, measure: str, factor: float, methods: Sequence[str]) -> str:
     """Return a Markdown table of one metric for all recordings and methods."""
     rows = []
-    for name in dict.fromkeys(cell["recording"] for cell in cells):
-        base = _spread(cells, name, "baseline", measure, factor).mean
+    for (name,), spread in spreads(cells, measure, factor, by=("recording",)).items():
+        base = spread["baseline"].mean if "baseline" in spread else None
         row = [name]
         for method in methods:
-            spread = _spread(cells, name, method, measure, factor)
-            less = ""
-            if method != "baseline" and base and spread.mean is not None:
-                less = f" ({_in_percent(1.0 - spread.mean / base)})"
-            row.append(in_words(spread) + less)
+            less, mean = "", spread[method].mean
+            if method != "baseline" and base and mean is not None:
+                less = f" ({_in_percent(1.0 - mean / base)})"
+            row.append(in_words(spread[method]) + less)
         rows.append(row)
     return markdown_table(["recording", *methods], rows)
 
@@ -543,25 +512,16 @@ def _in_percent(part: float) -> str:
 def _gains(cells: Cells, methods: Sequence[str]) -> dict[str, float]:
     """Return each method's mean improvement over recordings and both metrics; failed methods have none."""
     found: dict[str, float] = {}
-    names = list(dict.fromkeys(cell["recording"] for cell in cells))
+    cases = [each for name in PAPER_MEASURES for each in spreads(cells, name, by=("recording",)).values()]
     for method in methods:
         gains = []
-        for name, measure in itertools.product(names, PAPER_MEASURES):
-            base = _spread(cells, name, "baseline", measure).mean
-            mine = _spread(cells, name, method, measure)
+        for spread in cases:
+            base, mine = spread["baseline"].mean if "baseline" in spread else None, spread[method]
             if base and mine.mean is not None and not mine.failures:
                 gains.append(100.0 * (1.0 - mine.mean / base))
-        if method != "baseline" and len(gains) == len(names) * len(PAPER_MEASURES):
+        if method != "baseline" and len(gains) == len(cases):
             found[method] = float(np.mean(gains))
     return found
-
-
-def _failures(cells: Cells) -> list[str]:
-    return [
-        f"- {cell['recording']}, {cell['method']}, seed {cell['seed']}: {cell['failed']}"
-        for cell in cells
-        if "failed" in cell
-    ]
 
 
 def _mended(facts: Facts) -> list[str]:
@@ -571,22 +531,14 @@ def _mended(facts: Facts) -> list[str]:
 # the figures
 
 
-def draw(facts: Facts, methods: Sequence[str], names: Sequence[str], out: Path) -> list[Path]:
-    """Write figures of tensions, paths, tip x, error over the horizon, and losses and repetitions if any."""
+def draw(facts: Facts, methods: Sequence[str], names: Sequence[str]) -> dict[str, Figure]:
+    """Return figures of paths, tip x, error over the horizon, and losses if any."""
     seen = {name: _predicted(facts, methods, name) for name in names}
-    drawn = {
-        "tensions": measured_tensions(seen),
-        "paths": paths(seen),
-        "tip-x": tip_x(seen),
-        "horizon": horizon(seen),
-    }
+    drawn = {"paths": paths(seen), "tip-x": tip_x(seen), "horizon": horizon(seen)}
     losses = {method: list(facts[method]["loss"].values()) for method in methods if facts[method]["loss"]}
     if losses:
         drawn["loss"] = figures.losses(losses)
-    repeated = repetitions({name: _predicted(facts, (), name) for name in facts["measured"]})
-    if repeated:
-        drawn["consistency"] = consistency(repeated, DT)
-    return write_figures(out, drawn)
+    return drawn
 
 
 def _predicted(facts: Facts, methods: Sequence[str], name: str) -> Predicted:
@@ -596,32 +548,8 @@ def _predicted(facts: Facts, methods: Sequence[str], name: str) -> Predicted:
         for method in methods
         if name in facts[method]["tips"]
     }
-    command = None if it["command"] is None else np.array(it["command"], dtype=float)
-    time, tip, tension = (np.array(it[key], dtype=float) for key in ("time", "tip", "tension"))
-    return Predicted(time, tip, tips, tension, command)
-
-
-def repetitions(recordings: Mapping[str, Predicted]) -> dict[str, list[np.ndarray]]:
-    """Return the tips of recordings with equal commands, by the first recording's name."""
-    groups: list[list[str]] = []
-    for name, it in recordings.items():
-        for group in groups:
-            if _alike(recordings[group[0]], it):
-                group.append(name)
-                break
-        else:
-            groups.append([name])
-    return {
-        group[0]: [np.asarray(recordings[name].measured) for name in group] for group in groups if group[1:]
-    }
-
-
-def _alike(one: Predicted, other: Predicted) -> bool:
-    a, b = (it.tension if it.command is None else it.command for it in (one, other))
-    if a.shape[1] != b.shape[1]:
-        return False
-    length = min(len(a), len(b))
-    return bool(np.sqrt(np.nanmean((a[:length] - b[:length]) ** 2)) < SAME)
+    time, tip = (np.array(it[key], dtype=float) for key in ("time", "tip"))
+    return Predicted(time, tip, tips)
 
 
 #: line style of each method
@@ -631,8 +559,6 @@ LINES: dict[str, dict[str, Any]] = {
     "paper-b": LOOKS["paper"],
     "best": LOOKS["best"],
     "calibrated": LOOKS["calibrated"],
-    "no-memory": {"color": PALETTE[2], "linestyle": "-", "linewidth": 1.1},
-    "no-vibration": {"color": PALETTE[4], "linestyle": "--", "linewidth": 1.1},
 }
 MEASURED = {**REFERENCE, "label": "measured"}
 COLUMNS = 2
@@ -644,34 +570,20 @@ class Predicted(NamedTuple):
     time: Float[np.ndarray, " T"]
     measured: Float[np.ndarray, "T 3"]
     predicted: Mapping[str, Float[np.ndarray, "T 3"]]
-    tension: Float[np.ndarray, "T c"]
-    command: Float[np.ndarray, "T c"] | None
 
 
-def measured_tensions(recordings: Mapping[str, Predicted]) -> Figure:
-    """Return a figure of commanded and measured tensions by tendon.
+def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
+    """Return a figure of x of the tips over time.
 
     Raises:
         ImportError: matplotlib is not installed; from every function here.
         ValueError: there is nothing to draw; from every function here.
     """
-    with _grid(recordings, 2.3) as (figure, panels):
-        for axes, (name, it) in zip(panels, recordings.items(), strict=False):
-            for k in range(it.tension.shape[1]):
-                colour = PALETTE[k % len(PALETTE)]
-                axes.plot(it.time, it.tension[:, k], color=colour, linewidth=1.1, label=f"tendon {k + 1}")
-                if it.command is not None:
-                    axes.step(
-                        it.time, it.command[:, k], where="post", color=colour, linewidth=0.8, alpha=0.6,
-                        linestyle="--",
-                    )  # fmt: skip
-            axes.set(title=f"{name}: measured (solid), commanded (dashed)", ylabel="tension [N]")
-        return _finished(figure, panels)
-
-
-def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
-    """Return a figure of x of the tips over time."""
-    with _grid(recordings, 2.3) as (figure, panels):
+    require_some(recordings)
+    columns = 1 if len(recordings) < 3 else 2
+    rows = -(-len(recordings) // columns)
+    with new_figure(TWO_COLUMNS, 1.61 * rows + 0.5) as figure:
+        panels = figure.subplots(rows, columns, squeeze=False).ravel()
         # one scale for all panels, so that motions are comparable; predictions far off leave the axes
         reach = 2.5 * max(float(np.nanmax(np.abs(it.measured[:, 0]))) for it in recordings.values())
         for axes, (name, it) in zip(panels, recordings.items(), strict=False):
@@ -679,7 +591,13 @@ def tip_x(recordings: Mapping[str, Predicted]) -> Figure:
             for method, tip in it.predicted.items():
                 axes.plot(it.time, tip[:, 0], label=method, **LINES.get(method, {}))
             axes.set(title=name, ylabel="tip x [m]", ylim=(-reach, reach))
-        return _finished(figure, panels)
+            axes.margins(x=0.0)
+        for axes in panels[len(recordings) :]:
+            axes.remove()
+        for axes in panels[: len(recordings)][-2:]:
+            axes.set_xlabel("time [s]")
+        legend_below(figure, panels[: len(recordings)])
+    return figure
 
 
 def paths(recordings: Mapping[str, Predicted]) -> Figure:
@@ -736,43 +654,4 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
         axes.set_title("Lines: root mean square of all recordings over the last second; bands: least to most")
         axes.margins(x=0.0)
         legend_below(figure, [axes])
-    return figure
-
-
-def consistency(groups: Mapping[str, Sequence[Float[np.ndarray, "T 3"]]], dt: float) -> Figure:
-    """Return a figure of repeated recordings of one control, overlaid: the robot's repeatability."""
-    with _grid(groups, 2.3) as (figure, panels):
-        for axes, (name, several) in zip(panels, groups.items(), strict=False):
-            length = min(len(tip) for tip in several)
-            tips = np.stack([tip[:length] for tip in several])
-            time = dt * np.arange(length)
-            spread = np.linalg.norm(np.nanstd(tips, axis=0), axis=1)
-            for k, tip in enumerate(tips):
-                label = "" if k else "each recording"
-                axes.plot(time, tip[:, 0], color=PALETTE[0], linewidth=0.8, label=label)
-            axes.set(
-                title=f"{name}, {len(tips)} times: {100 * np.sqrt(np.nanmean(spread**2)):.2f} cm apart",
-                ylabel="tip x [m]",
-            )
-        return _finished(figure, panels)
-
-
-@contextlib.contextmanager
-def _grid(given: Mapping[str, Any], height: float) -> Iterator[tuple[Any, Any]]:
-    require_some(given)
-    columns = 1 if len(given) < 3 else 2
-    rows = -(-len(given) // columns)
-    with new_figure(TWO_COLUMNS, 0.7 * height * rows + 0.5) as figure:
-        yield figure, figure.subplots(rows, columns, squeeze=False).ravel()
-
-
-def _finished(figure: Any, panels: Any) -> Figure:
-    used = [axes for axes in panels if axes.get_lines()]
-    for axes in panels:
-        axes.margins(x=0.0)
-        if axes not in used:
-            axes.remove()
-    for axes in used[-2:]:
-        axes.set_xlabel("time [s]")
-    legend_below(figure, used)
     return figure

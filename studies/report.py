@@ -12,7 +12,8 @@ import math
 import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, NotRequired, TypedDict
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from knode_cosserat._files.writing import replacing
 
@@ -26,19 +27,8 @@ MEASURES = {
     "rotation_rmse": ("Angle between orientations, RMS [degrees]", math.degrees(1.0)),
 }
 PAPER_MEASURES = ("tip_dtw", "pose_mse")
-
-
-class Cell(TypedDict):
-    """Metrics of one method with one seed in one case; if they are None, `failed` has the reason."""
-
-    imperfection: str
-    control: str
-    method: str
-    seed: int
-    tip_dtw: float | None
-    pose_mse: float | None
-    rotation_rmse: float | None
-    failed: NotRequired[str]
+#: cells: metrics of one method with one seed in one case; if they are None, `failed` has the reason
+Cells = Sequence[Mapping[str, Any]]
 
 
 class Published(NamedTuple):
@@ -67,16 +57,28 @@ class Spread(NamedTuple):
         return statistics.stdev(self.values) if len(self.values) > 1 else None
 
 
-Case = tuple[str, str]
+#: values of the keys of a case
+Case = tuple[Any, ...]
+#: keys of a cell that are its case in the paper's table
+CASE = ("imperfection", "control")
 
 
-def spreads(cells: Sequence[Cell], measure: str, factor: float = 1.0) -> dict[Case, dict[str, Spread]]:
-    """Return the values of a metric, times a factor, by case and method, in the order of the cells."""
+def spreads(
+    cells: Cells, measure: str, factor: float = 1.0, by: Sequence[str] = CASE
+) -> dict[Case, dict[str, Spread]]:
+    """Return the values of a metric, times a factor, by case and method, in the order of the cells.
+
+    Args:
+        cells: cells of one or more methods and seeds.
+        measure: key of the metric.
+        factor: factor of its values.
+        by: keys of the cells whose values are a case.
+    """
     found: dict[Case, dict[str, Spread]] = {}
     for cell in cells:
-        methods = found.setdefault((cell["imperfection"], cell["control"]), {})
+        methods = found.setdefault(tuple(cell[key] for key in by), {})
         values, failures = methods.get(cell["method"], Spread((), ()))
-        value = cell[measure]  # type: ignore[literal-required]
+        value = cell[measure]
         if value is None:
             failures = (*failures, cell.get("failed", "no reason given"))
         else:
@@ -91,7 +93,7 @@ _COLUMNS = (
 )  # fmt: skip
 
 
-def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
+def as_csv(cells: Cells, published: Mapping[Case, Published]) -> str:
     """Return CSV with a line per case, method and metric: mean, deviation, published values and ratio."""
     file = io.StringIO()
     writer = csv.writer(file, lineterminator="\n")
@@ -111,7 +113,7 @@ def as_csv(cells: Sequence[Cell], published: Mapping[Case, Published]) -> str:
     return file.getvalue()
 
 
-def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], notes: Sequence[str] = ()) -> str:
+def as_markdown(cells: Cells, published: Mapping[Case, Published], notes: Sequence[str] = ()) -> str:
     """Return Markdown with one table per metric, with published values beside ours, and the failures.
 
     The paper has no angles between orientations, so that table has no columns of it.
@@ -139,14 +141,8 @@ def as_markdown(cells: Sequence[Cell], published: Mapping[Case, Published], note
                     row.append(ratio_in_words(spread.mean, paper.learned[k] if paper else 0.0))
             rows.append(row)
         parts += [f"## {title}", markdown_table(heads, rows)]
-    failures = [
-        f"- {case[0]}, {case[1]}, {method}: {reason}"
-        for case, by_method in spreads(cells, "tip_dtw").items()
-        for method, spread in by_method.items()
-        for reason in spread.failures
-    ]
-    if failures:
-        parts += ["What failed:", "\n".join(failures)]
+    if failed := failures(cells, "imperfection", "control", "method"):
+        parts += ["What failed:", "\n".join(failed)]
     return "\n\n".join([*parts, *notes]) + "\n"
 
 
@@ -186,12 +182,12 @@ def markdown_table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 class Report(NamedTuple):
     """Results of a study and its files; the first table is in Markdown."""
 
-    cells: Sequence[Mapping[str, Any]]
+    cells: Cells
     tables: list[Path]
     figures: list[Path]
 
 
-def as_json(cells: Sequence[Mapping[str, Any]]) -> str:
+def as_json(cells: Cells) -> str:
     """Return a JSON list with one cell per line; numbers that are not finite are null."""
 
     def known(cell: Mapping[str, Any]) -> dict[str, Any]:
@@ -220,6 +216,29 @@ def checks_table(made: Sequence[Mapping[str, Any]]) -> str:
     return markdown_table(["check", "value", "limit", "met"], rows)
 
 
+def write_report(
+    out: Path,
+    name: str,
+    cells: Cells,
+    text: str,
+    figures: Mapping[str, Figure] = MappingProxyType({}),
+    others: Mapping[str, str] = MappingProxyType({}),
+) -> Report:
+    """Write a study's table, its cells, figures by name and other texts by file name, and return all."""
+    out.mkdir(parents=True, exist_ok=True)
+    tables = write_texts(out, {f"{name}.md": text, f"{name}.json": as_json(cells), **others})
+    return Report(cells, tables, write_figures(out, figures))
+
+
+def failures(cells: Cells, *keys: str) -> list[str]:
+    """Return a line of text for each cell that failed: these values of it, and the reason."""
+
+    def words(cell: Mapping[str, Any]) -> str:
+        return ", ".join(f"seed {cell[key]}" if key == "seed" else str(cell[key]) for key in keys)
+
+    return [f"- {words(cell)}: {cell['failed']}" for cell in cells if "failed" in cell]
+
+
 def write_texts(out: Path, texts: Mapping[str, str]) -> list[Path]:
     """Write texts to files by name, each atomically, and return their paths."""
     for name, text in texts.items():
@@ -230,8 +249,8 @@ def write_texts(out: Path, texts: Mapping[str, str]) -> list[Path]:
 
 def write_figures(out: Path, figures: Mapping[str, Figure]) -> list[Path]:
     """Write each figure to OUT/figures/NAME.png and return the paths."""
-    (out / "figures").mkdir(exist_ok=True)
     paths = [out / "figures" / f"{name}.png" for name in figures]
     for path, figure in zip(paths, figures.values(), strict=True):
+        path.parent.mkdir(exist_ok=True)
         figure.savefig(path)
     return paths

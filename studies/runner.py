@@ -16,6 +16,7 @@ import json
 import multiprocessing
 import os
 import platform
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -49,6 +50,14 @@ class Product(NamedTuple):
 
     facts: dict[str, Any]
     files: dict[str, bytes]
+
+
+def file_bytes(name: str, write: Callable[[Path], Any]) -> bytes:
+    """Return the content of a file of this name that a function writes."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / name
+        write(path)
+        return path.read_bytes()
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,10 +10,9 @@ the imperfection. It then predicts a held-out sine and a held-out step.
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from knode_cosserat import controls
 from knode_cosserat.learning.knode import KNODE
@@ -26,8 +25,11 @@ from knode_cosserat.trajectory import Trajectory
 from studies import figures, runner
 from studies.comparisons import compared
 from studies.methods import METHODS
-from studies.report import Cell, Published, Report, as_csv, as_json, as_markdown, write_figures, write_texts
-from studies.runner import Job, Product
+from studies.report import Case, Published, Report, as_csv, as_markdown, write_report
+from studies.runner import Job, Product, file_bytes
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 ROBOT = "delrin-tendon-robot"
 #: time step (s)
@@ -47,7 +49,7 @@ IMPERFECTIONS: dict[str, dict[str, Any]] = {
 
 #: Table I of the paper, and a rerun of the same method with one seed (tip DTW, then pose MSE).
 #: The baseline of self-weight under the step was published from a solve that had not converged; see NOTES.
-PUBLISHED = {
+PUBLISHED: dict[Case, Published] = {
     ("self-weight", "sine"): Published((1.75, 0.09), (0.00, 0.00), (0.00, 0.00)),
     ("length", "sine"): Published((40.16, 16.46), (4.31, 1.44), (4.03, 1.17)),
     ("stiffness", "sine"): Published((19.99, 12.52), (0.94, 0.03), (1.22, 0.05)),
@@ -72,7 +74,7 @@ class Setting(NamedTuple):
     controls: Mapping[str, str]
     imperfections: Mapping[str, Mapping[str, Any]]
     space: str
-    published: Mapping[tuple[str, str], Published] = {}
+    published: Mapping[Case, Published] = {}
     notes: Sequence[str] = NOTES[1:]
 
 
@@ -159,14 +161,14 @@ def predict(settings: Any) -> Product:
         moved(robot, control, settings["training_rows"], dt, space) for control in settings["training"]
     ]
     learned = METHODS[method](robot.replace(**settings["changes"]), training, settings["seeds"])
-    cells: list[Cell] = []
+    cells: list[dict[str, Any]] = []
     kept = _Kept()
     for name, control in settings["controls"].items():
         truth = moved(robot, control, settings["rows"], dt, space)
         for seed, system in learned.systems.items():
             prediction = predicted(system, control, settings["rows"], dt, space)
             case = {"imperfection": imperfection, "control": name, "method": method, "seed": seed}
-            cells.append(cast(Cell, case | compared(prediction, truth)))
+            cells.append(case | compared(prediction, truth))
             if isinstance(prediction, Trajectory) and seed == min(learned.systems):
                 kept.trajectory(prediction, name, f"{imperfection}-{method}")
     for seed, system in learned.systems.items():
@@ -185,10 +187,7 @@ class _Kept:
 
     def trajectory(self, trajectory: Trajectory, control: str, of: str) -> None:
         name = self.trajectories[control] = f"trajectories/{of}-{control}.nc"
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / "trajectory.nc"
-            trajectory.save(path)
-            self.files[name] = path.read_bytes()
+        self.files[name] = file_bytes("trajectory.nc", trajectory.save)
 
     def model(self, model: KNODE, name: str) -> None:
         self.files[f"models/{name}"] = model.to_bytes()
@@ -229,11 +228,13 @@ def rerun(
         StudyError: see `runner.run`.
     """
     facts = runner.run(jobs(seeds, methods, robot), out, **how)
-    cells = cells_of(facts, robot)
-    return Report(cells, write_table(cells, out, robot), draw(facts, methods, out, robot))
+    cells, setting = cells_of(facts, robot), SETTINGS[robot]
+    text = as_markdown(cells, setting.published, setting.notes)
+    table = {"table1.csv": as_csv(cells, setting.published)}
+    return write_report(out, "table1", cells, text, draw(facts, methods, out, robot), table)
 
 
-def cells_of(facts: Facts, robot: str = ROBOT) -> list[Cell]:
+def cells_of(facts: Facts, robot: str = ROBOT) -> list[dict[str, Any]]:
     """Return all cells of the jobs in the order of the paper's table: control, imperfection, method, seed."""
     cells = [cell for each in facts.values() for cell in each["cells"]]
     controls, imperfections = list(CONTROLS), list(SETTINGS[robot].imperfections)
@@ -242,21 +243,8 @@ def cells_of(facts: Facts, robot: str = ROBOT) -> list[Cell]:
     )
 
 
-def write_table(cells: Sequence[Cell], out: Path, robot: str = ROBOT) -> list[Path]:
-    """Write `table1.md`, `table1.csv` and `table1.json`."""
-    setting = SETTINGS[robot]
-    return write_texts(
-        out,
-        {
-            "table1.md": as_markdown(cells, setting.published, setting.notes),
-            "table1.csv": as_csv(cells, setting.published),
-            "table1.json": as_json(cells),
-        },
-    )
-
-
-def draw(facts: Facts, methods: Sequence[str], out: Path, robot: str = ROBOT) -> list[Path]:
-    """Write figures to OUT/figures: controls, shapes and tips of the first seed, losses of all."""
+def draw(facts: Facts, methods: Sequence[str], out: Path, robot: str = ROBOT) -> dict[str, Figure]:
+    """Return figures by name: controls, shapes and tips of the first seed, losses of all."""
     truths = _trajectories(facts[REFERENCE], out)
     drawn = {"controls": figures.controls(truths)}
     for imperfection in SETTINGS[robot].imperfections:
@@ -277,7 +265,7 @@ def draw(facts: Facts, methods: Sequence[str], out: Path, robot: str = ROBOT) ->
     }
     if losses:
         drawn["loss"] = figures.losses(losses)
-    return write_figures(out, drawn)
+    return drawn
 
 
 def _trajectories(facts: Mapping[str, Any], out: Path) -> dict[str, Trajectory]:

@@ -136,7 +136,7 @@ def tracked(
         "identification_s": clock.perf_counter() - done,
         "youngs_modulus": float(model.robot.youngs_modulus),
     }  # fmt: skip
-    sensor, percent = Sensor(TipPosition(), noise=NOISE / TipPosition().sigma), 100.0 / float(nominal.length)
+    sensor = Sensor(TipPosition(), noise=NOISE / TipPosition().sigma)
     cells = []
     for name in settings["controllers"]:
         controller = controller_of(model, name, dt, limits, settings["adaptive"])
@@ -145,19 +145,20 @@ def tracked(
             if isinstance(controller, PlanController):
                 controller.observer.restart()
             log = run_loop(controller, ElasticaPlant(rod, dt, sensor), paths[path], seconds)
-            cells.append(
-                {
-                    "controller": name,
-                    "robot": ROBOT,
-                    "reference": path,
-                    "rmse_percent": percent * error(log, path),
-                    "offset_percent": percent * float(np.median(log.tip_distance[_held(log)])),
-                    "fallbacks": log.fallbacks,
-                    "parameters": {key: float(values[-1]) for key, values in log.parameters.items()},
-                    "true_modulus": float(rod.robot.youngs_modulus),
-                }
-            )
+            offset = float(np.median(log.tip_distance[_held(log)]))
+            at = {"controller": name, "robot": ROBOT, "reference": path}
+            cells.append(at | tracking_facts(log, error(log, path), offset, rod.robot))
     return {"cells": cells, "model": facts}
+
+
+def tracking_facts(log: LoopLog, rmse: float, offset: float, truth: TendonRod) -> dict[str, Any]:
+    """Return the tracking errors (m) of a loop as percent of the length, and what its controller adapted."""
+    percent = 100.0 / float(truth.length)
+    return {
+        "rmse_percent": percent * rmse, "offset_percent": percent * offset, "fallbacks": log.fallbacks,
+        "parameters": {name: float(values[-1]) for name, values in log.parameters.items()},
+        "true_modulus": float(truth.youngs_modulus),
+    }  # fmt: skip
 
 
 def _held(log: LoopLog) -> Any:

@@ -22,7 +22,7 @@ from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.virtual import record_virtual
 from knode_cosserat.schemes.result import SimulationError
-from studies.report import Report, as_json, markdown_table, write_texts
+from studies.report import Report, markdown_table, write_report
 from studies.runner import Job, Product, run
 
 #: signals of the held-out recordings
@@ -47,8 +47,7 @@ def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
         how: as `runner.run` has it.
     """
     facts = list(run(jobs(seeds), out, **how).values())
-    texts = {"virtual_robots.md": as_markdown(facts), "virtual_robots.json": as_json(facts)}
-    return Report(facts, write_texts(out, texts), [])
+    return write_report(out, "virtual_robots", facts, as_markdown(facts))
 
 
 def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> list[Measurements]:
@@ -79,15 +78,16 @@ def _recorded(seed: int) -> _Recorded:
     Raises:
         SimulationError: all draws collapse.
     """
-    for redrawn in range(DRAWS):
+    redrawn = 0
+    while True:
         truth = drawn_robot(seed + APART * redrawn)
         try:
             given = recordings_of(truth, TRAINING, seed)
             return _Recorded(truth, given, recordings_of(truth, UNSEEN, 1000 + seed), redrawn)
         except SimulationError:
-            if redrawn == DRAWS - 1:
+            redrawn += 1
+            if redrawn == DRAWS:
                 raise
-    raise AssertionError("unreachable")
 
 
 def robot_facts(settings: Any) -> Product:

@@ -26,7 +26,7 @@ from studies.cables.model import DT, CableModel, CableParameters, Grips
 from studies.cables.places import grip_tangents, marker_places
 from studies.cables.recordings import CableData, CableMotion, load_cables
 from studies.cables.rollouts import Rollouts
-from studies.report import Report, as_json, markdown_table, write_figures, write_texts
+from studies.report import Report, failures, markdown_table, write_report
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -62,9 +62,11 @@ def rerun(
     tell: Callable[[str], None] = lambda line: None,
 ) -> Report:
     """Run the study for every cable of a folder, and write cables.json, cables.md, a figure and scenes."""
-    cables = load_cables(folder)
-    out.mkdir(parents=True, exist_ok=True)
-    return write_report(out, [study_cable(data, options, tell) for data in cables])
+    results = [study_cable(data, options, tell) for data in load_cables(folder)]
+    cells = [cell for result in results for cell in result.cells]
+    report = write_report(out, "cables", cells, as_markdown(results), {"cables": figure(results)})
+    scenes = [scene for result in results if (scene := _scene(out, result)) is not None]
+    return report._replace(tables=report.tables + scenes)
 
 
 def study_cable(data: CableData, options: CableOptions, tell: Callable[[str], None]) -> CableResult:
@@ -172,15 +174,6 @@ class CableResult(NamedTuple):
 SHOWN = (0.1, 0.4, 0.7, 1.0)
 
 
-def write_report(out: Path, results: Sequence[CableResult]) -> Report:
-    """Write all of the report into a folder."""
-    cells = [cell for result in results for cell in result.cells]
-    texts = {"cables.md": as_markdown(results), "cables.json": as_json(cells)}
-    tables = write_texts(out, texts)
-    scenes = [scene for result in results if (scene := _scene(out, result)) is not None]
-    return Report(cells, tables + scenes, write_figures(out, {"cables": figure(results)}))
-
-
 def as_markdown(results: Sequence[CableResult]) -> str:
     """Return the tables: means of each method, then every motion, then the parameters."""
     parts = [
@@ -216,10 +209,8 @@ def as_markdown(results: Sequence[CableResult]) -> str:
                 f"{1e3 * np.median(known):.1f} mm in the median, at most {1e3 * max(known):.1f} mm"
                 + (f"; no estimate for {lost} of {len(estimates)} predictions." if lost else ".")
             )
-        failed = [cell for cell in result.cells if "failed" in cell]
-        if failed:
-            listed = [f"- {cell['file']}, {cell['method']}: {cell['failed']}" for cell in failed]
-            parts += ["Failed, and left out of the means:", "\n".join(listed)]
+        if failed := failures(result.cells, "file", "method"):
+            parts += ["Failed, and left out of the means:", "\n".join(failed)]
         hard = [cell for cell in result.cells if cell.get("divided") or cell.get("restarts")]
         if hard:
             listed = [

@@ -24,6 +24,7 @@ from knode_cosserat_hardware.driver import (
 )
 from knode_cosserat_hardware.middleware.commands import CommandGate
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
+from tests.hardware.waiting import eventually, wait_for
 
 pytest.importorskip("cyclonedds", reason="DDS needs cyclonedds: pip install 'knode-cosserat-hardware[dds]'")
 
@@ -178,20 +179,9 @@ def test_types_have_the_names_of_ros_2():
 # topics
 
 
-def taken(reader, count=1, timeout=5.0):
+def taken(reader):
     """Wait for messages."""
-    found, end = [], time.monotonic() + timeout
-    while len(found) < count and time.monotonic() < end:
-        found += reader.take(N=100)
-        time.sleep(0.01)
-    return found
-
-
-def matched(entity, timeout=5.0):
-    end = time.monotonic() + timeout
-    while not entity() and time.monotonic() < end:
-        time.sleep(0.01)
-    assert entity()
+    return eventually(lambda: reader.take(N=100))
 
 
 def test_readings_poses_and_wrenches_are_published():
@@ -201,7 +191,7 @@ def test_readings_poses_and_wrenches_are_published():
         states = dds.open_reader(other, "rt/joint_states", idl.JointState)
         poses = dds.open_reader(other, "rt/poses", idl.PoseArray)
         wrenches = dds.open_reader(other, "rt/wrench", idl.WrenchStamped)
-        matched(bridge._wrench.get_matched_subscriptions)
+        wait_for(bridge._wrench.get_matched_subscriptions)
         bridge.publish(Reading(12.5, np.arange(4.0), np.zeros(4), DriverState.ARMED))
         quaternion = np.array([[1.0, 0.0, 0.0, 0.0], [np.nan] * 4])
         bridge.publish_poses(PoseFrame(12.5, np.array([[1.0, 2.0, 3.0], [np.nan] * 3]), quaternion))
@@ -229,17 +219,14 @@ def commanded():
     with DDSBridge(Robot(), domain=domain, commands=True) as bridge:
         other = dds.open_participant(domain, loopback=True)
         writer = dds.open_writer(other, "rt/tendon_commands", idl.JointState)
-        matched(writer.get_matched_subscriptions)
+        wait_for(writer.get_matched_subscriptions)
         yield bridge, writer
 
 
 def sent(bridge, writer, message):
-    """Step until a command was handled."""
+    """Write a command, and wait until it was handled."""
     writer.write(message)
-    end = time.monotonic() + 5.0
-    before = bridge.gate.accepted + sum(bridge.gate.refused.values())
-    while bridge.gate.accepted + sum(bridge.gate.refused.values()) == before and time.monotonic() < end:
-        bridge.step()
+    eventually(lambda: bridge.handle_commands())
 
 
 def test_commands_reach_an_armed_robot_only(commanded):

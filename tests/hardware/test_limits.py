@@ -38,8 +38,8 @@ def test_limits_hold_after_any_commands(commands, low, high, rate, total):
 
 
 @pytest.mark.parametrize(
-    "limits", [Limits(high=-1.0), Limits(rate=0.0), Limits(low=20.0), Limits(low=5.0, total=15.0)]
+    "limits", [{"high": -1.0}, {"rate": 0.0}, {"low": 20.0}, {"low": 5.0, "total": 15.0}]
 )
 def test_limits_that_contradict_each_other_are_refused(limits):
     with pytest.raises(HardwareError, match="must be"):
-        SerialBoard("port", limits)
+        SerialBoard("port", Limits(**limits))

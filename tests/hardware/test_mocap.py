@@ -1,6 +1,7 @@
 """Motion capture: NatNet packets, sound and damaged, a VRPN server, axes, lost bodies, times."""
 
 import contextlib
+import importlib.util
 import socket
 import struct
 import threading
@@ -15,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.middleware import natnet
-from knode_cosserat_hardware.middleware.mocap import PoseFrame, SimulatedCapture, upright
+from knode_cosserat_hardware.middleware.mocap import VRPN, PoseFrame, SimulatedCapture, upright
 from knode_cosserat_hardware.middleware.natnet import (
     NatNet,
     NatNetAddress,
@@ -27,6 +28,10 @@ from knode_cosserat_hardware.simulated import SimulatedRobot
 from tests.hardware.vrpn_server import VRPNServer
 from tests.hardware.waiting import wait_for
 
+with_vrpn = pytest.mark.skipif(
+    importlib.util.find_spec("motioncapture") is None,
+    reason="VRPN needs motioncapture: pip install 'knode-cosserat-hardware[mocap]'",
+)
 VERSIONS = [(3, 0), (3, 1), (4, 0), (4, 1), (4, 2)]
 #: identity, position, quaternion (scalar last), tracked
 BODIES = [
@@ -277,12 +282,8 @@ def test_y_up_becomes_z_up():
 # VRPN
 
 
+@with_vrpn
 def test_a_vrpn_server():
-    pytest.importorskip(
-        "motioncapture", reason="VRPN needs motioncapture: pip install 'knode-cosserat-hardware[mocap]'"
-    )
-    from knode_cosserat_hardware.middleware.mocap import VRPN
-
     names = ["base", "tip", "other"]
     with VRPNServer(names) as server, VRPN(["tip", "base"], "127.0.0.1", port=server.port) as capture:
 
@@ -306,12 +307,8 @@ def test_a_vrpn_server():
         assert np.isnan(frame.position[1]).all() and np.isfinite(frame.position[0]).all()
 
 
+@with_vrpn
 def test_a_vrpn_server_that_is_not_there():
-    pytest.importorskip(
-        "motioncapture", reason="VRPN needs motioncapture: pip install 'knode-cosserat-hardware[mocap]'"
-    )
-    from knode_cosserat_hardware.middleware.mocap import VRPN
-
     with (
         VRPN(["tip"], "127.0.0.1", port=free_port()) as capture,
         pytest.raises(

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat_hardware.cli import motion, options
+from knode_cosserat_hardware.cli import options
 from knode_cosserat_hardware.description import HardwareDescription
 from knode_cosserat_hardware.driver import HardwareError
 from knode_cosserat_hardware.middleware.mocap import PoseFrame
@@ -20,7 +20,7 @@ from knode_cosserat_hardware.open_driver import open_driver
 from knode_cosserat_hardware.simulated import SimulatedRobot
 from tests.commands import run
 from tests.hardware.fake_board import FakeBoard
-from tests.hardware.waiting import free_computation
+from tests.hardware.waiting import eventually, free_computation
 
 pytestmark = pytest.mark.slow
 
@@ -105,7 +105,7 @@ def test_words_of_drivers():
     opened = open_driver("simulated?noise=0,fault=slack:2,after=0.1", HardwareDescription(), lambda: ROD)
     with opened.driver as driver:
         opened.driver.advance(0.2)
-        assert driver.fault == "slack:2" and opened.poses((1.0,)).shape == (1, 7)
+        assert driver.fault == "slack:2" and opened.robot.poses((1.0,)).shape == (1, 7)
     assert "tares" in open_driver("COM3", HardwareDescription(), lambda: ROD).connecting_moves
     with pytest.raises(HardwareError, match="must be a number"):
         open_driver("simulated?noise=much", HardwareDescription(), lambda: ROD)
@@ -242,15 +242,11 @@ def test_a_signal_stops_a_real_port(folder, number):
         process = subprocess.Popen(
             [*program, *more], stderr=subprocess.PIPE, stdin=subprocess.DEVNULL, text=True
         )
-        end = time.monotonic() + 60.0
-        while sum(board.wanted) < 100 and time.monotonic() < end and process.poll() is None:
-            time.sleep(0.01)
+        eventually(lambda: sum(board.wanted) >= 100 or process.poll() is not None, 60.0)
         assert board.state == "armed"
         process.send_signal(number)
         sent = time.monotonic()
-        while board.fault != "stopped:0" and time.monotonic() - sent < 5.0:
-            time.sleep(0.005)
-        assert board.fault == "stopped:0" and time.monotonic() - sent < 1.0
+        assert eventually(lambda: board.fault == "stopped:0") and time.monotonic() - sent < 1.0
         assert board.received.count(b"stop") == 1
         stderr = process.communicate(timeout=30)[1]
     assert process.returncode == 2 and f"error: stopped by {signal.Signals(number).name}" in stderr
@@ -314,7 +310,7 @@ def test_the_measured_tip_is_relative_to_the_clamped_end():
     stamp, tip = options.tip_source(opened, Capture())()
     np.testing.assert_allclose(tip, [0.1, 0.0, 0.5 + 0.0635])
     assert stamp == 3.0 and options.tip_source(opened, None) is None
-    config = motion._recording_config(4, ["base", "rib", "tip"], opened)
+    config = options.recording_config(opened, ["base", "rib", "tip"])
     assert config.base.height == 0.0635 and [each.fraction for each in config.markers] == [0.5, 1.0]
 
 

@@ -15,7 +15,6 @@ FACTS = {
     "fuzz": {"unsafe": 0, "armed": 1},
     "steps": {"settling": 0.09, "overshoot": 5.0, "rate": 250.0},
     "watchdog": {"left": 5.0},
-    "faults": {"missed": 0, "dead": 0},
     "repeat": {"different": 0, "speed": 4.0},
     "loop": {"rmse": 0.2, "unsafe": 0, "faults": 0},
     "loop-faults": {"missed": 0, "dead": 0, "unsafe": 0},

@@ -4,7 +4,7 @@ import statistics
 
 import pytest
 
-from studies.report import Cell, Published, Spread, as_csv, as_markdown, in_words, ratio_in_words, spreads
+from studies.report import Published, Spread, as_csv, as_markdown, in_words, ratio_in_words, spreads
 
 PUBLISHED = {
     ("length", "sine"): Published((40.16, 16.46), (4.31, 1.44), (4.03, 1.17)),
@@ -12,7 +12,7 @@ PUBLISHED = {
 }
 
 
-def cell(imperfection, method, seed, dtw, mse, **more) -> Cell:
+def cell(imperfection, method, seed, dtw, mse, **more):
     return {
         "imperfection": imperfection, "control": "sine", "method": method, "seed": seed, "tip_dtw": dtw,
         "pose_mse": mse, "rotation_rmse": None if mse is None else 0.01 * mse, **more,

@@ -14,7 +14,7 @@ from typing import Literal, TypeVar
 import serial
 from serial.tools.list_ports import comports
 
-from knode_cosserat_hardware.driver import HardwareError, LatencyWindow
+from knode_cosserat_hardware.driver import HardwareError, LatencyWindow, short_reason
 from knode_cosserat_hardware.lines import (
     GRAM_FORCE,
     Answer,
@@ -119,9 +119,9 @@ class SerialTransport(Transport):
             self._port.close()
 
     def _lost(self, error: Exception) -> HardwareError:
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
         return HardwareError(
-            f"{self.name}: the connection is lost ({reason}); check the USB cable, then connect again"
+            f"{self.name}: the connection is lost ({short_reason(error)}); check the USB cable, then connect "
+            "again"
         )
 
 
@@ -137,7 +137,7 @@ def _refusal(port: str, error: Exception) -> str:
         return f"{port}: another program uses this port; close it (a serial monitor, another driver)"
     if "no such file" in text or "filenotfound" in text or "could not open" in text:
         return f"{port}: no such serial port; {found}"
-    return f"{port}: cannot be opened ({' '.join(str(error).split())[:120]}); {found}"
+    return f"{port}: cannot be opened ({short_reason(error)}); {found}"
 
 
 #: time between lines that feed the board's watchdog (60 ms), and its silence in plain mode (500 ms) (s)

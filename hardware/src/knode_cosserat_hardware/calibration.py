@@ -133,15 +133,10 @@ def _nonlinearity(weight: Any, reading: Any, slope: float) -> tuple[float, bool]
     if len(np.unique(weight)) < 3 or len(weight) < 4:
         return 0.0, False
     span = float(np.ptp(weight))
-    scaled = (weight - weight.mean()) / span
-    columns = np.stack([np.ones_like(scaled), scaled, scaled**2], axis=1)
-    found, *_ = np.linalg.lstsq(columns, reading, rcond=None)
-    error = reading - columns @ found
-    variance = float(np.sum(error**2)) / (len(weight) - 3)
-    deviation = float(np.sqrt(variance * np.linalg.inv(columns.T @ columns)[2, 2]))
+    found, covariance = np.polyfit((weight - weight.mean()) / span, reading, 2, cov=True)
+    curvature, deviation = abs(float(found[0])), float(np.sqrt(covariance[0, 0]))
     # a parabola's greatest distance from its best line over the range is an eighth of its second difference
-    bend = abs(float(found[2])) / 8.0 / (abs(slope) * span)
-    return bend, abs(float(found[2])) > SIGNIFICANT * deviation
+    return curvature / 8.0 / (abs(slope) * span), curvature > SIGNIFICANT * deviation
 
 
 def _hysteresis(weight: Any, reading: Any, slope: float) -> float:

@@ -18,7 +18,7 @@ import can
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.driver import HardwareError, Limits
+from knode_cosserat_hardware.driver import HardwareError, Limits, short_reason
 from knode_cosserat_hardware.motor_robot import MotorReel, MotorRobot, MotorSample
 
 
@@ -145,9 +145,9 @@ class CanRobot(MotorRobot):
         try:
             self._bus = can.Bus(**self._options)
         except Exception as error:  # each interface has its own errors
-            reason = " ".join(str(error).split())[:120]
             raise HardwareError(
-                f"{self.name}: cannot be opened ({reason}); check the adapter, and with socketcan: "
+                f"{self.name}: cannot be opened ({short_reason(error)}); "
+                "check the adapter, and with socketcan: "
                 f"sudo ip link set {self._options['channel']} up type can bitrate {self._options['bitrate']}"
             ) from None
         self._closed_loop = False
@@ -290,10 +290,9 @@ class CanRobot(MotorRobot):
         self._put(arbitration_id=identifier(node, command), data=data)
 
     def _put(self, **message: Any) -> None:
+        bus = self._opened()
         try:
-            self._opened().send(can.Message(is_extended_id=False, **message), timeout=0.1)
-        except HardwareError:
-            raise
+            bus.send(can.Message(is_extended_id=False, **message), timeout=0.1)
         except Exception as error:
             raise self._lost(error) from None
 
@@ -303,10 +302,9 @@ class CanRobot(MotorRobot):
 
     def _receive(self, timeout: float) -> bool:
         """Process a message; False if none came in time (s)."""
+        bus = self._opened()
         try:
-            message = self._opened().recv(timeout)
-        except HardwareError:
-            raise
+            message = bus.recv(timeout)
         except Exception as error:
             raise self._lost(error) from None
         if message is None:
@@ -331,5 +329,6 @@ class CanRobot(MotorRobot):
         return self._bus
 
     def _lost(self, error: Exception) -> HardwareError:
-        reason = " ".join(str(error).split())[:120] or type(error).__name__
-        return HardwareError(f"{self.name}: the bus is lost ({reason}); check adapter, cable and terminators")
+        return HardwareError(
+            f"{self.name}: the bus is lost ({short_reason(error)}); check adapter, cable and terminators"
+        )

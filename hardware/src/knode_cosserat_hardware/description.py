@@ -19,7 +19,7 @@ from typing import Any
 
 from knode_cosserat._files.yaml_text import did_you_mean, shown
 from knode_cosserat.rods.robot_file import RobotFileError, file_mapping
-from knode_cosserat_hardware.driver import HardwareError, Limits, require_limits, require_number
+from knode_cosserat_hardware.driver import HardwareError, Limits, require_number
 
 
 def _length(default: float, low: float, high: float) -> Any:
@@ -122,7 +122,6 @@ def _described(section: Any, source: str) -> HardwareDescription:
     )
     try:
         limits = Limits(**tension)
-        require_limits(limits)
     except HardwareError as error:
         raise RobotFileError(f"{source}: hardware.tension: {error}") from None
     try:

@@ -70,12 +70,24 @@ class Limits:
         high: greatest tension of each tendon (N).
         rate: greatest change of a tension in one second (N/s).
         total: greatest sum of all tensions (N).
+
+    Raises:
+        HardwareError: a limit is not allowed, or they contradict each other.
     """
 
     low: float = 0.0
     high: float = 15.0
     rate: float = 100.0
     total: float = 60.0
+
+    def __post_init__(self) -> None:
+        for name, unit in {"low": "N", "high": "N", "rate": "N/s", "total": "N"}.items():
+            low = 0.0 if name == "low" else 0.001
+            require_number(name, getattr(self, name), {"low": low, "high": 1e5, "unit": unit})
+        if self.low >= self.high:
+            raise HardwareError(f"low must be below high, {self.high:g} N (got {self.low:g})")
+        if self.total < self.low:
+            raise HardwareError(f"total must be at least low, {self.low:g} N (got {self.total:g})")
 
 
 class Driver(abc.ABC):
@@ -125,9 +137,21 @@ class Driver(abc.ABC):
         """Let time pass (s) without a sign of life to the robot: armed, its watchdog reacts."""
         time.sleep(seconds)
 
+    # what is checked before a call; all raise HardwareError
+
     def _require_no_fault(self) -> None:
         if self.fault:
             raise HardwareError(fault_message(self.fault))
+
+    def _require_armed(self) -> None:
+        self._require_no_fault()
+        if self.state is not DriverState.ARMED:
+            raise HardwareError("the robot is not armed; call arm() before command()")
+
+    def _require_ready(self, purpose: str) -> None:
+        self._require_no_fault()
+        if self.state is not DriverState.READY:
+            raise HardwareError(f"{purpose} moves the motors by itself; call disarm() first")
 
     @property
     @abc.abstractmethod
@@ -240,18 +264,9 @@ def require_number(name: str, value: Any, stated: Any, whole: bool = False) -> N
     raise HardwareError(message)
 
 
-def require_limits(limits: Limits) -> None:
-    """Check limits of tensions."""
-    for field in dataclasses.fields(limits):
-        value = getattr(limits, field.name)
-        low = 0.0 if field.name == "low" else 0.001
-        require_number(
-            field.name, value, {"low": low, "high": 1e5, "unit": "N/s" if field.name == "rate" else "N"}
-        )
-    if limits.low >= limits.high:
-        raise HardwareError(f"low must be below high, {limits.high:g} N (got {limits.low:g})")
-    if limits.total < limits.low:
-        raise HardwareError(f"total must be at least low, {limits.low:g} N (got {limits.total:g})")
+def short_reason(error: Exception) -> str:
+    """Return the message of another library's error in one line, or its kind if it has none."""
+    return " ".join(str(error).split())[:120] or type(error).__name__
 
 
 class TensionLimiter:
@@ -262,11 +277,10 @@ class TensionLimiter:
         count: number of tendons.
 
     Raises:
-        HardwareError: the limits contradict each other, or all tendons at their low limit exceed the total.
+        HardwareError: all tendons at their low limit exceed the total.
     """
 
     def __init__(self, limits: Limits, count: int):
-        require_limits(limits)
         if limits.low * count > limits.total:
             raise HardwareError(
                 f"total must be at least {count} times low, {limits.low * count:g} N (got {limits.total:g})"

@@ -21,7 +21,7 @@ import dynamixel_sdk as sdk
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat_hardware.driver import HardwareError, Limits
+from knode_cosserat_hardware.driver import HardwareError, Limits, short_reason
 from knode_cosserat_hardware.motor_robot import MotorReel, MotorRobot, MotorSample
 
 #: tries of a transfer
@@ -100,7 +100,7 @@ class DynamixelBus:
             opened = port.openPort() and port.setBaudRate(self._baud)
         except Exception as error:
             raise HardwareError(
-                f"{self.name}: cannot be opened ({' '.join(str(error).split())[:120]}); check the adapter"
+                f"{self.name}: cannot be opened ({short_reason(error)}); check the adapter"
             ) from None
         if not opened:
             raise HardwareError(f"{self.name}: cannot be opened at {self._baud} baud; check port and baud")
@@ -197,11 +197,11 @@ class DynamixelBus:
     def _safely(self, transfer: Any) -> tuple[int, Any]:
         try:
             return transfer()
-        except (
-            Exception
-        ) as error:  # the SDK passes on errors of the port, and of packets that it does not expect
-            reason = " ".join(str(error).split())[:120] or type(error).__name__
-            raise HardwareError(f"{self.name}: the bus is lost ({reason}); check the USB cable") from None
+        # the SDK passes on errors of the port, and of packets that it does not expect
+        except Exception as error:
+            raise HardwareError(
+                f"{self.name}: the bus is lost ({short_reason(error)}); check the USB cable"
+            ) from None
         finally:
             if self._port is not None:
                 # the SDK leaves it set after an error, and refuses all later packets

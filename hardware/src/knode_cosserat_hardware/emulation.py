@@ -388,7 +388,6 @@ class EmulatedRobot(TrueShape):
         self._compliance = compliance
         self._stepper = Stepper(self.robot, ROD_STEPS / STEPS)
         self._stepper.step(self.motors.position)
-        self._fields = {field.name: where for field, where in _places(self.robot)}
         self._straight = self._path()
         self._follows = self._response()
         self._taken, self._rate = np.zeros(4), np.zeros(4)
@@ -442,7 +441,7 @@ class EmulatedRobot(TrueShape):
 
     def _row(self, name: str, node: int = 0, state: Any = None) -> Float[np.ndarray, " c"]:
         row = self._stepper.state if state is None else state
-        return np.asarray(row.y[-1, node, self._fields[name]])
+        return np.asarray(self.robot.y_layout.get(row.y[-1, node], name))
 
     def _path(self, state: Any = None) -> Float[np.ndarray, " c"]:
         """Return the length of each tendon from base to tip (m)."""
@@ -460,15 +459,6 @@ class EmulatedRobot(TrueShape):
     def true_state(self) -> Trajectory:
         """Return the state at the last step of the rod, a trajectory of one row."""
         return self._stepper.state
-
-
-def _places(robot: RoutedTendonRobot) -> list[tuple[Any, slice]]:
-    """Return the fields of y with their places."""
-    places, start = [], 0
-    for field in robot.y_layout.fields:
-        places.append((field, slice(start, start + field.size)))
-        start += field.size
-    return places
 
 
 #: time between two exchanges of bytes of a pseudo-terminal (s)

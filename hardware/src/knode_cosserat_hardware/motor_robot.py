@@ -180,11 +180,12 @@ class MotorRobot(Driver):
     def arm(self) -> None:
         """Let the motors follow commands, from zero tension on."""
         with self._lock:
-            self._require()
+            self._require_connected()
+            self._require_no_fault()
             if self._state is DriverState.ARMED:
                 return
             self._take(1.0)
-            self._require()
+            self._require_no_fault()
             with self._guarded():
                 self._enable()
             self._limiter.reset(time.monotonic())
@@ -193,8 +194,7 @@ class MotorRobot(Driver):
     def disarm(self) -> None:
         """Turn the torques off: gears may hold some tension."""
         with self._lock:
-            if self._state is DriverState.DISCONNECTED:
-                raise HardwareError("the robot is not connected; call connect()")
+            self._require_connected()
             self._disable()
             if self._state is DriverState.ARMED:
                 self._state = DriverState.READY
@@ -216,7 +216,7 @@ class MotorRobot(Driver):
             self._clear()
             self._fault, self._state = "", DriverState.READY
             self._take(1.0)
-            self._require()
+            self._require_no_fault()
 
     # motion
 
@@ -224,13 +224,12 @@ class MotorRobot(Driver):
         """Send tensions (N), and return those sent, which the limits may have reduced."""
         wanted = checked_tensions(tension, self.tendon_count)
         with self._lock:
-            self._require()
-            if self._state is not DriverState.ARMED:
-                raise HardwareError("the robot is not armed; call arm() before command()")
+            self._require_connected()
+            self._require_armed()
             if time.monotonic() - self._sampled > STALE:
                 # over-travel and faults are seen in readings only
                 self._take(1.0)
-                self._require()
+                self._require_no_fault()
             start = time.monotonic()
             sent = self._limiter.reduced(wanted, start)
             with self._guarded():
@@ -241,8 +240,7 @@ class MotorRobot(Driver):
     def read(self, timeout: float = 1.0) -> Reading:
         """Return a new reading; its drives are the measured tensions by `limits.high`."""
         with self._lock:
-            if self._state is DriverState.DISCONNECTED:
-                raise HardwareError("the robot is not connected; call connect(), or check the cable")
+            self._require_connected()
             sample = self._take(timeout)
             tension = sample.torque / self.reel.radius
             drive = np.clip(tension / self.limits.high, -1.0, 1.0)
@@ -251,10 +249,11 @@ class MotorRobot(Driver):
     def tare(self) -> None:
         """Tighten the tendons, and take the motors' angles as the zero of their travel."""
         with self._lock:
+            self._require_connected()
             self._require_ready("tare")
             # the travel counts from here
             self._zero = self._take(1.0).angle
-            self._require()
+            self._require_no_fault()
             self._enable()
             try:
                 end = time.monotonic() + TARE_TIME
@@ -262,11 +261,11 @@ class MotorRobot(Driver):
                 while still < 5:
                     self._write(np.full(self.tendon_count, self.reel.tare_tension * self.reel.radius))
                     sample = self._take(1.0)
-                    self._require()
+                    self._require_no_fault()
                     still = still + 1 if np.all(np.abs(sample.velocity) < AT_REST) else 0
                     if time.monotonic() > end:
                         self._latch("tare-timeout:0")
-                        self._require()
+                        self._require_no_fault()
                     time.sleep(0.02)
                 self._zero = sample.angle
             finally:
@@ -276,6 +275,7 @@ class MotorRobot(Driver):
         """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1 (2 N at the reel)."""
         self._check_jog(tendon, drive)
         with self._lock:
+            self._require_connected()
             self._require_ready("jog")
             torque = np.zeros(self.tendon_count)
             torque[int(tendon)] = drive * JOG_TENSION * self.reel.radius
@@ -333,12 +333,6 @@ class MotorRobot(Driver):
             self._state = DriverState.FAULT
             self._fault = self._fault or fault
 
-    def _require(self) -> None:
+    def _require_connected(self) -> None:
         if self._state is DriverState.DISCONNECTED:
             raise HardwareError("the robot is not connected; call connect(), or check the cable")
-        self._require_no_fault()
-
-    def _require_ready(self, purpose: str) -> None:
-        self._require()
-        if self._state is not DriverState.READY:
-            raise HardwareError(f"{purpose} moves the motors by itself; call disarm() first")

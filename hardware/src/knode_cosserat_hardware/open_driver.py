@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
-from typing import Any
-
-import numpy as np
-from jaxtyping import Float
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in
@@ -16,6 +13,9 @@ from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 from knode_cosserat_hardware.description import HardwareDescription
 from knode_cosserat_hardware.driver import Driver, HardwareError, Limits
 from knode_cosserat_hardware.motor_robot import MotorReel
+
+if TYPE_CHECKING:
+    from knode_cosserat_hardware.simulated import TrueShape
 
 #: words before the address, and options of each
 KINDS: dict[str, tuple[str, ...]] = {
@@ -33,8 +33,7 @@ class OpenedDriver:
         driver: the driver.
         name: name for messages and reports.
         connecting_moves: what moves when the driver connects; empty if nothing does.
-        poses: returns true positions (m) and quaternions at fractions of the length; None on real robots.
-        simulated: True if the robot is simulated or emulated.
+        robot: the simulated or emulated robot, whose true shape is known; None for a real one.
         prepare: called with the driver after it has connected; None: nothing is to do.
         base_height: height of the base's motion-capture body above the rod's clamped end (m).
     """
@@ -42,8 +41,7 @@ class OpenedDriver:
     driver: Driver
     name: str
     connecting_moves: str = ""
-    poses: Callable[[Sequence[float]], Float[np.ndarray, "M 7"]] | None = None
-    simulated: bool = False
+    robot: TrueShape | None = None
     prepare: Callable[[Driver], Any] | None = None
     base_height: float = 0.0
 
@@ -85,7 +83,7 @@ def open_driver(port: str, hardware: HardwareDescription, robot: Callable[[], Sy
             simulated = SimulatedRobot(robot(), limits, machine=machine, real_time=is_real_time)
             if "fault" in options:
                 simulated.inject(options["fault"], after=max(_number(options, "after", 1.0), 1e-6))
-            opened = OpenedDriver(simulated, "simulated", poses=simulated.poses, simulated=True)
+            opened = OpenedDriver(simulated, "simulated", robot=simulated)
         case "emulated":
             opened = _emulated(limits, robot())
         case "serial":
@@ -157,7 +155,7 @@ def _emulated(limits: Limits, robot: System) -> OpenedDriver:
     emulated = EmulatedRobot(robot) if isinstance(robot, RoutedTendonRobot) else EmulatedRobot()
     return OpenedDriver(
         SerialBoard(EmulatedPort(emulated), limits), "emulated",
-        "the emulated board tares: all reels move in and out", emulated.poses, True, _accept_settings,
+        "the emulated board tares: all reels move in and out", emulated, _accept_settings,
     )  # fmt: skip
 
 

@@ -387,7 +387,7 @@ class Recorder:
 def record_robot(
     recorder: Recorder, driver: Driver, duration: float, capture: MotionCapture | None = None
 ) -> int:
-    """Record a connected robot, which nothing commands meanwhile, and return the number of readings.
+    """Record a robot for a time, in which nothing commands it, and return the number of readings.
 
     Args:
         recorder: an open recorder.
@@ -398,7 +398,8 @@ def record_robot(
     Raises:
         HardwareError: the robot or motion capture does not answer, or the disk is full.
     """
-    end = recorder.clock.now() + duration
+    # a simulated clock reaches the end but for rounding
+    end = recorder.clock.now() + duration - 1e-9
     count = 0
     while recorder.clock.now() < end:
         recorder.add_reading(driver.read())

@@ -339,9 +339,7 @@ class SerialBoard(Driver):
         wanted = checked_tensions(tension, self.tendon_count)
         with link.lock:
             link.touch()
-            self._require_no_fault()
-            if self.state is not DriverState.ARMED:
-                raise HardwareError("the robot is not armed; call arm() before command()")
+            self._require_armed()
             now = link.transport.now()
             if now - link.arrival > STALE:
                 raise HardwareError(

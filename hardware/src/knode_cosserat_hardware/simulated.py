@@ -258,7 +258,8 @@ class SimulatedRobot(TrueShape, Driver):
 
     def tare(self) -> None:
         """Take the readings of slack tendons as zero. Returns when it is done."""
-        self._ready("tare")
+        self._touch()
+        self._require_ready("tare")
         self._wanted = np.zeros(self.tendon_count)
         self.wait(TARE)
         self.cells.tare(self.tension + self._hung)
@@ -266,9 +267,10 @@ class SimulatedRobot(TrueShape, Driver):
 
     def arm(self) -> None:
         """Let the tensions follow commands, from zero on."""
-        if self.state is DriverState.ARMED:
+        self._touch()
+        self._require_no_fault()
+        if self._armed:
             return
-        self._ready("arm")
         self._wanted, self._armed = np.zeros(self.tendon_count), True
         self._limiter.reset(self.now())
         self._touch()
@@ -276,9 +278,7 @@ class SimulatedRobot(TrueShape, Driver):
     def command(self, tension: Float[np.ndarray, " c"]) -> Float[np.ndarray, " c"]:
         """Set the wanted tensions (N), and return them within the limits."""
         self._touch()
-        self._require_no_fault()
-        if not self._armed:
-            raise HardwareError("the robot is not armed; call arm() before command()")
+        self._require_armed()
         self._wanted = self._limiter.reduced(tension, self.now())
         self._sent = self.now() if self._sent < 0.0 else self._sent
         return self._wanted.copy()
@@ -298,7 +298,8 @@ class SimulatedRobot(TrueShape, Driver):
     def jog(self, tendon: int, drive: float) -> None:
         """Drive one motor for a tenth of a second; tendon from 0 on, drive from -1 to 1."""
         self._check_jog(tendon, drive, self.cells.settings["jog"] / 255.0)
-        self._ready("jog")
+        self._touch()
+        self._require_ready("jog")
         self._wanted = self.tension.copy()
         self._wanted[tendon] = max(0.0, self._wanted[tendon] + JOG * drive)
         self._drive[tendon] = drive
@@ -362,12 +363,6 @@ class SimulatedRobot(TrueShape, Driver):
         if self._stepper is None:
             raise HardwareError("the robot is not connected; call connect(), or use it in a with statement")
         return self._stepper
-
-    def _ready(self, purpose: str) -> None:
-        self._touch()
-        self._require_no_fault()
-        if self._armed:
-            raise HardwareError(f"{purpose} needs a robot that is not armed; call disarm() first")
 
     def _touch(self) -> None:
         """Follow the clock, and note that the host is alive."""

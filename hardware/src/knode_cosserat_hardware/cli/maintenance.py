@@ -213,7 +213,7 @@ def calibrate(
         assert port is not None
         machine = opened(port, robot)
         index = tendon_index(tendon, machine.driver.tendon_count)
-        if not (machine.simulated or has_terminal()):
+        if machine.robot is None and not has_terminal():
             raise ValueError("calibrate needs a terminal: a person hangs the weights (or give --table)")
         with connected(machine, yes) as driver:
             weights = [GRAVITY * mass for mass in parse_numbers("--masses", masses, example="0,0.5,1")]

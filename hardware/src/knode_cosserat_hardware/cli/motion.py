@@ -28,12 +28,12 @@ from knode_cosserat_hardware.cli.options import (
     emergency_stop,
     motion_capture,
     opened,
+    recording_config,
     tip_source,
 )
 
 if TYPE_CHECKING:
     from knode_cosserat_hardware.driver import Driver
-    from knode_cosserat_hardware.open_driver import OpenedDriver
 
 
 @commands.command(
@@ -79,12 +79,12 @@ def record(
         f"{float(rows.max()):.3g} N (within {machine.driver.limits.high:g} N)"
     )
     from knode_cosserat_hardware.driver import HostClock
-    from knode_cosserat_hardware.recorder import Recorder
+    from knode_cosserat_hardware.recorder import Recorder, record_robot
 
     with contextlib.ExitStack() as stack:
         poses = stack.enter_context(motion_capture(machine, capture))
-        names = _body_names(machine, poses)
-        config = _recording_config(count, names, machine)
+        names = [] if poses is None else list(poses.names)
+        config = recording_config(machine, names)
         driver = stack.enter_context(connected(machine, yes, motion))
         recorder = Recorder(out, config, clock=HostClock(machine.driver.now))
         config.save(out.with_suffix(".yaml"))
@@ -92,13 +92,13 @@ def record(
         try:
             with recorder, emergency_stop(driver) as emergency:
                 driver.arm()
-                begin = machine.driver.now()
+                begin = driver.now()
                 for k, row in enumerate(rows):
                     emergency.check()
                     sent = driver.command(row)
                     recorder.add_command(sent)
                     reduced += bool(np.max(np.abs(sent - row)) > 0.02)
-                    _read_until(begin + (k + 1) * dt, machine, recorder, poses)
+                    record_robot(recorder, driver, begin + (k + 1) * dt - driver.now(), poses)
                 driver.disarm()
         except BaseException:
             if out.exists():
@@ -127,55 +127,6 @@ def _tension_rows(controls: str, seconds: float | None, dt: float | None, count:
             raise ValueError(f"--dt must be between 0 and 10 s (got {step:g})")
         steps = round((10.0 if seconds is None else seconds) / step)
     return np.asarray(kc.controls.parse(controls, steps, step, count)), step
-
-
-def _read_until(end: float, machine: OpenedDriver, recorder: Any, poses: Any) -> None:
-    """Record readings and poses until a time (s)."""
-    true = machine.poses
-    while machine.driver.now() < end - 1e-9:
-        reading = machine.driver.read()
-        recorder.add_reading(reading)
-        if poses is not None:
-            for frame in poses.frames():
-                recorder.add_poses(frame)
-        elif true is not None:
-            from knode_cosserat_hardware.middleware.mocap import PoseFrame
-
-            found = true((1.0,))
-            recorder.add_poses(PoseFrame(machine.driver.now(), found[:, :3], found[:, 3:]))
-
-
-def _body_names(machine: OpenedDriver, poses: Any) -> list[str]:
-    if poses is not None:
-        return list(poses.names)
-    return [] if machine.poses is None else ["tip"]
-
-
-def _recording_config(count: int, names: list[str], machine: OpenedDriver) -> Any:
-    """Return the topics of a bag: tensions, commands, and bodies at even fractions of the length."""
-    from knode_cosserat.recordings.config import (
-        BaseSource,
-        CommandSource,
-        MarkerSource,
-        RecordingConfig,
-        TensionSource,
-    )
-
-    order = tuple(range(1, count + 1))
-    # a configuration has one body or more: without motion capture its topic has no messages
-    markers = [name for name in names if name != "base"] or ["tip"]
-    rotation = (1.0, 0.0, 0.0, 0.0) if machine.simulated else None
-    return RecordingConfig(
-        markers=tuple(
-            MarkerSource(name, f"/{name}", (k + 1) / len(markers), rotation=rotation)
-            for k, name in enumerate(markers)
-        ),
-        tension=TensionSource("/tension", order),
-        command=CommandSource("/command", order),
-        base=BaseSource("/base", machine.base_height) if "base" in names else None,
-        simulated=machine.simulated,
-        description=f"recorded at {machine.name}",
-    )
 
 
 @commands.command(
@@ -247,7 +198,7 @@ def run(
             f"{model} has {system.control_layout.size} controls and the robot {machine.driver.tendon_count} "
             "tendons; they must be equal"
         )
-    if machine.poses is None and capture is None:
+    if machine.robot is None and capture is None:
         raise ValueError("run needs the tip's position; give --capture natnet:SERVER?base=1,tip=2")
     limits = _control_limits(machine.driver, high, lag)
     wanted = parsed_reference(reference)
@@ -264,7 +215,7 @@ def run(
     if out is not None:
         log.to_csv(out)
     if recording is not None:
-        log.measurements(simulated=machine.simulated).save(recording)
+        log.measurements(simulated=machine.robot is not None).save(recording)
     facts = log.summary() | {
         "reduced": plant.reduced,
         "latency_ms": None if not latency.count else round(1e3 * latency.median, 3),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
@@ -15,10 +15,12 @@ from knode_cosserat.cli.output import printable
 from knode_cosserat.cli.program import command_group
 
 if TYPE_CHECKING:
+    from knode_cosserat.recordings import RecordingConfig
     from knode_cosserat_hardware.driver import Driver
     from knode_cosserat_hardware.middleware.mocap import MotionCapture
     from knode_cosserat_hardware.open_driver import OpenedDriver
     from knode_cosserat_hardware.safety import EmergencyStop
+    from knode_cosserat_hardware.simulated import TrueShape
 
 commands = command_group(
     help="Operate a real, emulated or simulated robot: connect, calibrate, record, control."
@@ -134,14 +136,14 @@ def emergency_stop(driver: Driver, **more: Any) -> Iterator[EmergencyStop]:
 
 @contextlib.contextmanager
 def motion_capture(machine: OpenedDriver, source: str | None) -> Iterator[MotionCapture | None]:
-    """Open motion capture by its word, and yield it; None without one.
+    """Open motion capture by its word, and yield it; the true tip of a simulated robot, or None, without one.
 
     Raises:
         ValueError: the word is not understood.
         HardwareError: the source cannot be reached.
     """
     if source is None:
-        yield None
+        yield None if machine.robot is None else _true_tip(machine, machine.robot)
         return
     kind, _, rest = source.partition(":")
     server, _, text = rest.partition("?")
@@ -167,25 +169,57 @@ def motion_capture(machine: OpenedDriver, source: str | None) -> Iterator[Motion
         yield capture
 
 
+def _true_tip(machine: OpenedDriver, robot: TrueShape) -> MotionCapture:
+    """Return the source of a simulated robot's true tip."""
+    from knode_cosserat_hardware.middleware.mocap import SimulatedCapture
+
+    return SimulatedCapture(robot, recording_config(machine, ["tip"]), machine.driver.now)
+
+
+def recording_config(machine: OpenedDriver, names: Sequence[str]) -> RecordingConfig:
+    """Return the topics of a bag: tensions, commands, and bodies at even fractions of the length."""
+    from knode_cosserat.recordings.config import (
+        BaseSource,
+        CommandSource,
+        MarkerSource,
+        RecordingConfig,
+        TensionSource,
+    )
+
+    order = tuple(range(1, machine.driver.tendon_count + 1))
+    # a configuration has one body or more: without motion capture its topic has no messages
+    markers = [name for name in names if name != "base"] or ["tip"]
+    is_simulated = machine.robot is not None
+    rotation = (1.0, 0.0, 0.0, 0.0) if is_simulated else None
+    return RecordingConfig(
+        markers=tuple(
+            MarkerSource(name, f"/{name}", (k + 1) / len(markers), rotation=rotation)
+            for k, name in enumerate(markers)
+        ),
+        tension=TensionSource("/tension", order),
+        command=CommandSource("/command", order),
+        base=BaseSource("/base", machine.base_height) if "base" in names else None,
+        simulated=is_simulated,
+        description=f"recorded at {machine.name}",
+    )
+
+
 def tip_source(machine: OpenedDriver, capture: MotionCapture | None) -> Any:
     """Return a function with time (s) and position of the tip (m); None if it is not measured.
 
     The tip is the last body of motion capture. With a body named base, the position is relative to the
     clamped end below it; otherwise motion capture's origin must be at the clamped end.
     """
-    if capture is not None:
-        above = np.array([0.0, 0.0, machine.base_height])
-
-        def measured() -> Any:
-            frame = capture.poses()
-            origin = frame.position[0] - above if capture.names[0] == "base" else 0.0
-            return frame.time, frame.position[-1] - origin
-
-        return measured
-    poses = machine.poses
-    if poses is None:
+    if capture is None:
         return None
-    return lambda: (machine.driver.now(), poses((1.0,))[-1, :3])
+    above = np.array([0.0, 0.0, machine.base_height])
+
+    def measured() -> Any:
+        frame = capture.poses()
+        origin = frame.position[0] - above if capture.names[0] == "base" else 0.0
+        return frame.time, frame.position[-1] - origin
+
+    return measured
 
 
 def tendon_index(tendon: int, count: int) -> int:

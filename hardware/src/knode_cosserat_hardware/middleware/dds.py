@@ -199,27 +199,27 @@ class DDSBridge(Bridge):
 def open_writer(participant: Any, topic: str, kind: Any) -> Any:
     """Return a writer with ROS 2's default quality of service: reliable, the last 10 messages."""
     from cyclonedds.pub import DataWriter
-    from cyclonedds.topic import Topic
 
-    return DataWriter(participant, Topic(participant, topic, kind, qos=_quality()), qos=_quality())
+    return _opened(DataWriter, participant, topic, kind)
 
 
 def open_reader(participant: Any, topic: str, kind: Any) -> Any:
     """Return a reader with ROS 2's default quality of service: reliable, the last 10 messages."""
     from cyclonedds.sub import DataReader
-    from cyclonedds.topic import Topic
 
-    return DataReader(participant, Topic(participant, topic, kind, qos=_quality()), qos=_quality())
+    return _opened(DataReader, participant, topic, kind)
 
 
-def _quality() -> Any:
+def _opened(endpoint: Any, participant: Any, topic: str, kind: Any) -> Any:
     from cyclonedds.qos import Policy, Qos
+    from cyclonedds.topic import Topic
     from cyclonedds.util import duration
 
-    return Qos(
+    quality = Qos(
         # a writer waits at most this long for a slow reader
         Policy.Reliability.Reliable(duration(milliseconds=100)),
         Policy.Durability.Volatile,
         Policy.History.KeepLast(10),
         Policy.DataRepresentation(use_cdrv0_representation=True),
     )
+    return endpoint(participant, Topic(participant, topic, kind, qos=quality), qos=quality)
