@@ -193,10 +193,9 @@ class _Regression:
         floors = np.maximum(floors, TOLERANCE * np.asarray(strand.scales().y) / ds)
         where = strand.y_layout.indices(layout.names)
         least = floors if self.linear else np.maximum(floors, data.doubt / length)
-        load = _load(
-            strand, layout, points.y, views, missing[:, where], least[where], counting,
-            curved=self.options.curved,
-        )  # fmt: skip
+        libraries = _libraries(strand, layout, views, self.options.curved)
+        targets = _targets(strand, layout, points.y, missing[:, where], least[where])
+        load = _load(*_fitted(*libraries, targets, counting))
         residual = dataclasses.replace(residual, load=load)
         # with two ends: strains on the near side of discontinuities, and the mean of A + c0 B, are not exact
         if self.linear and not (data.space.implicit and (strand.discontinuities.places or strand.mixed)):
@@ -219,7 +218,9 @@ class _Regression:
         """Return the missing load at the tip."""
         tip, views = jax.tree.map(np.asarray, _at_tip(residual.adapted(self.knowledge), self.data.tips))
         layout, floors = Ends.of(self.knowledge).layout, TOLERANCE * np.asarray(self.knowledge.scales().tip)
-        return _load(self.knowledge, layout, self.data.tips.y, views, -tip, floors, self.tip_counting)
+        libraries = _libraries(self.knowledge, layout, views, curved=False)
+        targets = _targets(self.knowledge, layout, self.data.tips.y, -tip, floors)
+        return _load(*_fitted(*libraries, targets, self.tip_counting))
 
     def _moved(self) -> tuple[Float[Any, "S y"], _Counting]:
         """Return the mean y_s of the segments by the nominal length, and the samples that count."""
@@ -396,30 +397,34 @@ class _Library(NamedTuple):
     simple: Mapping[str, Sequence[str]]
 
 
-def _load(
-    system: System, layout: Layout, y: Any, views: _Views, missing: Any, floors: Any, counting: _Counting,
-    curved: bool = False,
-) -> Load | None:  # fmt: skip
-    """Return the load of this layout that explains the missing loads (S, l), from observables and inputs."""
+def _libraries(system: System, layout: Layout, views: _Views, curved: bool) -> tuple[_Library, _Library]:
+    """Return the functions of a load of this layout: of observables and inputs, and of inputs alone."""
     aspect, inputs = Observed.of(system), material_layout(system)
     simple: dict[str, Sequence[str]] = {
         **dict.fromkeys(inputs.names, LINEAR),
         **dict.fromkeys(aspect.velocities, DRAG),
     }
     forms = simple | (dict.fromkeys(aspect.velocities or aspect.layout.names, CURVED) if curved else {})
-    material = _Library(expansion(inputs, views.material, forms, layout.size), views.material, simple)
-    ambient = _Library(expansion(aspect.ambient_layout, views.ambient, {}, layout.size), views.ambient, {})
+    material = expansion(inputs, views.material, forms, layout.size)
+    ambient = expansion(aspect.ambient_layout, views.ambient, {}, layout.size)
+    return _Library(material, views.material, simple), _Library(ambient, views.ambient, {})
+
+
+def _targets(system: System, layout: Layout, y: Any, missing: Any, floors: Any) -> list[_Target]:
+    """Return the fields of a missing load (S, l) of this layout."""
     rotations = {
         name: np.asarray(_rotations(jnp.asarray(system.y_layout.get(y, name))))
         for name in {field.frame for field in layout.fields if field.frame}
     }
-    targets = [
+    return [
         _Target(missing[:, where], rotations.get(field.frame), floors[where])
         for field in layout.fields
         for where in [layout.slice(field.name)]
     ]
-    load = Load(*_fitted(material, ambient, targets, counting))
-    return None if load.material is None and load.ambient is None else load
+
+
+def _load(material: Expansion | None, ambient: Expansion | None) -> Load | None:
+    return None if material is None and ambient is None else Load(material, ambient)
 
 
 def _fitted(
