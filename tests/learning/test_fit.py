@@ -80,10 +80,8 @@ def test_noise_in_the_data_is_in_every_number_and_the_same_each_time(bars):
     assert np.any(module._noisy(bars[0], 0.01, 1).y != shaken.y)
 
 
-@pytest.mark.parametrize("shared", [0, 10**9])
-def test_several_seeds(bars, monkeypatch, shared):
-    """On their own threads, or in one vectorised program, they are what they are alone."""
-    monkeypatch.setattr(module, "SHARED", shared)
+def test_several_seeds(bars):
+    """On their own threads they are what they are alone."""
     models = fit_states(WRONG, bars, dataclasses.replace(SMALL, seed=(0, 7, 3)))
     alone = fit_states(WRONG, bars, dataclasses.replace(SMALL, seed=7))
     assert [model.about.facts["seed"] for model in models] == [0, 7, 3]
@@ -114,23 +112,6 @@ def test_early_stopping_keeps_the_best(bars, unseen):
     best = np.argmin(errors[:, 1])
     assert len(history["loss"]) == errors[-1, 0] == errors[best, 0] + 100 < 3000
     np.testing.assert_allclose(tip_rmse(model, unseen), errors[best, 1], rtol=1e-9)
-
-
-def test_early_stopping_of_one_seed_does_not_stop_another(bars, unseen, monkeypatch):
-    config = with_training(epochs=600, schedule="constant", learning_rate=0.03, stop_after=40, check_every=20)
-    alone = [
-        fit_states(WRONG, bars, dataclasses.replace(config, seed=seed), held_out=[unseen]).about.facts[
-            "segments"
-        ]
-        for seed in (0, 1, 2)
-    ]
-    monkeypatch.setattr(module, "SHARED", 10**9)
-    together = fit_states(WRONG, bars, dataclasses.replace(config, seed=(0, 1, 2)), held_out=[unseen])
-    assert len({len(each["loss"]) for each in alone}) > 1
-    for model, expected in zip(together, alone, strict=True):
-        found = model.about.facts["segments"]
-        assert found["loss"].shape == expected["loss"].shape
-        np.testing.assert_allclose(found["held_out_error"], expected["held_out_error"], rtol=1e-3)
 
 
 # what stops it
@@ -193,8 +174,7 @@ def test_a_loss_that_diverges(bars, tmp_path):
         fit_states(WRONG, bars, config, checkpoint=tmp_path, checkpoint_every=1)
 
 
-def test_one_seed_that_fails_stops_the_others(bars, monkeypatch):
-    monkeypatch.setattr(module, "SHARED", 0)
+def test_one_seed_that_fails_stops_the_others(bars):
     config = FitConfig(
         NetworkOptions(hidden=5, convex=False),
         Training(epochs=100_000, learning_rate=10.0, schedule="constant"),

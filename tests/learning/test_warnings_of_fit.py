@@ -1,6 +1,6 @@
 """A fit tells by its result what did not work, and not by NumPy's warnings."""
 
-import sys
+import importlib
 import warnings
 
 import numpy as np
@@ -22,7 +22,7 @@ def test_floating_point_warnings_do_not_leave_a_fit(monkeypatch, operation, reco
         done.append(operation())
         raise kc.learning.FitError("enough")
 
-    module = sys.modules["knode_cosserat.identification.fit"]
+    module = importlib.import_module("knode_cosserat.identification.fit")
     monkeypatch.setattr(module, "fit_states", diverges)
     monkeypatch.setattr(module, "_measured", diverges)
     data = kc.recordings.load_example() if recordings else synthetic()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
-import reprlib
-from collections.abc import Callable
-from typing import Any, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
+from knode_cosserat._files.yaml_text import shown
+from knode_cosserat._settings import FLAG, LINE, Rule, ValidatedSettings, choice, items, number, part
 from knode_cosserat.errors import KnodeCosseratError
 
 
@@ -25,124 +24,86 @@ class FitError(KnodeCosseratError, ValueError):
     code = "fit"
 
 
-class _Allowed(NamedTuple):
-    """Accepted values: in words, and a function that returns the value to keep, or None to refuse it."""
-
-    words: str
-    kept: Callable[[Any], Any]
-    #: classes of options within options
-    parts: tuple[Any, ...] = ()
-
-
-def _whole(low: int, high: int = 10_000_000) -> _Allowed:
-    words = f"a whole number from {low} to {high}"
-    return _Allowed(words, lambda x: int(x) if _is_whole(x, low, high) else None)
-
-
-def _is_whole(value: Any, low: int, high: float) -> bool:
-    whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
-    return whole and low <= int(value) <= high
-
-
-def _number(low: float, high: float, *, above: bool = False) -> _Allowed:
-    def kept(value: Any) -> float | None:
-        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
-            return None
-        return float(value) if (low < value if above else low <= value) and value <= high else None
-
-    return _Allowed(f"a number {'above' if above else 'from'} {low:g} up to {high:g}", kept)
-
-
-def _choice(*names: str) -> _Allowed:
-    words = ", ".join(f'"{name}"' for name in names)
-    return _Allowed(words, lambda x: x if isinstance(x, str) and x in names else None)
-
-
-def _several(words: str, test: Callable[[Any], bool]) -> _Allowed:
-    def kept(value: Any) -> Any:
-        parts = tuple(value) if isinstance(value, list | tuple) else ()
-        good = parts and len(set(map(str, parts))) == len(parts) and all(test(part) for part in parts)
-        return tuple(part if isinstance(part, str) else int(part) for part in parts) if good else None
-
-    return _Allowed(words, kept)
-
-
-def _seeds() -> _Allowed:
-    words = "a whole number from 0 to 4294967295, or several different ones"
-    one = _whole(0, 2**32 - 1).kept
-    several = _several(words, lambda x: one(x) is not None).kept
-    return _Allowed(words, lambda x: one(x) if several(x) is None else several(x))
-
-
-def _part(*kinds: type) -> _Allowed:
-    words = " or ".join(kind.__name__ for kind in kinds)
-    return _Allowed(words, lambda x: x if isinstance(x, kinds) else None, kinds)
-
-
-def _option(default: Any, allowed: _Allowed, *, none: str = "") -> Any:
-    """Return a dataclass field with its accepted values; `none` is the meaning of None, if accepted."""
-    return dataclasses.field(default=default, metadata={"allowed": allowed, "none": none})
-
-
-def _flag(default: bool) -> Any:
-    return _option(default, _Allowed("true or false", lambda x: x if isinstance(x, bool) else None))
-
-
-@dataclasses.dataclass(frozen=True)
-class _Options:
+class _Options(ValidatedSettings):
     """Settings of one kind. Raises `ConfigError` if a value is not accepted."""
 
-    #: name in a mapping, where several kinds are accepted
+    error = ConfigError
+    #: name of a residual in a mapping
     kind: ClassVar[str] = ""
+    #: settings of `FitConfig` with gradient training; a residual needs one of them, if there are any
+    trainers: ClassVar[tuple[str, ...]] = ()
 
-    def __post_init__(self) -> None:
-        for field in dataclasses.fields(self):
-            (words, kept, _), none = field.metadata["allowed"], field.metadata["none"]
-            value = getattr(self, field.name)
-            if none and value is None:
-                continue
-            accepted = kept(value)
-            if accepted is None:
-                words = f"{words}, or None: {none}" if none else words
-                name = f"{type(self).__name__}.{field.name}"
-                raise ConfigError(f"{name} is {reprlib.repr(value)}; allowed is {words}")
-            object.__setattr__(self, field.name, accepted)
+    @classmethod
+    def refusal(cls, name: str, value: Any, words: str) -> Exception:
+        """Return the error of a value that is not allowed."""
+        return super().refusal(f"{cls.__name__}.{name}", value, words)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the settings as JSON values."""
-        values: dict[str, Any] = {"kind": self.kind} if self.kind else {}
-        for field in dataclasses.fields(self):
-            value = getattr(self, field.name)
-            value = value.to_dict() if isinstance(value, _Options) else value
-            values[field.name] = list(value) if isinstance(value, tuple) else value
-        return values
+        """Return the settings as JSON values, without those that are None."""
+        return ({"kind": self.kind} if self.kind else {}) | super().to_dict()
 
     @classmethod
     def from_dict(cls, values: Any) -> Self:
         """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
-        fields = {field.name: field for field in dataclasses.fields(cls)}
-        names = ", ".join(fields)
         if not isinstance(values, dict):
-            raise ConfigError(f"{cls.__name__} is {reprlib.repr(values)}; allowed is a mapping of {names}")
-        options = {key: value for key, value in values.items() if key != "kind" or not cls.kind}
-        for key, value in options.items():
-            if key not in fields:
-                close = difflib.get_close_matches(str(key), list(fields), n=1)
-                hint = f"; did you mean {close[0]}?" if close else ""
-                raise ConfigError(
-                    f"{cls.__name__} has no option {reprlib.repr(key)}; there are {names}{hint}"
-                )
-            parts = fields[key].metadata["allowed"].parts
-            if not parts or value is None:
-                continue
-            kinds = {part.kind: part for part in parts}
-            kind = value.get("kind") if isinstance(value, dict) else None
-            if len(kinds) > 1 and kind not in kinds:
-                raise ConfigError(
-                    f"{cls.__name__}.{key} has the kind {reprlib.repr(kind)}; allowed is {', '.join(kinds)}"
-                )
-            options[key] = (kinds[kind] if len(kinds) > 1 else parts[0]).from_dict(value)
-        return cls(**options)
+            raise ConfigError(f"{cls.__name__} is {shown(values)}; allowed is a mapping")
+        return super().from_dict({key: value for key, value in values.items() if key != "kind"})
+
+
+# rules
+
+
+def _whole(low: int, high: int = 10_000_000) -> Rule:
+    def read(value: Any) -> int | None:
+        whole = isinstance(value, int | np.integer) and not isinstance(value, bool)
+        return int(value) if whole and low <= value <= high else None
+
+    schema = {"type": "integer", "minimum": low, "maximum": high}
+    return Rule(f"a whole number from {low} to {high}", read, schema)
+
+
+#: steps without a better held-out rollout after which to stop
+LIMIT = _whole(1)._replace(words="a whole number from 1 on, or None: never")
+
+
+def _positive(high: float) -> Rule:
+    rule = number(0.0, high)
+    schema = {**rule.schema, "exclusiveMinimum": 0.0}
+    return Rule(f"a number above 0 up to {high:g}", lambda value: rule.read(value) or None, schema)
+
+
+def _several(words: str, one: Rule) -> Rule:
+    def read(value: Any) -> tuple[Any, ...] | None:
+        known = tuple(map(one.read, items(value)))
+        return known if known and None not in known and len(set(known)) == len(known) else None
+
+    return Rule(words, read, {"type": "array", "items": one.schema, "minItems": 1, "uniqueItems": True})
+
+
+def _seeds() -> Rule:
+    one = _whole(0, 2**32 - 1)
+    several = _several(f"{one.words}, or several different ones", one)
+
+    def read(value: Any) -> Any:
+        seeds = several.read(value)
+        return one.read(value) if seeds is None else seeds
+
+    return Rule(several.words, read, {"anyOf": [one.schema, several.schema]})
+
+
+def _kind_of(*kinds: type[_Options]) -> Rule:
+    """Return the rule of settings of one of several kinds, also as a mapping with its kind."""
+    named = {kind.kind: kind for kind in kinds}
+
+    def read(value: Any) -> Any:
+        if not isinstance(value, dict):
+            return value if isinstance(value, kinds) else None
+        if value.get("kind") not in named:
+            raise ConfigError(f"the kind is {shown(value.get('kind'))}; allowed is {', '.join(named)}")
+        return named[value["kind"]].from_dict(value)
+
+    words = " or ".join(kind.__name__ for kind in kinds)
+    return Rule(words, read, {"anyOf": [kind.json_schema() for kind in kinds]})
 
 
 # residuals
@@ -155,9 +116,9 @@ class StructuredOptions(_Options):
     kind: ClassVar[str] = "structured"
 
     #: if true, nonlinear functions (powers, saturating) are tried where the linear ones leave a remainder
-    curved: bool = _flag(True)
+    curved: Annotated[bool, FLAG] = True
     #: if true, the seed draws random row weights (Bayesian bootstrap), so that seeds vary as new data would
-    resample: bool = _flag(False)
+    resample: Annotated[bool, FLAG] = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,16 +126,17 @@ class NetworkOptions(_Options):
     """A network with one hidden layer, added to y_s and z (`learning.residual.Network`)."""
 
     kind: ClassVar[str] = "network"
+    trainers: ClassVar[tuple[str, ...]] = ("segments", "rollouts")
 
-    hidden: int = _option(512, _whole(1, 100_000))
+    hidden: Annotated[int, _whole(1, 100_000)] = 512
     #: if true, ʰy and ʰz are inputs too
-    history: bool = _flag(False)
+    history: Annotated[bool, FLAG] = False
     #: if true, the weights are kept nonnegative
-    convex: bool = _flag(True)
+    convex: Annotated[bool, FLAG] = True
     #: if true, inputs and outputs are standardised by the statistics of the data
-    standardised: bool = _flag(False)
+    standardised: Annotated[bool, FLAG] = False
     #: if true, the correction of an orientation's quaternion turns it and leaves its length as it is
-    unit_quaternions: bool = _flag(False)
+    unit_quaternions: Annotated[bool, FLAG] = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,9 +147,10 @@ class PassiveOptions(_Options):
     """
 
     kind: ClassVar[str] = "passive"
+    trainers: ClassVar[tuple[str, ...]] = ("rollouts",)
 
     #: units of each of its two networks
-    hidden: int = _option(8, _whole(1, 1000))
+    hidden: Annotated[int, _whole(1, 1000)] = 8
 
 
 # training
@@ -197,57 +160,53 @@ class PassiveOptions(_Options):
 class Training(_Options):
     """Gradient training on one-segment samples: Adam, all samples in every epoch."""
 
-    epochs: int = _option(1000, _whole(1))
-    learning_rate: float = _option(0.01, _number(0.0, 10.0, above=True))
+    epochs: Annotated[int, _whole(1)] = 1000
+    learning_rate: Annotated[float, _positive(10.0)] = 0.01
     #: "plateau": multiplied by `factor` after more than `patience` epochs in which the loss fell by less than
     #: a fraction of 1e-4; "cosine": down to zero over all epochs
-    schedule: Literal["plateau", "cosine", "constant"] = _option(
-        "plateau", _choice("plateau", "cosine", "constant")
-    )
-    patience: int = _option(80, _whole(0))
-    factor: float = _option(0.5, _number(0.0, 1.0, above=True))
+    schedule: Annotated[
+        Literal["plateau", "cosine", "constant"], choice(("plateau", "cosine", "constant"))
+    ] = "plateau"
+    patience: Annotated[int, _whole(0)] = 80
+    factor: Annotated[float, _positive(1.0)] = 0.5
     #: "paper", or "standardised": each error over its own spread (also used if the paper's is not defined)
-    loss: Literal["paper", "standardised"] = _option("paper", _choice("paper", "standardised"))
+    loss: Annotated[Literal["paper", "standardised"], choice(("paper", "standardised"))] = "paper"
     #: decoupled weight decay (AdamW), for weights but not for biases
-    weight_decay: float = _option(0.0, _number(0.0, 10.0))
+    weight_decay: Annotated[float, number(0.0, 10.0)] = 0.0
     #: noise added once, before training, to all numbers of y and z in their own units, as in the paper's
     #: training on recordings
-    data_noise: float = _option(0.0, _number(0.0, 10.0))
-    #: nodes that are predicted
-    nodes: tuple[int, ...] | None = _option(
-        None,
-        _several("different node numbers from 1 on", lambda x: _is_whole(x, 1, 10_000)),
-        none="all nodes",
-    )
+    data_noise: Annotated[float, number(0.0, 10.0)] = 0.0
+    #: nodes that are predicted; None: all nodes
+    nodes: Annotated[
+        tuple[int, ...] | None, _several("different node numbers from 1 on, or None: all", _whole(1, 10_000))
+    ] = None
     #: epochs without a better held-out rollout after which to stop; the best weights are kept
-    stop_after: int | None = _option(None, _whole(1), none="never")
+    stop_after: Annotated[int | None, LIMIT] = None
     #: epochs between two held-out rollouts
-    check_every: int = _option(50, _whole(1))
+    check_every: Annotated[int, _whole(1)] = 50
 
 
 @dataclasses.dataclass(frozen=True)
 class RolloutTraining(_Options):
     """Fine-tuning through whole simulations: only the compared fields of the trajectories must be known."""
 
-    updates: int = _option(100, _whole(1))
-    learning_rate: float = _option(1e-3, _number(0.0, 10.0, above=True))
-    schedule: Literal["cosine", "constant"] = _option("constant", _choice("cosine", "constant"))
-    #: fields of y that are compared
-    compared: tuple[str, ...] | None = _option(
-        None,
-        _several("different names of fields of y", lambda x: isinstance(x, str)),
-        none="position p and orientation h",
-    )
-    #: number of simulated rows
-    horizon: int | None = _option(None, _whole(1), none="all rows")
+    updates: Annotated[int, _whole(1)] = 100
+    learning_rate: Annotated[float, _positive(10.0)] = 1e-3
+    schedule: Annotated[Literal["cosine", "constant"], choice(("cosine", "constant"))] = "constant"
+    #: fields of y that are compared; None: position p and orientation h
+    compared: Annotated[
+        tuple[str, ...] | None, _several("different names of fields of y, or None: p and h", LINE)
+    ] = None
+    #: number of simulated rows; None: all rows
+    horizon: Annotated[int | None, _whole(1)] = None
     #: gradient clipping: largest norm of the gradient
-    clip: float = _option(1.0, _number(0.0, 1e12, above=True))
+    clip: Annotated[float, _positive(1e12)] = 1.0
     #: largest number of consecutive halvings of a step after which the simulation fails
-    rejections: int = _option(8, _whole(1, 1000))
+    rejections: Annotated[int, _whole(1, 1000)] = 8
     #: updates without a better held-out rollout after which to stop; the best weights are kept
-    stop_after: int | None = _option(None, _whole(1), none="never")
+    stop_after: Annotated[int | None, LIMIT] = None
     #: updates between two held-out rollouts
-    check_every: int = _option(10, _whole(1))
+    check_every: Annotated[int, _whole(1)] = 10
 
 
 @dataclasses.dataclass(frozen=True)
@@ -264,21 +223,22 @@ class FitConfig(_Options):
         ConfigError: a value is not allowed.
     """
 
-    residual: StructuredOptions | NetworkOptions | PassiveOptions = _option(  # noqa: RUF009
-        StructuredOptions(), _part(StructuredOptions, NetworkOptions, PassiveOptions)
-    )
-    segments: Training | None = _option(None, _part(Training), none="no such training")  # noqa: RUF009
-    rollouts: RolloutTraining | None = _option(  # noqa: RUF009
-        None, _part(RolloutTraining), none="no such training"
-    )
-    seed: int | tuple[int, ...] = _option(0, _seeds())
+    residual: Annotated[
+        StructuredOptions | NetworkOptions | PassiveOptions,
+        _kind_of(StructuredOptions, NetworkOptions, PassiveOptions),
+    ] = StructuredOptions()
+    segments: Annotated[Training | None, part(Training)] = None
+    rollouts: Annotated[RolloutTraining | None, part(RolloutTraining)] = None
+    seed: Annotated[int | tuple[int, ...], _seeds()] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if isinstance(self.residual, NetworkOptions) and self.segments is None and self.rollouts is None:
-            raise ConfigError("FitConfig has a network but neither segments nor rollouts to train it by")
-        if isinstance(self.residual, PassiveOptions) and self.rollouts is None:
-            raise ConfigError("FitConfig has a passive residual but no rollouts to train it by")
+        trainers = self.residual.trainers
+        if trainers and not any(getattr(self, name) for name in trainers):
+            kind = self.residual.kind
+            raise ConfigError(
+                f"FitConfig has a {kind} residual but no {' or '.join(trainers)} to train it by"
+            )
 
     @classmethod
     def paper(cls, seed: int | tuple[int, ...] = 0, history: bool = False) -> Self:

@@ -100,9 +100,7 @@ def _axis(size: int, i: int) -> str:
 
 def _function(term: Term, axis: int, expansion: Expansion) -> str:
     x, norm = f"{term.name}{_axis(term.size, axis)}", f"|{term.name}|"
-    scale = 0.0
-    if term.slope >= 0:
-        scale = float(expansion.scales[term.scale] / expansion.slopes[term.slope])
+    scale = float(expansion.scales[term.scale]) / (term.slope or 1.0)
     return {
         "linear": x, "square": f"|{x}| {x}", "cube": f"{x}³", "square_norm": f"{norm} {x}",
         "cube_norm": f"{norm}² {x}", "saturating": f"{scale:.4g} tanh({x} / {scale:.4g})",

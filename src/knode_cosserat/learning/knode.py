@@ -34,9 +34,8 @@ from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import Wrapped
-from knode_cosserat.schemes import semi_discrete, space, time
+from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.schemes.semi_discrete import History, Point
-from knode_cosserat.schemes.settings import NewtonOptions, Settings
 
 
 class About:
@@ -169,13 +168,11 @@ class ModelFileError(KnodeCosseratError, ValueError):
 KIND = container.Kind("knode-cosserat model", 1, ModelFileError)
 #: characters of a robot file in a model: YAML is slow to read
 MOST_TEXT = 100_000
-#: classes that a model's file may have objects of
+#: classes of the objects in a model's file
 CLASSES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
-        Network, Nothing, Passive, Sizes, Structured, Load, Expansion, Term, Settings, NewtonOptions,
-        space.Euler, space.Lobatto2, space.Lobatto4, time.BDF1, time.BDF2, time.BDFAlpha, time.Trapezoidal,
-        time.SDIRK2, TrainedRange,
+        Network, Nothing, Passive, Sizes, Structured, Load, Expansion, Term, TrainedRange,
     )
 }  # fmt: skip
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import datetime
+import functools
 import logging
 import sys
 import time
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -39,9 +40,6 @@ log = logging.getLogger(__name__)
 
 #: the best preset
 BEST = FitConfig()
-#: hidden units times samples of all seeds up to which the seeds share one vectorised program on a CPU; larger
-#: fits run in parallel on all cores (measured, five of the paper's networks: 1.9 s on two cores, not 4 s)
-SHARED = 20_000
 #: part of the nominal model's error below which a gain is reported as little
 LITTLE = 0.2
 #: errors below this are those of the solver
@@ -97,42 +95,45 @@ def fit_states(
     trajectories, held_out = _listed("trajectories", trajectories), _listed("held_out", held_out)
     dataset = _samples(knowledge, trajectories, config)
     initial = _initial(knowledge, trajectories, config, dataset)
-    data = _Data(knowledge, trajectories, config, dataset, rollouts.held_out_batches(knowledge, held_out))
+    held_out_error = rollouts.held_out_error(knowledge, held_out)
     kept = None
     if checkpoint is not None:
         kept = Checkpoints(checkpoint, Identity.of(knowledge, trajectories, held_out, config))
-    learned = dict(zip(config.seeds, initial, strict=True))
+    learned = {seed: KNODE(knowledge, it) for seed, it in zip(config.seeds, initial, strict=True)}
     histories: dict[int, dict[str, Any]] = {seed: {} for seed in config.seeds}
     interrupted: KeyboardInterrupt | None = None
+    stages: list[Callable[[KNODE, int], Run]] = []
+    if config.segments and dataset:
+        stages.append(functools.partial(SegmentRun, config.segments, dataset, held_out_error))
+    if config.rollouts:
+        batches = rollouts.trajectory_batches(knowledge, trajectories, config.rollouts)
+        stages.append(functools.partial(rollouts.RolloutRun, config.rollouts, batches, held_out_error))
     with ProgressMonitor(progress, log_dir) as watch:
-        for stage in (_segment_runs, _rollout_runs):
-            runs = stage(data, learned)
-            if not runs:
-                continue
+        for stage in stages:
+            runs = [stage(model, seed) for seed, model in learned.items()]
             try:
                 run_all(runs, kept, checkpoint_every, watch)
             except KeyboardInterrupt as stop:
                 interrupted = stop
             for run in runs:
-                learned |= dict(zip(run.seeds, run.residuals(), strict=True))
-                for seed in run.seeds:
-                    histories[seed][run.stage] = run.report(seed)
+                learned[run.seed] = KNODE(knowledge, run.residual())
+                histories[run.seed][run.stage] = run.report()
             if interrupted:
                 break
     facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
     if verify is None:
         verify = not type(nominal_model(knowledge)).__module__.startswith("knode_cosserat.")
     models = []
-    for seed, residual in learned.items():
-        model, about = KNODE(knowledge, residual), {**facts, "seed": seed, **histories[seed]}
+    for seed, model in learned.items():
+        about = {**facts, "seed": seed, **histories[seed]}
         if interrupted:
             about["interrupted"] = True
-        if data.held_out is not None:
-            about["held_out_error"] = rollouts.tip_error(model, data.held_out)
+        if held_out_error:
+            about["held_out_error"] = held_out_error(model)
         if verify:
             about["rollout_errors"] = list(rollout_errors(knowledge, model, trajectories[0]))
         about["seconds"] = time.perf_counter() - began
-        models.append(KNODE(knowledge, residual, About(about), trained))
+        models.append(KNODE(knowledge, model.residual, About(about), trained))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), about["seconds"], seed)
     found = Ensemble(models) if isinstance(config.seed, tuple) else models[0]
     if interrupted:
@@ -170,16 +171,6 @@ def _listed(name: str, trajectories: Any) -> list[Trajectory]:
     if isinstance(trajectories, Trajectory) or not isinstance(trajectories, Iterable):
         raise FitError(f"{name} is a {type(trajectories).__name__}; allowed is a list of trajectories")
     return list(trajectories)
-
-
-class _Data(NamedTuple):
-    """Data shared by the stages of training."""
-
-    knowledge: System
-    trajectories: Sequence[Trajectory]
-    config: FitConfig
-    dataset: Any
-    held_out: rollouts.TrajectoryBatches | None
 
 
 def _samples(knowledge: System, trajectories: Sequence[Trajectory], config: FitConfig) -> Dataset | None:
@@ -220,38 +211,6 @@ def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
         np.asarray(part) + size * rng.normal(size=np.shape(part)) for part in (trajectory.y, trajectory.z)
     )
     return dataclasses.replace(trajectory, y=y, z=z)
-
-
-def _segment_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
-    training = data.config.segments
-    if training is None:
-        return []
-    return [
-        SegmentRun(
-            data.knowledge, {seed: learned[seed] for seed in seeds}, data.dataset, training, data.held_out
-        )
-        for seeds in _groups(data.config, len(data.dataset.segments.t))
-    ]
-
-
-def _groups(config: FitConfig, count: int) -> list[tuple[int, ...]]:
-    """Group the seeds that share one vectorised program: all seeds, unless each keeps a core busy."""
-    if isinstance(config.residual, NetworkOptions):
-        work = config.residual.hidden * count * len(config.seeds)
-        if jax.default_backend() != "cpu" or work <= SHARED:
-            return [config.seeds]
-    return [(seed,) for seed in config.seeds]
-
-
-def _rollout_runs(data: _Data, learned: dict[int, Residual]) -> list[Run]:
-    options = data.config.rollouts
-    if options is None:
-        return []
-    batches = rollouts.trajectory_batches(data.knowledge, data.trajectories, options)
-    return [
-        rollouts.RolloutRun(KNODE(data.knowledge, residual), batches, options, seed, data.held_out)
-        for seed, residual in learned.items()
-    ]
 
 
 def _facts(

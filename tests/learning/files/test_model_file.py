@@ -93,17 +93,11 @@ def test_what_is_known_of_a_model_comes_back_the_same(facts):
     assert bits(found) == bits(facts)
 
 
-def test_settings_and_a_loss_history_come_back(tmp_path):
+def test_a_loss_history_comes_back(tmp_path):
     loss = np.random.default_rng(0).random((5, 1000))
-    chosen = kc.solvers.Settings(
-        time=kc.solvers.BDFAlpha(-1 / 3),
-        space=kc.solvers.Lobatto4(),
-        newton=kc.solvers.NewtonOptions(tolerance=1e-9 / 3),
-    )
-    facts = {"loss": loss, "settings": chosen, "data": [{"sha256": "ab" * 32, "rows": (0, 30)}]}
+    facts = {"loss": loss, "data": [{"sha256": "ab" * 32, "rows": (0, 30)}]}
     KNODE(ROBOT, network(), About(facts)).save(tmp_path / "model")
     found = load_model(tmp_path / "model").about.facts
-    assert found["settings"] == chosen and hash(found["settings"]) == hash(chosen)
     assert np.array_equal(found["loss"], loss) and found["loss"].flags.writeable
     assert found["data"] == facts["data"]
 

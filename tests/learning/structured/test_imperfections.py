@@ -96,7 +96,7 @@ def test_a_stiffening_rod_has_the_moment_of_its_law_and_its_slope():
     still = History(np.zeros(()), np.zeros(19), np.zeros(6), np.zeros(19))
 
     def bent(moment):
-        point = Point(0.0, 0.0, jnp.asarray(y).at[10].set(moment), None, still)
+        point = Point(0.0, 0.0, jnp.asarray(y).at[10].set(moment), np.zeros(4), still)
         return semi_discrete.strains(robot, point)[3]
 
     u = 1.7

@@ -1,4 +1,4 @@
-"""What the sparse regression is made of: evidence, selection, slopes, expansions."""
+"""What the sparse regression is made of: evidence, selection, expansions."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -9,9 +9,8 @@ from knode_cosserat.learning.structured.regression import (
     folds,
     held_out_error,
     moments,
-    refined_slopes,
     relevant,
-    selected_groups,
+    selected_columns,
 )
 from knode_cosserat.learning.structured.residual import CURVED, LINEAR, expansion
 from knode_cosserat.rods.layout import Layout
@@ -74,27 +73,16 @@ def test_terms_that_do_not_carry_over_are_left_out():
     fold = np.repeat([0, 1], 100)
     features = np.stack([truth, np.where(fold == 0, chance, -chance)], axis=1)
     values = (truth + 0.5 * chance)[:, None]
-    taken, error = selected_groups(moments(features, values, fold), [np.array([0]), np.array([1])], floor=0.0)
-    assert taken == [0]
-    assert error == pytest.approx(held_out_error(moments(features, values, fold), np.array([0])))
+    parts = moments(features, values, fold)
+    taken, error = selected_columns(parts, [np.array([0]), np.array([1])], floor=0.0)
+    assert taken.tolist() == [0]
+    assert error == pytest.approx(held_out_error(parts, np.array([0])))
 
 
 def test_folds_are_trajectories_or_parts_of_the_only_one():
     two = np.stack([np.repeat([0, 1], 6), np.tile(np.arange(6), 2)], axis=1)
     assert folds(two).tolist() == [0] * 6 + [1] * 6
     assert folds(two[:6]).tolist() == [0, 0, 1, 1, 2, 2]
-
-
-def test_slopes_are_found_between_those_of_the_start():
-    x = np.random.default_rng(3).normal(size=200)
-    target = 0.7 * np.tanh(1.37 * x)
-
-    def build(slopes):
-        return (np.tanh(slopes[0] * x) / slopes[0])[:, None]
-
-    found = refined_slopes(build, target, np.array([1.0, 4.0]), [0], ["a"])
-    assert found[0] == pytest.approx(1.37, rel=1e-6)
-    assert found[1] == 4.0
 
 
 @pytest.mark.parametrize("forms", [LINEAR, CURVED])
@@ -104,7 +92,7 @@ def test_an_expansion_is_the_sum_of_its_features(forms):
     values = rng.normal(size=(20, 4))
     part = expansion(layout, values, dict.fromkeys(layout.names, forms), 2)
     weights = rng.normal(size=part.weights.shape)
-    part = type(part)(weights, part.scales, part.slopes, part.terms)
+    part = type(part)(weights, part.scales, part.terms)
     for x in values[:5]:
         np.testing.assert_allclose(part(x), weights @ np.asarray(part.features(x)), rtol=1e-12)
 
@@ -116,8 +104,8 @@ def test_pruning_changes_nothing_but_the_size():
     part = expansion(layout, values, dict.fromkeys(layout.names, CURVED), 3)
     weights = np.zeros(part.weights.shape)
     weights[1, 5] = weights[2, 0] = 1.0
-    full = type(part)(weights, part.scales, part.slopes, part.terms)
+    full = type(part)(weights, part.scales, part.terms)
     small = full.pruned()
     assert small.weights.shape[1] < weights.shape[1] and len(small.terms) == 1
     np.testing.assert_array_equal(full(values[0]), small(values[0]))
-    assert type(part)(0 * weights, part.scales, part.slopes, part.terms).pruned() is None
+    assert type(part)(0 * weights, part.scales, part.terms).pruned() is None

@@ -23,7 +23,7 @@ from knode_cosserat.learning.training.descent import (
     loss_for,
     value_scales,
 )
-from knode_cosserat.learning.training.runs import split
+from knode_cosserat.learning.training.runs import ProgressMonitor, split
 from knode_cosserat.solvers.segments import predict_segment, samples
 from tests.learning.bar import BAR, WRONG, pulled
 
@@ -205,18 +205,14 @@ def test_weights_are_what_is_not_fixed():
 # epochs
 
 
-def trained(data, net, training, seeds=(0,)):
-    """Weights and losses (epochs, seeds) after all epochs; `net` one for each seed."""
-    nets = net if isinstance(net, list) else [net]
-    given = program.prepared(WRONG, nets[0], data, training)
-    state = program.started(nets, training)
-    losses, rates = [], []
-    while state.epoch < training.epochs:
-        done = int(state.epoch)
-        state, loss, rate = program.run_epochs(given, state, training.epochs)
-        losses.append(np.asarray(loss)[: int(state.epoch) - done])
-        rates.append(np.asarray(rate)[: int(state.epoch) - done])
-    return state.weights, np.concatenate(losses), np.concatenate(rates)
+def trained(data, net, training):
+    """Weights, losses and rates after all epochs."""
+    run = program.SegmentRun(training, data, None, KNODE(WRONG, net), 0)
+    with ProgressMonitor(False, None) as watch:
+        watch.begin("", run.steps, 0)
+        while not run.finished:
+            run.advance(run.steps, watch)
+    return run.state.weights, run.losses, run.rates
 
 
 def small(seed=0, **options):
@@ -225,7 +221,7 @@ def small(seed=0, **options):
 
 @pytest.mark.parametrize("convex", [True, False])
 def test_an_epoch_is_a_step_of_adam(bars, convex):
-    """Against optax.adamw on the loss of `predict` alone: no precomputation, no vectorised seeds."""
+    """Against optax.adamw on the loss of `predict` alone: no precomputation."""
     data = samples(WRONG, bars, nodes=(2, 5))
     net = small(convex=convex)
     training = Training(epochs=7, learning_rate=0.03, weight_decay=0.1, schedule="constant", nodes=(2, 5))
@@ -243,7 +239,7 @@ def test_an_epoch_is_a_step_of_adam(bars, convex):
     state, slope = optimiser.init(expected), jax.jit(jax.value_and_grad(slow))
     for epoch in range(7):
         value, gradient = slope(expected)
-        np.testing.assert_allclose(losses[epoch, 0], value, rtol=1e-9)
+        np.testing.assert_allclose(losses[epoch], value, rtol=1e-9)
         updates, state = optimiser.update(gradient, state, expected)
         expected = optax.apply_updates(expected, updates)
         if convex:
@@ -251,7 +247,7 @@ def test_an_epoch_is_a_step_of_adam(bars, convex):
                 kept = np.maximum(getattr(expected, name), 0.0)
                 expected = eqx.tree_at(lambda w, name=name: getattr(w, name), expected, jnp.asarray(kept))
     for found, wanted in zip(jax.tree.leaves(weights), jax.tree.leaves(expected), strict=True):
-        np.testing.assert_allclose(found[0], wanted, rtol=1e-7, atol=1e-10)
+        np.testing.assert_allclose(found, wanted, rtol=1e-7, atol=1e-10)
     if convex:
         assert np.min(weights.input_weights) == 0.0 and np.min(weights.input_biases) < 0.0
 
@@ -279,14 +275,14 @@ def test_plateau_is_that_of_pytorch():
 
 def test_cosine_goes_down_to_zero(bars):
     _, _, rates = trained(samples(WRONG, bars), small(), Training(epochs=60, schedule="cosine"))
-    np.testing.assert_allclose(rates[:, 0], 0.005 * (1.0 + np.cos(np.pi * np.arange(60) / 60)))
+    np.testing.assert_allclose(rates, 0.005 * (1.0 + np.cos(np.pi * np.arange(60) / 60)))
 
 
 def test_it_learns(bars):
     data = samples(WRONG, bars)
     net = program.standardised(small(), WRONG, data)
     _, losses, _ = trained(data, net, Training(epochs=400))
-    assert losses[-1, 0] < 1e-2 * losses[0, 0]
+    assert losses[-1] < 1e-2 * losses[0]
 
 
 @pytest.mark.parametrize("space", ["lobatto4", "lobatto2"])
@@ -296,10 +292,10 @@ def test_any_scheme_and_any_residual(bars, space):
     data = samples(WRONG, [swing])
     residual = small() if space == "lobatto4" else Softer(jnp.zeros(()))
     weights, losses, _ = trained(data, residual, Training(epochs=250, learning_rate=0.02))
-    assert losses[-1, 0] < 0.1 * losses[0, 0]
+    assert losses[-1] < 0.1 * losses[0]
     if isinstance(residual, Softer):
         # what remains is the drag
-        np.testing.assert_allclose(weights.softness[0], 0.5, rtol=0.02)
+        np.testing.assert_allclose(weights.softness, 0.5, rtol=0.02)
 
 
 class Softer(Residual):
@@ -309,18 +305,6 @@ class Softer(Residual):
 
     def adapted(self, knowledge):
         return dataclasses.replace(knowledge, stiffness=knowledge.stiffness / (1.0 + self.softness))
-
-
-def test_a_seed_does_not_depend_on_those_beside_it(bars):
-    data = samples(WRONG, bars)
-    training = Training(epochs=30)
-    together, losses, _ = trained(data, [small(seed) for seed in (3, 4, 5)], training, (3, 4, 5))
-    alone, loss, _ = trained(data, small(4), training, (4,))
-    other, _, _ = trained(data, small(5), training, (5,))
-    np.testing.assert_allclose(losses[:, 1], loss[:, 0], rtol=1e-9)
-    for beside, found, another in zip(*map(jax.tree.leaves, (together, alone, other)), strict=True):
-        np.testing.assert_allclose(beside[1], found[0], rtol=1e-7, atol=1e-10)
-        assert not np.allclose(found, another, rtol=1e-2)
 
 
 def test_first_weights_are_as_the_paper_has_them(robot):

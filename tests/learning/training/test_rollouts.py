@@ -21,9 +21,8 @@ from knode_cosserat.learning.states import fit_states
 from knode_cosserat.learning.training import rollouts as module
 from knode_cosserat.learning.training.rollouts import (
     RolloutRun,
-    held_out_batches,
+    held_out_error,
     loss_and_slope,
-    tip_error,
     trajectory_batches,
 )
 from knode_cosserat.learning.training.runs import ProgressMonitor, split
@@ -112,11 +111,11 @@ def test_held_out_error_is_that_of_simulate(bars, residual):
     for each in (bars[0], shorter):
         found = kc.simulate(model, each.control[1:], each.dt)
         expected.append(np.sqrt(np.mean((found.tip_position - each.tip_position) ** 2)))
-    along = held_out_batches(WRONG, [only_positions(bars[0]), shorter])
-    np.testing.assert_allclose(tip_error(model, along), np.mean(expected), rtol=1e-9)
-    assert held_out_batches(WRONG, []) is None
+    error = held_out_error(WRONG, [only_positions(bars[0]), shorter])
+    np.testing.assert_allclose(error(model), np.mean(expected), rtol=1e-9)
+    assert held_out_error(WRONG, []) is None
     broken = dataclasses.replace(residual, output_biases=residual.output_biases + np.nan)
-    assert tip_error(KNODE(WRONG, broken), along) == np.inf
+    assert error(KNODE(WRONG, broken)) == np.inf
 
 
 # fine-tuning
@@ -179,7 +178,8 @@ def bumpy_run(bars, residual, monkeypatch, wall, **options):
     monkeypatch.setattr(RolloutRun, "_evaluated", lambda run, weights: bumpy(run, weights))
     start = dataclasses.replace(residual, input_biases=jnp.zeros(5))
     options = dataclasses.replace(OPTIONS, **options)
-    return bumpy, RolloutRun(KNODE(WRONG, start), trajectory_batches(WRONG, bars, options), options, 0, None)
+    batches = trajectory_batches(WRONG, bars, options)
+    return bumpy, RolloutRun(options, batches, None, KNODE(WRONG, start), 0)
 
 
 def to_its_end(run):
@@ -195,10 +195,10 @@ def test_a_step_that_cannot_be_simulated_is_halved(bars, residual, monkeypatch):
     # Adam's first steps are of the size of the rate: 0.3, then 0.6 is beyond the wall, 0.45 is not, …
     first = [calls[0] for calls in bumpy.calls]
     np.testing.assert_allclose(first[:4], [0.0, 0.3, 0.6, 0.45], atol=0.02)
-    assert np.all(np.isfinite(run.report(0)["loss"])) and np.all(np.diff(run.report(0)["loss"]) < 0.0)
-    rates = run.report(0)["learning_rate"]
+    assert np.all(np.isfinite(run.report()["loss"])) and np.all(np.diff(run.report()["loss"]) < 0.0)
+    rates = run.report()["learning_rate"]
     assert rates[0] == 0.3 and rates[1] == 0.15 and rates[2] < 0.15
-    found = run.residuals()[0].input_biases
+    found = run.residual().input_biases
     assert np.all(found < 0.5) and np.all(found > 0.45)
 
 
@@ -207,7 +207,7 @@ def test_too_many_rejections_stop_it(bars, residual, monkeypatch):
     with pytest.raises(FitError, match=r"halved 2 times.*cannot be simulated") as caught:
         to_its_end(run)
     assert "\n" not in str(caught.value)
-    assert np.all(run.residuals()[0].input_biases < 0.5) and run.done >= 1
+    assert np.all(run.residual().input_biases < 0.5) and run.done >= 1
 
 
 class Torn(type(BAR)):
@@ -238,8 +238,7 @@ def test_best_held_out_weights_are_kept(bars, unseen):
     errors = history["held_out_error"]
     best = np.argmin(errors[:, 1])
     assert errors[0, 0] == 0 and len(history["learning_rate"]) == errors[-1, 0] == errors[best, 0] + 10
-    along = held_out_batches(WRONG, [unseen])
-    np.testing.assert_allclose(tip_error(model, along), errors[best, 1], rtol=1e-9)
+    np.testing.assert_allclose(held_out_error(WRONG, [unseen])(model), errors[best, 1], rtol=1e-9)
 
 
 # wrong data

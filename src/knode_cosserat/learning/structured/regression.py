@@ -1,4 +1,4 @@
-"""Sparse linear regression: automatic relevance determination, selection of groups, and slopes.
+"""Sparse linear regression: automatic relevance determination, and selection by held-out error.
 
 Every weight has its own prior, w_i ~ N(0, 1/α_i), and the noise has a precision β. All are set by maximising
 the evidence (MacKay, "Bayesian interpolation", 1992; Tipping, "Sparse Bayesian learning", 2001). Irrelevant
@@ -12,7 +12,7 @@ held-out data most (whole trajectories, or parts of a single one), until none lo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,8 +28,6 @@ GAIN = 0.05
 MOST_TERMS = 12
 #: number of folds of the rows of a single trajectory
 PARTS = 3
-#: largest factor by which a slope may change, in both directions
-FURTHEST = 30.0
 
 
 def relevant(
@@ -150,72 +148,14 @@ def held_out_error(parts: Sequence[_Moments], columns: Any) -> float:
     return max(error, 0.0)
 
 
-def selected_groups(
-    parts: Sequence[_Moments], groups: Sequence[Any], floor: float
-) -> tuple[list[int], float]:
-    """Return the selected groups of columns, and their held-out error; stops at the error `floor`."""
-    selected: list[int] = []
-    columns = np.zeros(0, dtype=int)
+def selected_columns(parts: Sequence[_Moments], groups: Sequence[Any], floor: float) -> tuple[Any, float]:
+    """Return the columns of the selected groups, and their held-out error; stops at the error `floor`."""
+    columns, rest = np.zeros(0, dtype=int), [*groups]
     error = held_out_error(parts, columns)
-    while len(selected) < MOST_TERMS and error > floor:
-        rest = [k for k in range(len(groups)) if k not in selected]
-        trials = [held_out_error(parts, np.concatenate([columns, groups[k]])) for k in rest]
-        if not rest or min(trials) > (1.0 - GAIN) * error:
+    for _ in range(min(MOST_TERMS, len(rest))):
+        trials = [held_out_error(parts, np.concatenate([columns, group])) for group in rest]
+        if error <= floor or min(trials) > (1.0 - GAIN) * error:
             break
-        best = rest[int(np.argmin(trials))]
         error = min(trials)
-        selected.append(best)
-        columns = np.concatenate([columns, groups[best]])
-    return selected, error
-
-
-# slopes
-
-
-def refined_slopes(
-    build: Callable[[Any], Float[Any, "S k"]],
-    target: Float[Any, " S"],
-    slopes: Float[Any, " slopes"],
-    free: Sequence[int],
-    kinds: Sequence[Any],
-) -> Float[Any, " slopes"]:
-    """Return the slopes with which the features explain the target best.
-
-    If the true law saturates, its slope lies between the initial ones. The weights are eliminated (variable
-    projection, Golub & Pereyra 1973), so that the search is over the slopes alone.
-
-    Args:
-        build: features (S, k) from slopes.
-        target: (S,).
-        slopes: initial slopes.
-        free: indices of the slopes to refine.
-        kinds: kind of each of these; slopes of one kind are kept apart, because two equal ones are redundant.
-    """
-    # imported here: it takes a third of a second
-    from scipy.optimize import least_squares
-
-    if not len(free):
-        return slopes
-    scale = np.sqrt(np.mean(target**2))
-    start = np.log(slopes[list(free)])
-
-    def at(logarithms: Any) -> Any:
-        moved = slopes.copy()
-        moved[list(free)] = np.exp(logarithms)
-        return moved
-
-    def remainder(logarithms: Any) -> Any:
-        Q, _ = np.linalg.qr(build(at(logarithms)))
-        return (target - Q @ (Q.T @ target)) / scale
-
-    low, high = start - np.log(FURTHEST), start + np.log(FURTHEST)
-    for i, kind in enumerate(kinds):
-        for other, same in zip(start, kinds, strict=True):
-            if same == kind and other != start[i]:
-                # below the middle between two slopes
-                middle = start[i] + 0.4 * (other - start[i])
-                low[i], high[i] = (
-                    (low[i], min(high[i], middle)) if other > start[i] else (max(low[i], middle), high[i])
-                )
-    options: dict[str, Any] = {"xtol": 1e-12, "ftol": 1e-14, "gtol": 1e-14, "max_nfev": 60}
-    return at(least_squares(remainder, start, bounds=(low, high), **options).x)
+        columns = np.concatenate([columns, rest.pop(int(np.argmin(trials)))])
+    return columns, error

@@ -9,12 +9,12 @@ The geometry (p_s, h_s, q_s, ω_s of a rod) stays exact, and the laws do not dep
 σ, f and g is an `Expansion`: a weighted sum of simple functions of named vectors. A system's layouts mark
 loads and rotated fields (`Field.frame`, `Field.load`); without such marks every rate may be corrected.
 
-The functions of a vector x with the natural size σ, with k a learned slope:
+The functions of a vector x with the natural size σ, with k one of several slopes:
 
     linear       x/σ
     square       |xᵢ| xᵢ/σ², cube   xᵢ³/σ³, for each component (drag)
     square_norm  |x| x/σ², cube_norm   |x|² x/σ³ (stiffening or softening, in any direction)
-    saturating   tanh(k xᵢ/σ)/k, for several k (friction): a hidden layer with units along the axes
+    saturating   tanh(k xᵢ/σ)/k (friction): a hidden layer with units along the axes
     saturating_norm   x/σ / √(1 + k²|x|²/σ²), the same in any direction
 
 They are few enough for least squares, and each can be interpreted.
@@ -22,7 +22,7 @@ They are few enough for least squares, and each can be interpreted.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, NamedTuple, Self
 
 import equinox as eqx
@@ -43,19 +43,19 @@ LINEAR = ("linear",)
 #: functions of velocities: drag is linear or quadratic
 DRAG = ("linear", "square")
 CURVED = ("linear", "square", "cube", "square_norm", "cube_norm", "saturating", "saturating_norm")
-#: initial slopes of the saturating functions
-SLOPES = (0.5, 1.0, 2.0, 4.0)
+#: slopes of the saturating functions: a saturation in between is a sum of two
+SLOPES = (0.5, 1.0, 2.0, 4.0, 8.0, 16.0)
 
 
 class Term(NamedTuple):
-    """One function of one vector: the vector's position, and the indices of its scale and slope."""
+    """One function of one vector: the vector's position, the index of its scale, and the slope."""
 
     name: str
     start: int
     stop: int
     form: str
     scale: int
-    slope: int = -1
+    slope: float = 0.0
 
     @property
     def size(self) -> int:
@@ -72,15 +72,11 @@ class Expansion(eqx.Module):
     #: (outputs, 1 + features), the constant first
     weights: Float[Any, "outputs features"]
     scales: Float[Any, " vectors"]
-    slopes: Float[Any, " slopes"]
     terms: tuple[Term, ...] = eqx.field(static=True)
 
     def features(self, x: Float[Any, " x"]) -> Float[Any, " features"]:
         """Return the functions' values, the constant first."""
-        values = [
-            _value(term, x[term.start : term.stop] / self.scales[term.scale], self.slopes)
-            for term in self.terms
-        ]
+        values = [_value(term, x[term.start : term.stop] / self.scales[term.scale]) for term in self.terms]
         return jnp.concatenate([jnp.ones(1), *values])
 
     def __call__(self, x: Float[Any, " x"]) -> Float[Any, " outputs"]:
@@ -105,11 +101,6 @@ class Expansion(eqx.Module):
             (term, range(start, start + term.size)) for term, start in zip(self.terms, starts, strict=False)
         ]
 
-    def columns_of(self, other: Self) -> list[int]:
-        """Return the indices here of another expansion's features; its terms must be a subset."""
-        columns = {(term.name, term.form, term.slope): where for term, where in self.columns()}
-        return [0, *(k for term in other.terms for k in columns[term.name, term.form, term.slope])]
-
     def pruned(self) -> Self | None:
         """Return a copy without terms of zero weight; None if all weights are zero."""
         used = np.any(np.asarray(self.weights) != 0.0, axis=0)
@@ -117,10 +108,10 @@ class Expansion(eqx.Module):
             return None
         keep = [(term, where) for term, where in self.columns() if used[list(where)].any()]
         columns = [0, *(k for _, where in keep for k in where)]
-        return type(self)(self.weights[:, columns], self.scales, self.slopes, tuple(term for term, _ in keep))
+        return type(self)(self.weights[:, columns], self.scales, tuple(term for term, _ in keep))
 
 
-def _value(term: Term, x: Any, slopes: Any) -> Any:
+def _value(term: Term, x: Any) -> Any:
     if term.form == "linear":
         return x
     if term.form == "square":
@@ -132,19 +123,17 @@ def _value(term: Term, x: Any, slopes: Any) -> Any:
         return x * jnp.sqrt(jnp.sum(x * x) + 1e-24)
     if term.form == "cube_norm":
         return x * jnp.sum(x * x)
-    slope = slopes[term.slope]
     if term.form == "saturating_norm":
-        return x / jnp.sqrt(1.0 + slope**2 * jnp.sum(x * x))
-    return jnp.tanh(slope * x) / slope
+        return x / jnp.sqrt(1.0 + term.slope**2 * jnp.sum(x * x))
+    return jnp.tanh(term.slope * x) / term.slope
 
 
 def expansion(
-    layout: Layout, values: Float[Any, "S x"], forms: dict[str, Sequence[str]], outputs: int
+    layout: Layout, values: Float[Any, "S x"], forms: Mapping[str, Sequence[str]], outputs: int
 ) -> Expansion:
     """Return an expansion with zero weights, scaled by the vectors' rms values in the data."""
     terms: list[Term] = []
     scales: list[float] = []
-    slopes: list[float] = []
     for k, field in enumerate(layout.fields):
         where = layout.slice(field.name)
         rms = float(np.sqrt(np.mean(np.square(values[:, where]))))
@@ -152,14 +141,10 @@ def expansion(
         for form in forms.get(field.name, LINEAR):
             if field.size == 1 and form.endswith("_norm"):
                 continue  # the same function as for the component
-            if not form.startswith("saturating"):
-                terms.append(Term(field.name, where.start, where.stop, form, k))
-                continue
-            for slope in SLOPES:
-                terms.append(Term(field.name, where.start, where.stop, form, k, len(slopes)))
-                slopes.append(slope)
+            slopes = SLOPES if form.startswith("saturating") else (0.0,)
+            terms += [Term(field.name, where.start, where.stop, form, k, slope) for slope in slopes]
     count = 1 + sum(term.size for term in terms)
-    return Expansion(np.zeros((outputs, count)), np.array(scales), np.array(slopes), tuple(terms))
+    return Expansion(np.zeros((outputs, count)), np.array(scales), tuple(terms))
 
 
 class Load(eqx.Module):

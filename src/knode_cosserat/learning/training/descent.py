@@ -1,4 +1,4 @@
-"""Gradient training on one-segment samples: one compiled program for all epochs, and for several seeds.
+"""Gradient training on one-segment samples: one compiled program for all epochs.
 
 With a scheme without stages, a network adds to the prediction of the nominal model. That prediction does not
 depend on the weights and is evaluated once; an epoch is then two matrix products and their derivatives. Other
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -24,7 +24,6 @@ from knode_cosserat.learning.config import FitError, Training
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Network, Residual, elu, input_layout
 from knode_cosserat.learning.training import runs
-from knode_cosserat.learning.training.rollouts import TrajectoryBatches, tip_error
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System
@@ -32,7 +31,7 @@ from knode_cosserat.rotation import rotation_matrix
 from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.semi_discrete import Point
-from knode_cosserat.schemes.space import Euler, SpaceScheme
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.segments import Dataset, Samples, end_point, predict_segment, start_point
 
 #: largest number of epochs in one call of the program
@@ -161,22 +160,23 @@ class _NominalPredictions(NamedTuple):
     steps: Float[Any, "2"]
 
 
+def _inputs(net: Network, knowledge: System, point: Point, z: Any) -> Float[Any, " inputs"]:
+    inputs = net.inputs(knowledge, point.y, point.y_t, z, point.z_t(z), point.control)
+    return (inputs - net.input_mean) / net.input_scale
+
+
 def nominal_predictions(
     net: Network, knowledge: System, samples: Samples, space: SpaceScheme
 ) -> _NominalPredictions:
     """Evaluate the terms that do not depend on a network's weights; for schemes without stages."""
     steps = knowledge.length / (knowledge.nodes - 1) * jnp.asarray(space.formula.weights[:2])
 
-    def inputs_at(point: Point, z: Any) -> Any:
-        inputs = net.inputs(knowledge, point.y, point.y_t, z, point.z_t(z), point.control)
-        return (inputs - net.input_mean) / net.input_scale
-
     def one(sample: Samples) -> Any:
         y, z = predict_segment(knowledge, space, sample)
-        inputs = [inputs_at(start_point(knowledge, sample), z)]
+        inputs = [_inputs(net, knowledge, start_point(knowledge, sample), z)]
         if space.implicit:
             end = end_point(knowledge, sample)
-            inputs.append(inputs_at(end, semi_discrete.strains(knowledge, end)))
+            inputs.append(_inputs(net, knowledge, end, semi_discrete.strains(knowledge, end)))
         return inputs, y, z
 
     inputs, y, z = jax.vmap(one, out_axes=-1)(samples)
@@ -222,9 +222,8 @@ def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
     An output is scaled by the root mean square of the correction that is needed along a segment.
     """
     samples = data.segments
-    seen = _known(net, knowledge, samples, Euler())
-    y, z = (seen.y, seen.z) if isinstance(data.space, Euler) else _predicted(knowledge, data.space, samples)
-    inputs = np.asarray(seen.inputs)[:-1].T
+    y, z = _predicted(knowledge, data.space, samples)
+    inputs = np.asarray(_start_inputs(net, knowledge, samples, z.T))
     ds = knowledge.length / (knowledge.nodes - 1)
     lacking = [(samples.y_next.T - y) / ds, samples.z.T - z]
     scale = np.sqrt(np.mean(np.square(np.concatenate(lacking)), axis=1))
@@ -239,6 +238,12 @@ def standardised(net: Network, knowledge: System, data: Dataset) -> Network:
 
 
 _known = jax.jit(nominal_predictions, static_argnames="space")
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(None, None, 0, 0))
+def _start_inputs(net: Network, knowledge: System, sample: Samples, z: Any) -> Any:
+    return _inputs(net, knowledge, start_point(knowledge, sample), z)
 
 
 @functools.partial(jax.jit, static_argnames="space")
@@ -264,15 +269,15 @@ class _TrainingData(eqx.Module):
 
 
 class _State(NamedTuple):
-    """State of the training; all fields but `epoch` have the seeds (G) as first axis."""
+    """State of the training."""
 
     epoch: Int[Any, ""]
     weights: Any
     adam: Any
     #: for the "plateau" schedule: the rate, the best loss, and the number of epochs since then
-    rate: Float[Any, " G"]
-    best: Float[Any, " G"]
-    waited: Int[Any, " G"]
+    rate: Float[Any, ""]
+    best: Float[Any, ""]
+    waited: Int[Any, ""]
 
 
 def _loss(weights: Any, data: _TrainingData) -> Any:
@@ -291,9 +296,9 @@ def plateau(numbers: dict[str, Any], loss: Any, rate: Any, best: Any, waited: An
     return rate, jnp.where(better, loss, best), jnp.where(enough, 0, waited)
 
 
-def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:
-    """Run one update of one seed: return its new state, the loss before, and the rate."""
-    weights, adam, rate, best, waited = seed_state
+def _epoch(data: _TrainingData, state: _State) -> tuple[_State, Any, Any]:
+    """Run one update: return the new state, the loss before, and the rate."""
+    epoch, weights, adam, rate, best, waited = state
     loss, slope = jax.value_and_grad(_loss)(weights, data)
     now, numbers = rate, data.numbers
     if data.schedule == "cosine":
@@ -308,13 +313,13 @@ def _epoch(data: _TrainingData, epoch: Any, seed_state: Any) -> Any:
     weights, _ = runs.split(eqx.combine(weights, data.rest).clamped())
     if data.schedule == "plateau":
         rate, best, waited = plateau(numbers, loss, rate, best, waited)
-    return (weights, adam, rate, best, waited), loss, now
+    return _State(epoch + 1, weights, adam, rate, best, waited), loss, now
 
 
 @jax.jit
 def run_epochs(
     data: _TrainingData, state: _State, stop: Any
-) -> tuple[_State, Float[Any, "PIECE G"], Float[Any, "PIECE G"]]:
+) -> tuple[_State, Float[Any, " PIECE"], Float[Any, " PIECE"]]:
     """Run epochs up to `stop`, at most `PIECE`: return the new state, the losses and the rates.
 
     The number of epochs is a value, not a shape. One program serves every piece, so that an interruption does
@@ -323,20 +328,12 @@ def run_epochs(
     first = state.epoch
 
     def one(carry: Any) -> Any:
-        (epoch, *seed_states), losses, rates = carry
+        state, losses, rates = carry
+        i = state.epoch - first
+        state, loss, rate = _epoch(data, state)
+        return state, losses.at[i].set(loss), rates.at[i].set(rate)
 
-        def update(seed_state: Any) -> Any:
-            return _epoch(data, epoch, seed_state)
-
-        if state.rate.shape[0] > 1:
-            seed_states, loss, rate = jax.vmap(update)(tuple(seed_states))
-        else:  # without a batch axis, which would cost a third more
-            alone = update(jax.tree.map(lambda leaf: leaf[0], tuple(seed_states)))
-            seed_states, loss, rate = jax.tree.map(lambda leaf: leaf[None], alone)
-        i = epoch - first
-        return _State(epoch + 1, *seed_states), losses.at[i].set(loss), rates.at[i].set(rate)
-
-    nothing = jnp.full((PIECE, state.rate.shape[0]), jnp.nan)
+    nothing = jnp.full(PIECE, jnp.nan)
     last = jnp.minimum(stop, first + PIECE)
     return jax.lax.while_loop(lambda carry: carry[0].epoch < last, one, (state, nothing, nothing))
 
@@ -360,81 +357,50 @@ def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: 
     return jax.tree.map(jnp.asarray, data)
 
 
-def started(residuals: Sequence[Residual], training: Training) -> _State:
-    """Return the state before the first epoch, with one residual for each seed."""
-    every = [runs.split(residual)[0] for residual in residuals]
-    weights = jax.tree.map(lambda *leaves: jnp.stack([jnp.asarray(x, dtype=float) for x in leaves]), *every)
-    count = len(residuals)
-    rate, best, waited = (
-        jnp.full(count, training.learning_rate), jnp.full(count, jnp.inf), jnp.zeros(count, dtype=int)
-    )  # fmt: skip
-    return _State(jnp.zeros((), dtype=int), weights, jax.vmap(runs.ADAM.init)(weights), rate, best, waited)
-
-
 class SegmentRun(runs.Run):
-    """Epochs on one-segment samples, for one seed or several in one program."""
+    """Epochs on one-segment samples."""
 
     stage = "segments"
 
-    def __init__(
-        self, knowledge: System, residuals: Mapping[int, Residual], dataset: Dataset, training: Training,
-        held_out: TrajectoryBatches | None,
-    ):  # fmt: skip
-        """Prepare the training of the residuals, by their seeds."""
-        first, *_ = residuals.values()
-        state = started([*residuals.values()], training)
-        best = runs.Best(state.weights, training.stop_after)
-        super().__init__(tuple(residuals), training.epochs, state, best)
-        self._knowledge, self._every, self._held_out = knowledge, training.check_every, held_out
-        self._data = prepared(strand_of(knowledge), first, dataset, training)
+    def __init__(self, training: Training, dataset: Dataset, held_out: runs.HeldOut, model: KNODE, seed: int):
+        super().__init__(training, training.epochs, held_out, model, seed)
+        self._data = prepared(strand_of(model.knowledge), model.residual, dataset, training)
+
+    def started(self, weights: Any) -> _State:
+        """Return the state before the first epoch."""
+        rate, best = (jnp.array(x, dtype=float) for x in (self.training.learning_rate, jnp.inf))
+        zero = jnp.zeros((), dtype=int)
+        return _State(zero, weights, runs.ADAM.init(weights), rate, best, zero)
 
     def compile(self) -> None:
         """Compile the epochs' program without running one, and run one held-out rollout."""
         run_epochs(self._data, self.state, self.done)
-        if self._held_out:
-            tip_error(KNODE(self._knowledge, self._residual(0)), self._held_out)
+        super().compile()
 
     def advance(self, stop: int, watch: runs.ProgressMonitor) -> None:
         """Run epochs up to the next check, at most `PIECE`."""
-        first = self.done
+        first, every = self.done, self.training.check_every
         stop = min(stop, first + PIECE, self.steps)
-        if self._held_out:
-            stop = min(stop, first - first % self._every + self._every)
+        if self.held_out:
+            stop = min(stop, first - first % every + every)
         state, losses, rates = run_epochs(self._data, self.state, stop)
         losses, rates = (np.asarray(values)[: stop - first] for values in (losses, rates))
         self._require_sane(losses, state.weights)
         self.state = state
-        self.losses = np.concatenate([self.losses, losses])
-        self.rates = np.concatenate([self.rates, rates])
-        watch.steps(self.stage, self.seeds, first, losses, rates)
-        if self._held_out and (stop % self._every == 0 or stop == self.steps):
-            models = [KNODE(self._knowledge, self._residual(k)) for k in range(len(self.seeds))]
-            errors = [tip_error(model, self._held_out) for model in models]
-            self.best.offer(stop, errors, state.weights)
-            for seed, error in zip(self.seeds, errors, strict=True):
-                watch.error(self.stage, seed, stop, error)
+        self.losses, self.rates = np.append(self.losses, losses), np.append(self.rates, rates)
+        watch.steps(self.stage, self.seed, first, losses, rates)
+        self.check(watch)
 
-    def _require_sane(self, losses: np.ndarray, weights: Any) -> None:
-        start = np.concatenate([self.losses, losses])[0]
-        active = self.best.stopped < 0
-        bad = ~(losses <= runs.DIVERGED * np.maximum(start, runs.NOTHING)) & active
-        if bad.any():
-            row, k = np.argwhere(bad)[0]
+    def _require_sane(self, losses: Float[np.ndarray, " epochs"], weights: Any) -> None:
+        start = np.append(self.losses, losses)[0]
+        diverged = np.flatnonzero(~(losses <= runs.DIVERGED * max(start, runs.NOTHING)))
+        if len(diverged):
             raise FitError(
-                f"the loss of seed {self.seeds[k]} became {losses[row, k]:.3g} in epoch {self.done + row} "
-                f"({start[k]:.3g} in the first): a smaller learning rate may help"
+                f"the loss of seed {self.seed} became {losses[diverged[0]]:.3g} in epoch "
+                f"{self.done + diverged[0]} ({start:.3g} in the first): a smaller learning rate may help"
             )
-        if not runs.is_finite([np.asarray(leaf)[active] for leaf in jax.tree.leaves(weights)]):
+        if not runs.is_finite(weights):
             raise FitError(
                 f"weights are not finite after epoch {self.done + len(losses)}: "
                 "a smaller learning rate may help"
             )
-
-    def _residual(self, k: int) -> Residual:
-        """Return the residual of seed k with its last weights."""
-        return eqx.combine(jax.tree.map(lambda leaf: leaf[k], self.state.weights), self._data.rest)
-
-    def residuals(self) -> list[Residual]:
-        """Return residuals with the last weights, or the best if training may stop early."""
-        chosen = [self.best.chosen(k, self.state.weights) for k in range(len(self.seeds))]
-        return [eqx.combine(weights, self._data.rest) for weights in chosen]

@@ -19,7 +19,6 @@ from jaxtyping import Float
 
 from knode_cosserat.learning.config import FitError, RolloutTraining
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training import runs
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
@@ -144,8 +143,10 @@ def _tip_errors(model: System, batches: TrajectoryBatches) -> Any:
     return jnp.concatenate(errors)
 
 
-def held_out_batches(knowledge: System, trajectories: Sequence[Trajectory]) -> TrajectoryBatches | None:
-    """Return trajectories to simulate from rest and compare at the tip; None if there are none.
+def held_out_error(knowledge: System, trajectories: Sequence[Trajectory]) -> runs.HeldOut:
+    """Return a function of a model: its rms tip error (m) from rest, infinite if a step is not solved.
+
+    The errors are averaged over the trajectories. None if there are no trajectories.
 
     Raises:
         DataError: as for `trajectory_batches`, or the system has no positions.
@@ -156,13 +157,13 @@ def held_out_batches(knowledge: System, trajectories: Sequence[Trajectory]) -> T
     places = tuple(name for name in known if name.rstrip("0123456789") == "p")
     if not places:
         raise DataError(f"held-out rollouts need positions; y has {', '.join(known)}")
-    return trajectory_batches(knowledge, trajectories, RolloutTraining(compared=places), what="held-out ")
+    batches = trajectory_batches(knowledge, trajectories, RolloutTraining(compared=places), "held-out ")
 
+    def error(model: System) -> float:
+        errors = np.asarray(_tip_errors(model, batches))
+        return float(np.mean(errors)) if np.all(np.isfinite(errors)) else float("inf")
 
-def tip_error(model: System, batches: TrajectoryBatches) -> float:
-    """Return the rms tip error (m), averaged over trajectories; infinite if a step is not solved."""
-    errors = np.asarray(_tip_errors(model, batches))
-    return float(np.mean(errors)) if np.all(np.isfinite(errors)) else float("inf")
+    return error
 
 
 # the loss
@@ -233,25 +234,29 @@ class RolloutRun(runs.Run):
     loss_after = True
 
     def __init__(
-        self, model: KNODE, batches: TrajectoryBatches, options: RolloutTraining, seed: int,
-        held_out: TrajectoryBatches | None,
+        self, options: RolloutTraining, batches: TrajectoryBatches, held_out: runs.HeldOut, model: KNODE,
+        seed: int,
     ):  # fmt: skip
-        weights, self._rest = runs.split(model.residual)
-        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
+        super().__init__(options, options.updates, held_out, model, seed)
+        self._batches, self._options = batches, options
+
+    def started(self, weights: Any) -> _RolloutState:
+        """Return the state before the first update, without a gradient."""
         slope = jax.tree.map(jnp.zeros_like, weights)
-        state = _RolloutState(weights, runs.ADAM.init(weights), slope, weights, np.array(1.0))
-        super().__init__((seed,), options.updates, state, runs.Best(_one(weights), options.stop_after))
-        self._knowledge, self._batches = model.knowledge, batches
-        self._options, self._held_out = options, held_out
+        return _RolloutState(weights, runs.ADAM.init(weights), slope, weights, np.array(1.0))
+
+    @property
+    def last(self) -> Any:
+        """Weights with the lowest loss."""
+        return self.state.lowest
 
     def compile(self) -> None:
         """Compile by one evaluation and one held-out rollout."""
         self._evaluated(self.state.weights)
-        if self._held_out:
-            tip_error(self._model(), self._held_out)
+        super().compile()
 
     def _evaluated(self, weights: Any) -> tuple[float, Any]:
-        loss, slope = loss_and_slope(weights, self._rest, self._knowledge, self._batches)
+        loss, slope = loss_and_slope(weights, self.rest, self.knowledge, self._batches)
         return float(loss), slope
 
     def _begin(self, watch: runs.ProgressMonitor) -> None:
@@ -259,11 +264,11 @@ class RolloutRun(runs.Run):
         loss, slope = self._evaluated(self.state.weights)
         if not np.isfinite(loss) or not runs.is_finite(slope):
             raise FitError(
-                f"the model of seed {self.seeds[0]} cannot be simulated over the trajectories and so not "
+                f"the model of seed {self.seed} cannot be simulated over the trajectories and so not "
                 "be fine-tuned: train it longer on segments, or simulate fewer rows (RolloutTraining.horizon)"
             )
-        self.state, self.losses = self.state._replace(slope=slope), np.array([[loss]])
-        self._check(watch)
+        self.state, self.losses = self.state._replace(slope=slope), np.array([loss])
+        self.check(watch)
 
     def advance(self, stop: int, watch: runs.ProgressMonitor) -> None:
         """Run one update."""
@@ -275,40 +280,18 @@ class RolloutRun(runs.Run):
             rate *= 0.5 * (1.0 + np.cos(np.pi * self.done / options.updates))
         for _ in range(options.rejections):
             step = rate * scale
-            weights, adam = _proposal(state, self._rest, step, options.clip)
+            weights, adam = _proposal(state, self.rest, step, options.clip)
             loss, slope = self._evaluated(weights)
-            if loss <= runs.DIVERGED * max(self.losses[0, 0], runs.NOTHING) and runs.is_finite(
-                (weights, slope)
-            ):
+            if loss <= runs.DIVERGED * max(self.losses[0], runs.NOTHING) and runs.is_finite((weights, slope)):
                 break
             scale /= 2.0
         else:
             raise FitError(
-                f"fine-tuning of seed {self.seeds[0]} stopped in update {self.done}: with the step halved "
+                f"fine-tuning of seed {self.seed} stopped in update {self.done}: with the step halved "
                 f"{options.rejections} times, to {step:.3g}, the robot still cannot be simulated after it"
             )
         lowest = weights if loss < self.losses.min() else state.lowest
         self.state = _RolloutState(weights, adam, slope, lowest, np.array(scale))
-        watch.steps(self.stage, self.seeds, self.done, self.losses[-1:], np.array([[step]]))
-        self.losses = np.append(self.losses, [[loss]], axis=0)
-        self.rates = np.append(self.rates, [[step]], axis=0)
-        self._check(watch)
-
-    def _model(self) -> KNODE:
-        return KNODE(self._knowledge, eqx.combine(self.state.weights, self._rest))
-
-    def _check(self, watch: runs.ProgressMonitor) -> None:
-        if self._held_out is None or (self.done % self._options.check_every and self.done < self.steps):
-            return
-        error = tip_error(self._model(), self._held_out)
-        self.best.offer(self.done, [error], _one(self.state.weights))
-        watch.error(self.stage, self.seeds[0], self.done, error)
-
-    def residuals(self) -> list[Residual]:
-        """Return the weights with the lowest loss, or the lowest held-out error if it may stop early."""
-        return [eqx.combine(self.best.chosen(0, _one(self.state.lowest)), self._rest)]
-
-
-def _one(weights: Any) -> Any:
-    """Return the weights of one seed, with the seeds' axis."""
-    return jax.tree.map(lambda leaf: leaf[None], weights)
+        watch.steps(self.stage, self.seed, self.done, self.losses[-1:], np.array([step]))
+        self.losses, self.rates = np.append(self.losses, loss), np.append(self.rates, step)
+        self.check(watch)

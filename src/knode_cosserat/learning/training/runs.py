@@ -1,4 +1,4 @@
-"""Execution of the parts of a fit: in parallel on all cores, each with its own checkpoint, with progress."""
+"""Gradient training of the seeds of a fit: in parallel on all cores, with checkpoints and progress."""
 
 from __future__ import annotations
 
@@ -19,13 +19,16 @@ import optax  # type: ignore[import-untyped]
 from tqdm import tqdm
 
 from knode_cosserat.errors import KnodeCosseratError
-from knode_cosserat.learning.config import FitError
+from knode_cosserat.learning.config import FitError, RolloutTraining, Training
+from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, packed_tree, unpacked
 
 ADAM = optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-8)
 #: a loss above this multiple of its initial value has diverged; the initial value counts as at least NOTHING
 DIVERGED, NOTHING = 1e6, 1e-6
+#: a function that returns the held-out error (m) of a model, or None
+HeldOut = Callable[[KNODE], float] | None
 
 
 class WatchError(KnodeCosseratError, ValueError):
@@ -60,16 +63,13 @@ class ProgressMonitor:
             self._bar.close()
         self._bar = tqdm(total=total, initial=done, desc=what, unit="step", disable=not self._progress)
 
-    def steps(
-        self, what: str, seeds: Sequence[int], first: int, losses: np.ndarray, rates: np.ndarray
-    ) -> None:
-        """Record the losses and rates (steps, seeds) of consecutive steps; the first has number `first`."""
+    def steps(self, what: str, seed: int, first: int, losses: np.ndarray, rates: np.ndarray) -> None:
+        """Record the losses and rates of consecutive steps; the first has number `first`."""
         with self._lock:
-            self._bar.set_postfix_str(f"loss {np.mean(losses[-1]):.3g}", refresh=False)
+            self._bar.set_postfix_str(f"loss {losses[-1]:.3g}", refresh=False)
             self._bar.update(losses.size)
-            for k, seed in enumerate(seeds):
-                self._write(seed, first, f"{what}/loss", losses[:, k])
-                self._write(seed, first, f"{what}/learning_rate", rates[:, k])
+            self._write(seed, first, f"{what}/loss", losses)
+            self._write(seed, first, f"{what}/learning_rate", rates)
 
     def error(self, what: str, seed: int, step: int, error: float) -> None:
         """Record the held-out error (m) after a step."""
@@ -119,77 +119,47 @@ def is_finite(tree: Any) -> bool:
     return all(bool(np.all(np.isfinite(np.asarray(leaf)))) for leaf in jax.tree.leaves(tree))
 
 
-class Best:
-    """Best weights of each seed by held-out error, and early stopping."""
-
-    def __init__(self, weights: Any, stop_after: int | None):
-        count = jax.tree.leaves(weights)[0].shape[0]
-        self.stop_after = stop_after
-        self.errors = np.full(count, np.inf)
-        self.steps = np.zeros(count, dtype=int)
-        #: step after which each seed stopped; -1 if it is still running
-        self.stopped = np.full(count, -1)
-        self.weights = jax.tree.map(lambda leaf: np.array(leaf), weights)
-        #: step, and the error of each seed
-        self.seen: list[list[float]] = []
-
-    def offer(self, step: int, errors: Sequence[float], weights: Any) -> None:
-        """Record the held-out errors and weights (seeds first) after a step."""
-        self.seen.append([float(step), *errors])
-        for k in map(int, np.flatnonzero(self.stopped < 0)):
-            if errors[k] < self.errors[k]:
-                self.errors[k], self.steps[k] = errors[k], step
-                for kept, new in zip(jax.tree.leaves(self.weights), jax.tree.leaves(weights), strict=True):
-                    kept[k] = np.asarray(new)[k]
-            elif self.stop_after is not None and step - self.steps[k] >= self.stop_after:
-                self.stopped[k] = step
-
-    def chosen(self, k: int, last: Any) -> Any:
-        """Return the weights of a seed: the best if it may stop early, otherwise the last."""
-        kept = self.stop_after is not None and np.isfinite(self.errors[k])
-        return jax.tree.map(lambda leaf: jax.numpy.asarray(leaf[k]), self.weights if kept else last)
-
-    def report(self, k: int) -> np.ndarray:
-        """Return steps and errors (checks, 2) of a seed, until it stopped."""
-        seen = np.array(self.seen).reshape(len(self.seen), 1 + len(self.errors))[:, [0, 1 + k]]
-        return seen if self.stopped[k] < 0 else seen[seen[:, 0] <= self.stopped[k]]
-
-    def snapshot(self) -> dict[str, Any]:
-        """Return the state for `restore`."""
-        return {
-            "errors": self.errors, "steps": self.steps, "stopped": self.stopped,
-            "weights": packed_tree(self.weights), "seen": np.array(self.seen),
-        }  # fmt: skip
-
-    def restore(self, snapshot: dict[str, Any]) -> None:
-        """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
-        like = [self.errors, self.steps, self.stopped]
-        arrays = [snapshot.get(name) for name in ("errors", "steps", "stopped")]
-        self.errors, self.steps, self.stopped = (np.array(leaf) for leaf in unpacked(arrays, like))
-        self.weights = jax.tree.map(np.array, unpacked(snapshot.get("weights"), self.weights))
-        self.seen = [list(row) for row in np.asarray(snapshot.get("seen")).tolist()]
-
-
 class Run(abc.ABC):
-    """Independent part of a fit: some seeds, for a number of steps.
+    """Gradient training of one seed's residual, for a number of steps.
 
     Attributes:
         stage: kind of its steps, for progress, metrics and the name of its checkpoint.
-        seeds: seeds that it trains.
+        seed: seed of the residual.
         steps: total number of steps.
-        state: pytree from which it continues.
-        best: best weights by held-out error, and early stopping.
-        losses: (steps, seeds), before every step; with `loss_after` also after the last one.
-        rates: (steps, seeds), learning rates.
+        state: pytree from which it continues; it has the `weights`.
+        losses: losses before every step; with `loss_after` also after the last one.
+        rates: learning rates.
+        checks: (checks, 2), step and held-out error (m) of every held-out rollout.
+        best: weights with the least held-out error.
     """
 
     stage: ClassVar[str]
     loss_after: ClassVar[bool] = False
 
-    def __init__(self, seeds: tuple[int, ...], steps: int, state: Any, best: Best):
-        self.seeds, self.steps, self.state, self.best = seeds, steps, state, best
-        self.name = "-".join([self.stage, *map(str, seeds)])
-        self.losses = self.rates = np.zeros((0, len(seeds)))
+    def __init__(
+        self, training: Training | RolloutTraining, steps: int, held_out: HeldOut, model: KNODE, seed: int
+    ):
+        """Prepare the training of a model's residual."""
+        self.knowledge, self.training, self.held_out = model.knowledge, training, held_out
+        self.seed, self.steps, self.name = seed, steps, f"{self.stage}-{seed}"
+        weights, self.rest = split(model.residual)
+        weights = jax.tree.map(lambda leaf: jnp.asarray(leaf, dtype=float), weights)
+        self.state, self.best = self.started(weights), weights
+        self.losses = self.rates = np.zeros(0)
+        self.checks = np.zeros((0, 2))
+
+    @abc.abstractmethod
+    def started(self, weights: Any) -> Any:
+        """Return the state before the first step."""
+
+    @abc.abstractmethod
+    def advance(self, stop: int, watch: ProgressMonitor) -> None:
+        """Run some steps, up to number `stop` at most. Raises `FitError`."""
+
+    def compile(self) -> None:
+        """Compile the programs of `advance` before threads would each compile them."""
+        if self.held_out:
+            self.held_out(self.model())
 
     @property
     def done(self) -> int:
@@ -198,43 +168,56 @@ class Run(abc.ABC):
 
     @property
     def finished(self) -> bool:
-        """True if all steps are done, or all seeds have stopped early."""
-        return self.done >= self.steps or bool(np.all(self.best.stopped >= 0))
+        """True if all steps are done, or the held-out error has not fallen for long enough."""
+        limit, (steps, errors) = self.training.stop_after, self.checks.T
+        stopped = limit is not None and len(steps) > 0 and steps[-1] - steps[np.argmin(errors)] >= limit
+        return self.done >= self.steps or bool(stopped)
 
-    @abc.abstractmethod
-    def compile(self) -> None:
-        """Compile the program of `advance` before threads would each compile it."""
+    @property
+    def last(self) -> Any:
+        """Weights after the last step."""
+        return self.state.weights
 
-    @abc.abstractmethod
-    def advance(self, stop: int, watch: ProgressMonitor) -> None:
-        """Run some steps, up to number `stop` at most. Raises `FitError`."""
+    def model(self) -> KNODE:
+        """Return the model with the present weights."""
+        return KNODE(self.knowledge, eqx.combine(self.state.weights, self.rest))
 
-    @abc.abstractmethod
-    def residuals(self) -> list[Residual]:
-        """Return the trained residuals, one for every seed."""
+    def residual(self) -> Residual:
+        """Return the residual with the last weights, or the best if training may stop early."""
+        errors = self.checks[:, 1]
+        early = self.training.stop_after is not None and np.any(np.isfinite(errors))
+        return eqx.combine(self.best if early else self.last, self.rest)
 
-    def report(self, seed: int) -> dict[str, Any]:
-        """Return loss, rate and held-out errors of one seed over the steps."""
-        k = self.seeds.index(seed)
-        rows = slice(0, self.best.stopped[k] if self.best.stopped[k] >= 0 and not self.loss_after else None)
-        history = {"loss": self.losses[rows, k], "learning_rate": self.rates[rows, k]}
-        return history | ({"held_out_error": self.best.report(k)} if self.best.seen else {})
+    def check(self, watch: ProgressMonitor) -> None:
+        """Find the held-out error, if it is due after this step."""
+        if self.held_out is None or (self.done % self.training.check_every and self.done < self.steps):
+            return
+        error = self.held_out(self.model())
+        if error < np.min(self.checks[:, 1], initial=np.inf):
+            self.best = self.state.weights
+        self.checks = np.append(self.checks, [[self.done, error]], axis=0)
+        watch.error(self.stage, self.seed, self.done, error)
+
+    def report(self) -> dict[str, Any]:
+        """Return loss, rate and held-out errors over the steps."""
+        history = {"loss": self.losses, "learning_rate": self.rates}
+        return history | ({"held_out_error": self.checks} if len(self.checks) else {})
 
     def snapshot(self) -> dict[str, Any]:
-        """Return the state as plain values, arrays, and lists of arrays."""
+        """Return the state as arrays, and lists of arrays."""
         return {
-            "state": packed_tree(self.state), "losses": self.losses, "rates": self.rates,
-            "best": self.best.snapshot(),
+            "state": packed_tree(self.state), "best": packed_tree(self.best), "losses": self.losses,
+            "rates": self.rates, "checks": self.checks,
         }  # fmt: skip
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
-        self.state = unpacked(snapshot.get("state"), self.state)
-        arrays = [snapshot.get("losses"), snapshot.get("rates")]
-        done, count = len(snapshot["rates"]), len(self.seeds)
-        like = [np.zeros((done + self.loss_after, count)), np.zeros((done, count))]
-        self.losses, self.rates = map(np.asarray, unpacked(arrays, like))
-        self.best.restore(snapshot["best"])
+        done, checks = len(snapshot["rates"]), len(snapshot["checks"])
+        arrays = [snapshot[name] for name in ("losses", "rates", "checks")]
+        like = [np.zeros(done + self.loss_after), np.zeros(done), np.zeros((checks, 2))]
+        self.losses, self.rates, self.checks = map(np.asarray, unpacked(arrays, like))
+        self.state = unpacked(snapshot["state"], self.state)
+        self.best = unpacked(snapshot["best"], self.best)
 
 
 def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, watch: ProgressMonitor) -> None:
@@ -255,8 +238,7 @@ def run_all(runs: Sequence[Run], checkpoints: Checkpoints | None, every: int, wa
             path = checkpoints.path(run.name)  # type: ignore[union-attr]
             raise CheckpointError(f"{path}: {reason}; delete it to start again") from None
     stages = {run.stage for run in runs}
-    total = sum(run.steps * len(run.seeds) for run in runs)
-    watch.begin(" and ".join(sorted(stages)), total, sum(run.done * len(run.seeds) for run in runs))
+    watch.begin(" and ".join(sorted(stages)), sum(run.steps for run in runs), sum(run.done for run in runs))
 
     def work(run: Run) -> None:
         try:
