@@ -19,9 +19,9 @@ from knode_cosserat.evaluation.comparison import METHODS as LOOKS
 from knode_cosserat.evaluation.comparison import REFERENCE, legend_below, require_some
 from knode_cosserat.evaluation.drawing import equal_scales, new_figure
 from knode_cosserat.evaluation.style import PALETTE, TWO_COLUMNS, style
+from knode_cosserat.identification import IdentificationError, identify
 from knode_cosserat.identification.evaluate import Evaluation, compared, predict
 from knode_cosserat.identification.fit import fit as learn
-from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.learning.config import FitConfig, FitError
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.states import fit_states

@@ -32,7 +32,7 @@ def tilt(monkeypatch):
     @register()
     def tilt_effects(nominal, usual):
         """Return the effect of a table that is not level."""
-        return [Effect("tilt", "gravity across the rod", along_axes("gravity", "m/s2", 0.5, "xy"), tilted)]
+        return [Effect("tilt", along_axes("gravity", "m/s2", 0.5, "xy"), tilted)]
 
 
 def test_each_way_to_extend_the_package_has_an_example():

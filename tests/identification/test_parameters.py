@@ -10,8 +10,8 @@ import knode_cosserat as kc
 from knode_cosserat.estimation import BaseWrench, Curvatures
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification import Experiment, IdentificationError, identify, search
-from knode_cosserat.identification.effects import parameter_effects
 from knode_cosserat.identification.experiments import experiments_of
+from knode_cosserat.identification.free_parameters import parameter_effects
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual

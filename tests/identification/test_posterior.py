@@ -19,7 +19,7 @@ def model_of(needs=(), count=EFFECTS):
     def effect(k):
         numbers = (Number(f"n{k}", "", 0.0, 1.0),)
         wanted = ("e0",) if k in needs else ()
-        return Effect(f"e{k}", "", numbers, lambda robot, values: robot, needs=wanted)
+        return Effect(f"e{k}", numbers, lambda robot, values: robot, needs=wanted)
 
     return Model(nominal_robot(), [effect(k) for k in range(count)])
 
@@ -85,7 +85,7 @@ def test_an_effect_is_never_without_those_that_it_needs():
 def test_the_shape_of_an_effect_that_is_hardly_there_is_no_evidence_for_it():
     """rows = a curve(s): the evidence against a small a is that without its derivative by the shape s."""
     numbers = Number("a", "", 0.0, 1.0), Number("s", "", 0.0, 1.0, shape=True)
-    model = Model(nominal_robot(), [Effect("bent", "", numbers, lambda robot, values: robot)])
+    model = Model(nominal_robot(), [Effect("bent", numbers, lambda robot, values: robot)])
     rng, places, small, shape = np.random.default_rng(6), np.linspace(0.0, 3.0, ROWS), 0.1, 2.0
     rows = rng.normal(size=ROWS)
     curve, slope = np.sin(places + shape), np.cos(places + shape)

@@ -8,8 +8,8 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.estimation.parameters import Model
 from knode_cosserat.identification import identify
-from knode_cosserat.identification.effects import parameter_effects
 from knode_cosserat.identification.experiments import experiments_of
+from knode_cosserat.identification.free_parameters import parameter_effects
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.solvers.segments import DataError
 from tests.learning.bar import BAR, Bar, pulled

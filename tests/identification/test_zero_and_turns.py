@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.estimation.parameters import Model
-from knode_cosserat.identification.effects import parameter_effects
+from knode_cosserat.identification.free_parameters import parameter_effects
 from knode_cosserat.rods.parameters import value_at
 
 ends, loads = kc.robots.ends, kc.robots.loads

@@ -5,8 +5,8 @@ from knode_cosserat.identification.effects import effects_of, register
 from knode_cosserat.identification.evaluate import Evaluation, evaluate, predict
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.fit import fit
-from knode_cosserat.identification.identify import IdentificationError, identify
-from knode_cosserat.identification.result import Estimate, Identified
+from knode_cosserat.identification.identify import identify
+from knode_cosserat.identification.result import Estimate, IdentificationError, Identified
 
 __all__ = [
     "Effect",

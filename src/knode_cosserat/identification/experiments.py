@@ -87,6 +87,19 @@ class Experiment:
             return np.full(self.data.shape[1], self.output.sigma)
         return self.output.noise
 
+    def positions(self, rows: Float[np.ndarray, "rows w"]) -> Float[np.ndarray, "rows M d"] | None:
+        """Return the positions in rows of data, or their errors in rows of errors; None: there are none."""
+        outputs: tuple[Any, ...] = getattr(self.output, "outputs", (self.output,))
+        output, *others = outputs
+        if isinstance(output, States):
+            where = np.flatnonzero([label == "p" for label in output.labels])
+            return rows[:, where].reshape(len(rows), output.nodes, -1) if len(where) else None
+        if not output.labels[0].startswith("position"):
+            return None
+        errors = rows.shape[1] == len(self.noise)
+        width = rows.shape[1] - sum(len(it.noise) if errors else it.size for it in others)
+        return rows[:, :width].reshape(len(rows), len(output.fractions), -1)[..., :3]
+
     @property
     def is_resolved(self) -> bool:
         """True if time steps follow a continuous signal, so that shorter ones are nearer to the robot."""
@@ -115,32 +128,12 @@ class Experiment:
         )
 
 
-def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto4") -> list[Experiment]:
-    """Return the experiments of recordings, measurements, trajectories or experiments.
-
-    Those of measurements have one length, so that they share compiled programs.
+def listed_rows(data: Any) -> list[Measurements | Trajectory | Experiment]:
+    """Return data in a list, recordings as rows with mean tensions.
 
     Raises:
-        DataError: data that do not fit the robot or each other, are too short or not finite.
+        DataError: anything else, or time steps of recordings that differ.
     """
-    rows = listed_rows(data)
-    measured = [it for it in rows if isinstance(it, Measurements)]
-    same_steps(measured)
-    names = iter(names_of(measured))
-    experiments = [
-        it if isinstance(it, Experiment)
-        else of_measurements(it, model, next(names), space) if isinstance(it, Measurements)
-        else of_trajectory(it, model.nominal, f"trajectory {k}")
-        for k, it in enumerate(rows)
-    ]  # fmt: skip
-    if len(measured) < len(rows):
-        return experiments
-    longest = max(len(it.control) for it in experiments)
-    return [it.padded(longest) for it in experiments]
-
-
-def listed_rows(data: Any) -> list[Any]:
-    """Return data in a list, recordings as rows with mean tensions; `DataError` for anything else."""
     if isinstance(data, str | Recording | Measurements | Trajectory | Experiment) or not isinstance(
         data, Sequence
     ):
@@ -154,6 +147,9 @@ def listed_rows(data: Any) -> list[Any]:
                 f"data holds a {type(it).__name__}; allowed is what load_recording returns, its "
                 "sampled(0.0125, mean=True), or a Trajectory"
             )
+    steps = sorted({it.dt for it in rows if isinstance(it, Measurements)}) or [0.0]
+    if steps[-1] - steps[0] > 1e-9:
+        raise DataError(f"time steps differ: {', '.join(f'{dt:g}' for dt in steps)} s; allowed is one")
     return rows
 
 
@@ -163,15 +159,34 @@ def measured_rows(data: Any) -> list[Measurements]:
     for it in rows:
         if not isinstance(it, Measurements):
             raise DataError(f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of")
-    same_steps(rows)
-    return rows
+    return rows  # type: ignore[return-value]
 
 
-def same_steps(measured: Sequence[Measurements]) -> None:
-    """Raise `DataError` if the time steps differ."""
-    steps = sorted({it.dt for it in measured}) or [0.0]
-    if steps[-1] - steps[0] > 1e-9:
-        raise DataError(f"time steps differ: {', '.join(f'{dt:g}' for dt in steps)} s; allowed is one")
+def experiments_of(
+    rows: Sequence[Measurements | Trajectory | Experiment],
+    model: Model,
+    space: str | SpaceScheme = "lobatto4",
+) -> list[Experiment]:
+    """Return the experiments of measurements, trajectories or experiments.
+
+    Those of measurements have one length, so that they share compiled programs.
+
+    Raises:
+        DataError: data that do not fit the robot, are too short or not finite.
+    """
+    names = iter(names_of([it for it in rows if isinstance(it, Measurements)]))
+    experiments = [
+        it
+        if isinstance(it, Experiment)
+        else of_measurements(it, model, next(names), space)
+        if isinstance(it, Measurements)
+        else of_trajectory(it, model.nominal, f"trajectory {k}")
+        for k, it in enumerate(rows)
+    ]
+    if not all(isinstance(it, Measurements) for it in rows):
+        return experiments
+    longest = max(len(it.control) for it in experiments)
+    return [it.padded(longest) for it in experiments]
 
 
 def names_of(measured: Sequence[Measurements]) -> list[str]:

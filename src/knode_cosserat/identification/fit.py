@@ -20,10 +20,11 @@ from knode_cosserat.identification.experiments import (
     poses_of_nodes,
 )
 from knode_cosserat.identification.identify import identify
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual, residual_model
 from knode_cosserat.identification.result import Identified
-from knode_cosserat.identification.search import Search, SearchError
+from knode_cosserat.identification.search import Search
 from knode_cosserat.learning.config import FitConfig, FitError, PassiveOptions, StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
@@ -217,7 +218,7 @@ def _with_network(knowledge: System, poses: _Poses, config: FitConfig, tell: Tel
     options = config.residual
     assert isinstance(options, PassiveOptions)
     model = residual_model(Model(knowledge, ()), (), passive(knowledge, tension, 0, options.hidden), WIDE)
-    search = Search(Misfit(model, experiments_of(poses.measured, model, poses.space)), tell)
+    search = Search(Misfit(model, experiments_of(poses.measured, model, poses.space)), Journal(tell))
     try:
         point = search.from_far(model.mask(model.names))
     except SearchError as error:

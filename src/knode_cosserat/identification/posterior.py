@@ -21,8 +21,8 @@ from knode_cosserat.identification.search import Point
 SWEEPS, BURNT = 200, 40
 #: draws of the coordinates
 DRAWS = 4000
-#: an effect is found, or is left out, with this probability
-SURE = 0.95
+#: an effect is found with this probability, and left out below the other one
+SURE, UNLIKELY = 0.95, 1.0 - 0.95
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, Replace
+from knode_cosserat.estimation.parameters import Effect, Number, numbers_at
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
@@ -45,55 +45,33 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         Number(f"taken_in to {end:g} L", "m", float(np.mean(taken_in[ends == end])), TAKEN_IN * L)
         for end in levels
     )
+    springs = tuple(
+        _spring(f"compliance to {end:g} L", float(np.mean(compliance[ends == end])), nominal)
+        for end in levels
+    )
+    unit = "m" if radii is None else "rad"
+    zeros = tuple(
+        Number(f"reels.zero[{k}]", unit, float(zero[k]), float(widths[k])) for k in range(len(zero))
+    )
+    axial = (Number("shear_stiffness", "", 1.0, 1.0, 1e-6, 1e6, True),)
+    elastic = (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),)
     effects = [
+        Effect("length", numbers_at(nominal, "length", 0.05, logarithmic=True)),
+        Effect("axial stiffness", axial, _with_axial_stiffness),
+        Effect("motor zeros", zeros, part=_with_part("zero", zero)),
+        Effect("taken in", lengths, _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in)),
         Effect(
-            "length", "length of the rod", (Number("length", "m", L, 0.05, 1e-3, 20.0, True),),
-            Replace(("length",)),
+            "springs", springs, _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance)
         ),
-        Effect(
-            "axial stiffness", "stiffness against extension and shear over that of the section",
-            (Number("shear_stiffness", "", 1.0, 1.0, 1e-6, 1e6, True),), _with_axial_stiffness,
-        ),
-        Effect(
-            "motor zeros", "angle of each motor at which its reel has taken in nothing",
-            tuple(
-                Number(f"reels.zero[{k}]", "m" if radii is None else "rad", float(zero[k]), float(widths[k]))
-                for k in range(len(zero))
-            ),
-            Replace(("reels.zero",), "vector"), _with_part("zero", zero),
-        ),
-        Effect(
-            "taken in", "length of tendons that is taken in at the motors' zeros, by where they end", lengths,
-            _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in),
-        ),
-        Effect(
-            "springs", "compliance of the springs in series with tendons, by where these end",
-            tuple(
-                _spring(f"compliance to {end:g} L", float(np.mean(compliance[ends == end])), nominal)
-                for end in levels
-            ),
-            _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
-        ),
-        Effect(
-            "tendon elasticity", "compliance of all tendons",
-            (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),),
-            Replace(("tendon_compliance",)),
-        ),
-    ]  # fmt: skip
+        Effect("tendon elasticity", elastic),
+    ]
     if radii is not None:
-        single = tuple(
-            Number(f"reels.radius[{k}]", "m", float(at), 0.05, 1e-6, 1.0, True) for k, at in enumerate(radii)
-        )
+        single = numbers_at(nominal, "reels.radius", 0.05, low=1e-6, high=1.0, logarithmic=True)
+        common = (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),)
         effects += [
-            Effect(
-                "reel radius", "radius of all reels over the known one",
-                (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),), _with_radius,
-            ),
-            Effect(
-                "reel radii", "radius of each reel", single,
-                lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii]),
-            ),
-        ]  # fmt: skip
+            Effect("reel radius", common, _with_radius),
+            Effect("reel radii", single, lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii])),
+        ]
     return [*effects, *routing_effects(nominal)]
 
 
@@ -113,20 +91,15 @@ def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             tendons.append(dataclasses.replace(tendon, x=x, y=y))
         return robot.replace(routing=tuple(tendons))
 
-    all_tendons = (
-        Number("routing.offset", "", 1.0, 0.1, 0.01, 100.0, True), Number("routing.turn", "rad", 0.0, TURN)
-    )  # fmt: skip
+    together = (
+        Number("routing.offset", "", 1.0, 0.1, 0.01, 100.0, True),
+        Number("routing.turn", "rad", 0.0, TURN),
+    )
+    single = tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max()))
     return [
-        Effect(
-            "routing", "relative distance of all tendons from the axis, and their rotation about it",
-            all_tendons, lambda robot, v: turned(robot, v[0], [v[1]] * len(routing)),
-        ),
-        Effect(
-            "routing by motor", "rotation of each motor's tendons, or of each tendon, about the axis",
-            tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max())),
-            lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors]),
-        ),
-    ]  # fmt: skip
+        Effect("routing", together, lambda robot, v: turned(robot, v[0], [v[1]] * len(routing))),
+        Effect("routing by motor", single, lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors])),
+    ]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float
 from knode_cosserat.estimation.parameters import RESIDUAL, Effect, Model, Number, Replace
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.information import Problem, normal_equations
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.identification.search import FINE, Point, Search, SearchError, Subset
+from knode_cosserat.identification.search import FINE, Point, Search, Subset
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import PARTS, POSITIVE, Passive
@@ -70,14 +71,14 @@ def residual_model(
         widths: standard deviations of the priors of the residual's numbers, by part.
     """
     effects = [
-        dataclasses.replace(it, apply=_OfKnowledge(it.apply), part=it.part and _OfKnowledge(it.part))
+        dataclasses.replace(it, change=_OfKnowledge(it.change), part=it.part and _OfKnowledge(it.part))
         for it in model.effects
         if it.name in names
     ]
     for part, value in residual.coefficients().items():
         name, low = f"{RESIDUAL}.{part}", 0.0 if part in POSITIVE else -np.inf
         numbers = [Number(f"{name}[{k}]", "", 0.0, widths[part], low) for k in range(np.size(value))]
-        effects.append(Effect(name, part, tuple(numbers), Replace((name,), "coefficients")))
+        effects.append(Effect(name, tuple(numbers), Replace((name,), "coefficients")))
     return Model(KNODE(model.nominal, residual), effects)
 
 
@@ -146,7 +147,7 @@ def learn_residual(
         SearchError: the identified robot cannot be simulated.
     """
     misfit = Misfit(model, data)
-    search = Search(misfit, tell)
+    search = Search(misfit, Journal(tell))
     rollouts = search.solved(begin)
     if rollouts is None:
         raise SearchError("the identified robot cannot be simulated")
@@ -176,7 +177,7 @@ def learn_residual(
         prior = np.ones(model.size)
         for part, width in widths.items():
             prior[model.slice(f"{RESIDUAL}.{part}")] = width**-2
-        wider = Search(misfit, tell, prior)
+        wider = Search(misfit, search.journal, prior)
         mask = model.mask([*identified, *(f"{RESIDUAL}.{part}" for part in widths)])
         free = dataclasses.replace(point, free=mask, prior=wider.prior)
         folds = [

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
@@ -18,14 +17,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._files.writing import package_version
-from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import States
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.information import ROBUST, Problem, dispersion, huber, normal_equations
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, hashed
-
-clock = time.monotonic
+from knode_cosserat.learning.training.checkpoint import hashed
 
 #: parts of the longest motion over which preliminary searches go; with all rows at once, a search from a poor
 #: nominal robot may fail
@@ -54,18 +51,10 @@ UNSEEN = 0.8
 #: a row is not used if it moves by more lengths than this for each standard deviation of the priors: such a
 #: motion is unstable there, and derivatives say nothing
 LARGEST = 10.0
-
-
-class OutOfTimeError(KnodeCosseratError):
-    """The time of an identification is over."""
-
-    code = "out-of-time"
-
-
-class SearchError(KnodeCosseratError, RuntimeError):
-    """A search cannot go on; one line says why."""
-
-    code = "search"
+#: lags in rows, and the correlation above which a remainder is not noise
+LAGS, ALIKE = range(3, 11), 0.3
+#: scales below so many times the solver's errors are not examined
+NEAR = 10.0
 
 
 #: coordinates of the normal equations at the end of a search
@@ -127,29 +116,26 @@ class Search:
 
     Args:
         misfit: the recordings and the model.
-        tell: called with a line of progress.
-        prior: precision of each coordinate's prior, about zero; by default 1.
-        deadline: time of `clock` after which nothing is solved.
-        journal: keeps the ends of finished searches, so that an interrupted identification resumes.
+        journal: course of the identification.
+        prior: precision of each coordinate's prior, about zero; by default that of the model.
     """
 
     def __init__(
-        self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
-        prior: Float[np.ndarray, " n"] | None = None, journal: Checkpoints | None = None,
-        deadline: float = np.inf,
-    ):  # fmt: skip
-        self.misfit, self.tell, self.journal, self.deadline = misfit, tell, journal, deadline
-        #: the end of the last search in all recordings
-        self.last: Point | None = None
+        self,
+        misfit: Misfit,
+        journal: Journal | None = None,
+        prior: Float[np.ndarray, " n"] | None = None,
+    ):
+        self.misfit, self.journal = misfit, journal or Journal()
         self.prior = np.asarray(misfit.model.prior if prior is None else prior)
         #: True if no number has a prior: the equations are taken to be exact, and noise to be white
         self.exact = not np.any(self.prior)
-        self._identity = "" if journal is None else self._hash()
         self.length = float(np.asarray(misfit.model.nominal.length))
         self.low, self.high = misfit.model.bounds
         self.least = [self._least_scale(data) for data in misfit.data]
 
-    def _hash(self) -> str:
+    @functools.cached_property
+    def _identity(self) -> str:
         """Return a hash of everything that a search depends on: model, recordings, settings, this package."""
         model = self.misfit.model
         words = [package_version(), repr(model.numbers), repr(model.names)]
@@ -267,28 +253,56 @@ class Search:
         options = (subset.rows, subset.which and tuple(subset.which), effort, scale is None, equations)
         begins = (np.zeros(0) if it is None else it for it in (scale, near))
         solve = functools.partial(self._searched, x, free, subset, effort, scale, equations, near)
-        point = self._resumed(solve, repr(options), x, free, *begins) if self.journal else solve()
+        facts = self.journal.finished(
+            lambda: solve().facts(), self._identity, repr(options), x, free, *begins
+        )
+        point = Point.of(facts)
         if subset.which is None:
-            self.last = point
+            self.journal.last = self, point
         return point
 
-    def _resumed(self, solve: Callable[[], Point], *begun: Any) -> Point:
-        """Return the end of a search that began so, from the journal if it is there."""
-        assert self.journal is not None
-        key = hashed(self._identity, *begun)
-        try:
-            kept = self.journal.load(key)
-        except CheckpointError:  # a damaged file counts as missing
-            kept = None
-        if kept is None:
+    def first_explaining(self, *searches: Callable[[], Point]) -> Point:
+        """Return the end of the first search that explains the data, or of the best search.
+
+        Raises:
+            SearchError: all searches failed.
+        """
+        points, error = list[Point](), None
+        for search in searches:
             try:
-                kept = solve().facts()
-            except SearchError as error:
-                kept = {"failed": str(error)}
-            self.journal.save(key, kept)
-        if "failed" in kept:
-            raise SearchError(kept["failed"])
-        return Point.of(kept)
+                points.append(search())
+            except SearchError as failed:
+                self.journal.tell(f"the search failed: {failed}")
+                error = failed
+                continue
+            if (points[-1].converged or not self.exact) and not self.unexplained(points[-1].x):
+                return points[-1]
+        if error and not points:
+            raise error
+        return min(points, key=lambda it: (self.exact and not it.converged, float(np.sum(np.log(it.scale)))))
+
+    def unexplained(self, x: Float[np.ndarray, " n"]) -> tuple[str, ...]:
+        """Return the fields whose remaining differences are not noise: rows are correlated at large lags."""
+        fields: dict[str, None] = {}
+        for k, (data, rollout) in enumerate(zip(self.misfit.data, self.misfit.whole(x), strict=True)):
+            if rollout is None or data.static:
+                continue
+            [scale] = self.scales_of([rollout], [k])
+            known = np.isfinite(rollout.values[1:])
+            values = np.where(known, rollout.values[1:], 0.0)
+            for field, name in enumerate(data.fields):
+                if scale[field] <= NEAR * self.least[k][field]:
+                    continue
+                rows, seen = values[:, data.groups == field], known[:, data.groups == field]
+                for lag in LAGS:
+                    one, other = rows[:-lag], rows[lag:]
+                    size = np.sum(one**2 + other**2) / 2.0
+                    count = max(int(np.sum(seen[lag:])), 1)
+                    if np.abs(np.sum(one * other)) > max(ALIKE, 5.0 / np.sqrt(count)) * size:
+                        several = len(self.misfit.data) > 1 and data.readings
+                        fields[f"{name} in {data.name}" if several else name] = None
+                        break
+        return tuple(fields)
 
     def without(
         self, point: Point, k: int, effort: tuple[int, float], equations: Equations = "free"
@@ -331,7 +345,7 @@ class Search:
             after = self.scales_of(rollouts, which)
             horizon = "all rows" if subset.rows is None else f"{subset.rows} rows"
             text = ", ".join(f"{1e3 * size:.2f}" for size in after[:, 0])
-            self.tell(f"{horizon}, {most - remaining} evaluations: {text} mm")
+            self.journal.tell(f"{horizon}, {most - remaining} evaluations: {text} mm")
             settled = scale is not None or np.all(np.abs(after - sizes) <= SETTLED * sizes)
             converged = bool(ended and (rough or (settled and (known or self.exact))))
         sizes = self.scales_of(rollouts, which) if scale is None else scale
@@ -392,8 +406,7 @@ class Search:
         Raises:
             OutOfTimeError: the deadline is over.
         """
-        if clock() > self.deadline:
-            raise OutOfTimeError
+        self.journal.require_time()
         if offsets is None and subset.rows is None:
             rollouts = self.misfit.whole(x, subset.which)
         else:
