@@ -8,7 +8,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.identification import journal
 from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError
-from knode_cosserat.identification.search import Search
+from knode_cosserat.identification.search import ParameterSearch
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
 from tests.identification.test_journal import FREE, Curve
@@ -47,7 +47,7 @@ def use(monkeypatch):
 
 def test_nothing_is_solved_after_the_deadline(use):
     use(Clock())
-    search = Search(Curve(), Journal(minutes=1.0))
+    search = ParameterSearch(Curve(), Journal(minutes=1.0))
     end = search.run(np.zeros(3), FREE)
     assert search.journal.last == (search, end)
     use(Clock(calls=2))
@@ -68,7 +68,9 @@ def _run(monkeypatch, clock, stages):
             if stage == "trials":
                 course.result = kc.identification.Identified(TRUE)
 
-    monkeypatch.setattr(IDENTIFY, "Search", lambda misfit, journal: Search(Curve(), journal))
+    monkeypatch.setattr(
+        IDENTIFY, "ParameterSearch", lambda misfit, journal: ParameterSearch(Curve(), journal)
+    )
     monkeypatch.setattr(IDENTIFY, "Misfit", lambda *_: None)
     monkeypatch.setattr(IDENTIFY, "identify_effects", staged)
     return kc.identify(NOMINAL, [ROWS], minutes=1.0, progress=clock.tell)

@@ -8,7 +8,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.estimation import BaseWrench, Curvatures
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification import Experiment, IdentificationError, identify, search
 from knode_cosserat.identification.experiments import experiments_of
 from knode_cosserat.identification.free_parameters import parameter_effects
@@ -323,7 +323,7 @@ def test_slopes_of_a_start_that_has_to_be_found_are_exact(space):
     moved = pulled(1.0, robot=bar, space=space)
     assert moved.y[0, -1, 0] > 1.1
     other = bar.replace(stiffness=25.0)
-    model = Model(other, parameter_effects(other, ["length", "density", "stiffness", "damping"]))
+    model = ParameterModel(other, parameter_effects(other, ["length", "density", "stiffness", "damping"]))
     require_exact_slopes(Misfit(model, experiments_of([moved], model)), 4)
 
 
@@ -333,7 +333,7 @@ def test_slopes_of_a_start_that_has_to_be_found_are_exact(space):
 def test_matrices_and_vectors_as_numbers():
     robot = ROBOT.replace(bending_damping=[0.03, 0.04, 0.05])
     effects = parameter_effects(robot, ["bending_damping", "drag", "gravity", "radius"])
-    model = Model(robot, effects)
+    model = ParameterModel(robot, effects)
     assert model.labels == (
         "bending_damping[0]", "bending_damping[1]", "bending_damping[2]", "drag",
         "gravity[0]", "gravity[1]", "gravity[2]", "radius",

@@ -78,7 +78,7 @@ class Number(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Effect:
+class PossibleEffect:
     """A physical cause, its numbers, and the change that it makes to a robot.
 
     By default the numbers replace the parameters that their labels name (`numbers_at`). `part` adds the part
@@ -191,7 +191,7 @@ class ParametrisedRobot(eqx.Module):
         return robot
 
 
-class Model:
+class ParameterModel:
     """Unknown numbers of one robot, and the robot with them for any coordinates.
 
     Attributes:
@@ -201,7 +201,7 @@ class Model:
         robot: the robot with all effects, a function of coordinates.
     """
 
-    def __init__(self, nominal: System, effects: Iterable[Effect]):
+    def __init__(self, nominal: System, effects: Iterable[PossibleEffect]):
         self.nominal, self.effects = nominal, tuple(effects)
         self.numbers: tuple[Number, ...] = tuple(it for effect in self.effects for it in effect.numbers)
         self.robot = ParametrisedRobot(
@@ -253,7 +253,7 @@ class Model:
         first = sum(len(effect.numbers) for effect in before)
         return slice(first, first + len(self.effect(name).numbers))
 
-    def effect(self, name: str) -> Effect:
+    def effect(self, name: str) -> PossibleEffect:
         """Return the effect of that name."""
         return self.effects[self.names.index(name)]
 
@@ -321,7 +321,9 @@ class _Adaptable(Protocol):
         ...
 
 
-def adapted_model(robot: System, adapted: Sequence[Adapted | str]) -> tuple[Model, Float[np.ndarray, " n"]]:
+def adapted_model(
+    robot: System, adapted: Sequence[Adapted | str]
+) -> tuple[ParameterModel, Float[np.ndarray, " n"]]:
     """Return a robot with adapted parameters, and the drift (n,) of the coordinates in one second.
 
     Coordinates are zero at the robot's values and have deviation one. Positive parameters are logarithmic.
@@ -334,7 +336,7 @@ def adapted_model(robot: System, adapted: Sequence[Adapted | str]) -> tuple[Mode
     for it in adapted:
         choice = Adapted(it) if isinstance(it, str) else it
         choices += _parts_of_residual(robot, choice) if choice.name == RESIDUAL else [choice]
-    model = Model(robot, [_adapted_effect(robot, choice) for choice in choices])
+    model = ParameterModel(robot, [_adapted_effect(robot, choice) for choice in choices])
     if model.size > MOST:
         raise ParameterError(
             f"{model.size} numbers are to be adapted ({', '.join(model.names)}); allowed are at most {MOST}"
@@ -364,7 +366,7 @@ def _stated(robot: System, name: str) -> Any:
     return parts[part]
 
 
-def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
+def _adapted_effect(robot: System, adapted: Adapted) -> PossibleEffect:
     name, deviation = adapted.name, adapted.deviation
     stated = _stated(robot, name)
     try:
@@ -386,7 +388,7 @@ def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
         width = RELATIVE if deviation is None else float(deviation) / (1.0 if value.ndim else first)
         low, high = (first * float(np.exp(end * width)) for end in (-WIDEST, WIDEST))
         numbers = [Number(name, "", first, width, low, high, True)]
-        return Effect(name, tuple(numbers), Replace((name,), "multiple" if value.ndim else "numbers"))
+        return PossibleEffect(name, tuple(numbers), Replace((name,), "multiple" if value.ndim else "numbers"))
     if deviation is None and learned:
         deviation = RELATIVE * float(np.sqrt(np.mean(value**2))) or None
     if deviation is None:
@@ -401,5 +403,5 @@ def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
     for k, at in enumerate(value.ravel().tolist()):
         ends = max(low, at - reach), min(high, at + reach)
         numbers.append(Number(f"{name}[{k}]" if several else name, "", at, deviation, *ends))
-    effect = Effect(name, tuple(numbers))
+    effect = PossibleEffect(name, tuple(numbers))
     return dataclasses.replace(effect, change=Replace((name,), "coefficients")) if learned else effect

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.parameters import Effect, Model, Number
+from knode_cosserat.estimation.parameters import Number, ParameterModel, PossibleEffect
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.parameters import (
     ParameterError,
@@ -41,7 +41,7 @@ class Usual(NamedTuple):
 
 
 #: effects that a robot may have, for usual sizes
-Library = Callable[[RoutedTendonRobot, Usual], list[Effect]]
+Library = Callable[[RoutedTendonRobot, Usual], list[PossibleEffect]]
 _libraries: dict[Library, int] = {}
 
 
@@ -55,7 +55,7 @@ def register(order: int = 9) -> Callable[[Library], Library]:
     return added
 
 
-def effects_of(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def effects_of(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return all registered effects that a robot may have."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     for module in pkgutil.iter_modules(package.__path__):
@@ -67,8 +67,8 @@ def effects_of(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
 
 def library_model(
     nominal: TendonRod, tension: Float[np.ndarray, "T c"], bodies: Iterable[float] = (),
-    more: Sequence[Effect] = (),
-) -> Model:  # fmt: skip
+    more: Sequence[PossibleEffect] = (),
+) -> ParameterModel:  # fmt: skip
     """Return the model with all registered effects of a robot whose tendons run beside it.
 
     Args:
@@ -84,10 +84,10 @@ def library_model(
         float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1))),
         tuple(float(at) for at in bodies if at > 0.0),
     )  # fmt: skip
-    return Model(nominal, [*effects_of(nominal, usual), *more])
+    return ParameterModel(nominal, [*effects_of(nominal, usual), *more])
 
 
-def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Effect]:
+def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[PossibleEffect]:
     """Return the places of bodies that are not well known, as an effect; `flat` ones have no priors."""
     places: dict[float, float] = {}
     for rows in measured:
@@ -103,7 +103,7 @@ def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Effec
         others = [part for part in robot.effects if not isinstance(part, Markers)]
         return robot.replace(effects=(*others, Markers(at=at, stated=stated)))
 
-    effect = Effect(
+    effect = PossibleEffect(
         "marker places",
         numbers,
         lambda robot, values: placed(robot, jnp.stack(values)),

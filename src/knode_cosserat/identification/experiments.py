@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, Several, States
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -164,7 +164,7 @@ def measured_rows(data: Any) -> list[Measurements]:
 
 def experiments_of(
     rows: Sequence[Measurements | Trajectory | Experiment],
-    model: Model,
+    model: ParameterModel,
     space: str | SpaceScheme = "lobatto4",
 ) -> list[Experiment]:
     """Return the experiments of measurements, trajectories or experiments.
@@ -196,7 +196,10 @@ def names_of(measured: Sequence[Measurements]) -> list[str]:
 
 
 def of_measurements(
-    measured: Measurements, model: Model, name: str = "recording", space: str | SpaceScheme = "lobatto4"
+    measured: Measurements,
+    model: ParameterModel,
+    name: str = "recording",
+    space: str | SpaceScheme = "lobatto4",
 ) -> Experiment:
     """Return the experiment of measurements, which start in the equilibrium before row 0.
 

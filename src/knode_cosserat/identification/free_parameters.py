@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Model, Number, Replace
+from knode_cosserat.estimation.parameters import Number, ParameterModel, PossibleEffect, Replace
 from knode_cosserat.identification.effects import along_axes
 from knode_cosserat.identification.journal import SearchError
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.result import IdentificationError, Identified
-from knode_cosserat.identification.search import Point, Search
+from knode_cosserat.identification.search import ParameterSearch, SearchEnd
 from knode_cosserat.rods.parameters import (
     Parameter,
     ParameterError,
@@ -43,7 +43,7 @@ VAGUE, POOR = 1.0, 1.0
 PART = 0.1
 
 
-def identify_parameters(search: Search) -> Identified:
+def identify_parameters(search: ParameterSearch) -> Identified:
     """Return the robot with parameters that have flat priors; undetermined ones stay as they are."""
     model, journal = search.misfit.model, search.journal
     names, nominal = model.names, np.zeros(model.size)
@@ -77,7 +77,7 @@ def identify_parameters(search: Search) -> Identified:
     return dataclasses.replace(result, undetermined=undetermined)
 
 
-def gap_of(search: Search, point: Point, at_end: bool) -> tuple[tuple[str, ...], str] | None:
+def gap_of(search: ParameterSearch, point: SearchEnd, at_end: bool) -> tuple[tuple[str, ...], str] | None:
     """Return parameters with flat priors that the data do not determine, and the reason in words; None: none.
 
     At the start these are only parameters without an effect, and combinations: there a symmetry that hides a
@@ -125,7 +125,7 @@ def _combination(names: np.ndarray, parts: np.ndarray) -> tuple[tuple[str, ...],
     return involved[-1:], f"these data determine only a combination of {listed}"
 
 
-def _require_start(search: Search, x: np.ndarray) -> None:
+def _require_start(search: ParameterSearch, x: np.ndarray) -> None:
     """Raise `DataError` if row 0 is not the equilibrium that an experiment starts from."""
     for data, rollout in zip(search.misfit.data, search.misfit.differences(x, 0), strict=True):
         if data.held is None or rollout is None:
@@ -146,7 +146,7 @@ def _require_start(search: Search, x: np.ndarray) -> None:
             )
 
 
-def _require_range(model: Model, names: Sequence[str], point: Point) -> None:
+def _require_range(model: ParameterModel, names: Sequence[str], point: SearchEnd) -> None:
     """Raise if a number ended at a limit of its allowed range; a limit of zero is accepted."""
     for number, value, free in zip(model.numbers, model.values(point.x), model.mask(names), strict=True):
         for end in (number.low, number.high):
@@ -156,7 +156,7 @@ def _require_range(model: Model, names: Sequence[str], point: Point) -> None:
                 )
 
 
-def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> list[Effect]:
+def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> list[PossibleEffect]:
     """Return the named parameters of a robot as effects with flat priors.
 
     "all" are all of its own that have a value and can be searched. Parameters of parts have names with dots,
@@ -173,7 +173,7 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
     wanted: Any = names
     if isinstance(wanted, str) and wanted == "all":
         options = [_parameter_effect(owner, name, parameter) for name, parameter in known.items()]
-        return [option for option in options if isinstance(option, Effect)]
+        return [option for option in options if isinstance(option, PossibleEffect)]
     if isinstance(wanted, str) or not isinstance(wanted, Sequence) or not wanted:
         listed = ", ".join(known)
         raise ParameterError(f"parameters is {names!r}; allowed is a list of them, or 'all': {listed}")
@@ -195,7 +195,7 @@ def parameter_effects(robot: System, names: Sequence[str] | Literal["all"]) -> l
     return effects
 
 
-def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Effect | str:
+def _parameter_effect(owner: System, name: str, parameter: Parameter) -> PossibleEffect | str:
     """Return the effect of a parameter, or the reason why it cannot be searched."""
     part, last = owner_at(owner, name)
     if any(field.name == last and field.metadata.get("static") for field in dataclasses.fields(part)):
@@ -205,7 +205,7 @@ def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Effect 
         return f"{name} has no value: it follows from other parameters; give it one, or search for those"
     if parameter.shape == "quaternion":
         turn = along_axes(f"{name} turned", "rad", 1.0, low=-np.pi, high=np.pi, flat=True)
-        return Effect(name, turn, Replace((name,), "turn"))
+        return PossibleEffect(name, turn, Replace((name,), "turn"))
     value = np.asarray(stated, dtype=float)
     if value.ndim == 2:
         diagonal = np.diag(value)
@@ -221,4 +221,4 @@ def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Effect 
                flat=True)
         for label, at in zip(labels, np.atleast_1d(value).tolist(), strict=True)
     ]  # fmt: skip
-    return Effect(name, tuple(numbers))
+    return PossibleEffect(name, tuple(numbers))

@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.effects import library_model, place_effects
 from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
 from knode_cosserat.identification.free_parameters import identify_parameters, parameter_effects
@@ -20,7 +20,7 @@ from knode_cosserat.identification.library import identify_effects
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.result import IdentificationError, Identified
-from knode_cosserat.identification.search import Search
+from knode_cosserat.identification.search import ParameterSearch
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
@@ -102,16 +102,16 @@ def identify(
     plain = [] if parameters is None else parameter_effects(robot, parameters)
     plain += place_effects([it for it in rows if isinstance(it, Measurements)], flat=named)
 
-    def searched(robot: Any) -> Search:
+    def searched(robot: Any) -> ParameterSearch:
         if named:
-            model = Model(robot, plain)
+            model = ParameterModel(robot, plain)
             experiments = experiments_of(rows, model, space)
         else:
             model = library_model(
                 robot, np.concatenate([it.tension for it in rows]), rows[0].fractions, plain
             )
             experiments = [it.rough() for it in experiments_of(rows, model, space)]
-        return Search(Misfit(model, experiments), journal)
+        return ParameterSearch(Misfit(model, experiments), journal)
 
     try:
         if named:

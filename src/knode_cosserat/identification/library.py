@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.journal import STAGES, SearchError
 from knode_cosserat.identification.next_experiment import next_experiment
 from knode_cosserat.identification.posterior import UNLIKELY, Posterior
@@ -21,7 +21,7 @@ from knode_cosserat.identification.result import (
     variance_ratio,
 )
 from knode_cosserat.identification.samples import sampled
-from knode_cosserat.identification.search import HORIZONS, ROUGH, Point, Search, Subset
+from knode_cosserat.identification.search import HORIZONS, ROUGH, ParameterSearch, SearchEnd, Subset
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import System
@@ -47,7 +47,7 @@ WORSE = 0.02
 
 
 def identify_effects(
-    searched: Callable[[System], Search],
+    searched: Callable[[System], ParameterSearch],
     robot: System,
     effects: Sequence[str] | None,
     space: str | SpaceScheme,
@@ -90,7 +90,7 @@ def identify_effects(
     return _accepted(search, selection, effects is not None, space)
 
 
-def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
+def _known(effects: Sequence[str], model: ParameterModel) -> tuple[str, ...]:
     for name in effects:
         if name not in model.names:
             raise ParameterError(
@@ -101,7 +101,7 @@ def _known(effects: Sequence[str], model: Model) -> tuple[str, ...]:
     return tuple(name for name in model.names if name in wanted)
 
 
-def _with_all_effects(search: Search) -> Point:
+def _with_all_effects(search: ParameterSearch) -> SearchEnd:
     """Return the end of a search with all effects, begun in a part of the rows, or with the usual effects.
 
     The first answer is told; shapes stay over short horizons, where noise makes motions unstable.
@@ -109,7 +109,7 @@ def _with_all_effects(search: Search) -> Point:
     model, journal, rows = search.misfit.model, search.journal, search.rows_of(SEEN)
     every = np.ones(model.size, dtype=bool)
 
-    def usual_first() -> Point:
+    def usual_first() -> SearchEnd:
         few = model.mask(effect.name for effect in model.effects if effect.basic or effect.usual)
         point = search.from_far(few)
         try:
@@ -119,7 +119,7 @@ def _with_all_effects(search: Search) -> Point:
             journal.tell(f"all effects: {error}")
             return point
 
-    def longer() -> Point:
+    def longer() -> SearchEnd:
         x = search.over(first.x, first.free, [part for part in HORIZONS if part > SEEN])
         return search.run(x, first.free, effort=FIRST, equations="all")
 
@@ -147,15 +147,15 @@ class Selection(NamedTuple):
     """Selected effects, and the end of their search, with the ends without one recording each."""
 
     names: tuple[str, ...]
-    point: Point
-    folds: tuple[Point | None, ...] = ()
+    point: SearchEnd
+    folds: tuple[SearchEnd | None, ...] = ()
     #: differences (rows, e) of each recording, in the search without it
     held_out: tuple[Float[np.ndarray, "rows e"], ...] = ()
     #: logarithm of the usual size of these differences
     unseen: Float[np.ndarray, " R"] = np.zeros(0)
 
     @classmethod
-    def of(cls, search: Search, names: tuple[str, ...], point: Point) -> Selection:
+    def of(cls, search: ParameterSearch, names: tuple[str, ...], point: SearchEnd) -> Selection:
         """Return the selection after searches without one recording each."""
         count = len(search.misfit.data)
         folds = [search.without(point, k, FOLD, "none") for k in range(count)] if count > 1 else []
@@ -163,17 +163,17 @@ class Selection(NamedTuple):
         for k, fold in enumerate(folds):
             rollouts = None if fold is None else search.solved(fold.x, Subset(None, [k]))
             if rollouts is not None:
-                unseen[k] = np.mean(np.log(search.scales_of(rollouts, [k])))
+                unseen[k] = np.mean(np.log(search.scales_of(rollouts)))
                 held_out[k] = rollouts[0].values
         return cls(names, point, tuple(folds), tuple(held_out), unseen)
 
-    def posterior(self, model: Model, known: bool = False) -> Posterior:
+    def posterior(self, model: ParameterModel, known: bool = False) -> Posterior:
         """Return the probabilities of effects, in view of what recordings disagree about."""
         scatter = variance_ratio(self.point, [fold.x for fold in self.folds if fold is not None])
         return Posterior.of(model, self.point.scattered(scatter), self.names if known else None)
 
 
-def selected(search: Search, point: Point) -> tuple[tuple[str, ...], Point]:
+def selected(search: ParameterSearch, point: SearchEnd) -> tuple[tuple[str, ...], SearchEnd]:
     """Return the effects that are more probable than not, and the end of their search.
 
     The probabilities belong to equations that are linear about a point (`Posterior`), so the search with the
@@ -198,7 +198,7 @@ def selected(search: Search, point: Point) -> tuple[tuple[str, ...], Point]:
     return searched[-1], posterior.point
 
 
-def best_predicting(search: Search, selection: Selection) -> Selection:
+def best_predicting(search: ParameterSearch, selection: Selection) -> Selection:
     """Return a selection in view of what recordings disagree about, as long as it predicts as well.
 
     Each set is selected about the end of the last one, and has to predict as well as that the recordings that
@@ -226,7 +226,9 @@ def is_clearly_better(posterior: Posterior, names: tuple[str, ...]) -> bool:
     return posterior.score(posterior.names()) > posterior.score(names) + HARDLY
 
 
-def search_of(search: Search, posterior: Posterior, begin: Float[np.ndarray, " n"]) -> Point | None:
+def search_of(
+    search: ParameterSearch, posterior: Posterior, begin: Float[np.ndarray, " n"]
+) -> SearchEnd | None:
     """Return the end of a search with the effects that are more probable than not; None if it has none.
 
     It begins at the most probable coordinates, or else at those of the last search. Numbers that were absent
@@ -243,12 +245,14 @@ def search_of(search: Search, posterior: Posterior, begin: Float[np.ndarray, " n
     return None
 
 
-def sizes(point: Point) -> str:
+def sizes(point: SearchEnd) -> str:
     """Return the usual differences of each recording, in words."""
     return ", ".join(f"{1e3 * size:.1f}" for size in point.scale[:, 0]) + " mm"
 
 
-def _accepted(search: Search, selection: Selection, known: bool, space: str | SpaceScheme) -> Identified:
+def _accepted(
+    search: ParameterSearch, selection: Selection, known: bool, space: str | SpaceScheme
+) -> Identified:
     """Return the identified robot after its trials: with fewer effects if it fails, nominal if that fails.
 
     The effects are `known` if they were not selected.
@@ -299,7 +303,7 @@ def _accepted(search: Search, selection: Selection, known: bool, space: str | Sp
 
 
 def _averaged(
-    search: Search, selection: Selection, posterior: Posterior
+    search: ParameterSearch, selection: Selection, posterior: Posterior
 ) -> tuple[np.ndarray, tuple[str, ...], Posterior]:
     """Return the mean coordinates over all sets of effects, the probable effects, and their distribution.
 
@@ -316,7 +320,7 @@ def _averaged(
     return x, kept, posterior
 
 
-def _nominal(search: Search) -> Identified:
+def _nominal(search: ParameterSearch) -> Identified:
     misfit = search.misfit
     errors = misfit.tip_errors(np.zeros(misfit.model.size))
     steps = tuple(search.journal.steps)

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.online import errors_along, errors_of, sensitive
 from knode_cosserat.estimation.outputs import Output
-from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
+from knode_cosserat.estimation.parameters import ParameterModel, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import stepped
 from knode_cosserat.rods.tendons import LoadCells
@@ -38,15 +38,19 @@ class Rollout:
     """A simulated experiment: differences from its data in units of the noise; NaN where there are none.
 
     `offset` is what finer time steps add to the differences; it is part of the values. The `key` is that of a
-    `Misfit`.
+    `Misfit`: coordinates, number of the experiment, and rows.
     """
 
     key: Any = None
 
     def __init__(
-        self, values: Float[np.ndarray, "rows e"], tangents: Callable[[Any], np.ndarray], offset: Any = 0.0
+        self,
+        data: Experiment,
+        values: Float[np.ndarray, "rows e"],
+        tangents: Callable[[Any], np.ndarray],
     ):
-        self.plain, self.values, self.offset, self._tangents = values, values + offset, offset, tangents
+        self.data, self.plain, self.values, self._tangents = data, values, values, tangents
+        self.offset: Any = 0.0
         #: derivatives by some coordinates (a mask, or a slice of all), shared by copies
         self._known: list[Any] = []
 
@@ -80,7 +84,7 @@ class Rollout:
 class Misfit:
     """Differences of simulations from data, by the coordinates of a model."""
 
-    def __init__(self, model: Model, data: Sequence[Experiment]):
+    def __init__(self, model: ParameterModel, data: Sequence[Experiment]):
         self.model, self.data = model, tuple(data)
         self._first = True
         self._known_columns: dict[Output, tuple[int, ...]] = {}
@@ -121,46 +125,41 @@ class Misfit:
 
     def whole(self, x: Float[np.ndarray, " n"], which: Sequence[int] | None = None) -> list[Rollout | None]:
         """Return the refined rollouts of whole experiments at a point; None if one failed."""
-        return self.refined(self.differences(x, which=which), x, which)
+        return self.refined(self.differences(x, which=which), x)
 
-    def refined(
-        self, rollouts: Sequence[Rollout | None], x: Float[np.ndarray, " n"],
-        which: Sequence[int] | None = None,
-    ) -> list[Any]:  # fmt: skip
+    def refined(self, rollouts: Sequence[Rollout | None], x: Float[np.ndarray, " n"]) -> list[Any]:
         """Return whole rollouts at a point with the differences of the accurate experiments, as an offset.
 
         Between continuous controls these are extrapolated from half the steps (Richardson), for schemes of
         order two. Derivatives are not refined. Held controls belong to the steps of their scheme.
         """
-        at, chosen = np.asarray(x, dtype=float), range(len(self.data)) if which is None else which
-        targets = {
-            k: self.data[k].accurate or self.data[k]
-            for k, rollout in zip(chosen, rollouts, strict=True)
-            if rollout is not None and (at.tobytes(), k) not in self._accurate
-        }
-        resolved = [k for k, target in targets.items() if target.is_resolved]
+        at = np.asarray(x, dtype=float)
+        new = {it.key[:2]: it.data for it in rollouts if it and it.key[:2] not in self._accurate}
+        targets = {key: data.accurate or data for key, data in new.items()}
         # the longest ones first
-        wanted = [(k, 2) for k in resolved]
-        wanted += [(k, 1) for k, target in targets.items() if target is not self.data[k]]
+        wanted = [(key, 2) for key, target in targets.items() if target.is_resolved]
+        wanted += [(key, 1) for key, target in targets.items() if target is not new[key]]
 
-        def solved(part: tuple[int, int]) -> np.ndarray | None:
+        def solved(part: tuple[Any, int]) -> np.ndarray | None:
             target = targets[part[0]]
             rollout = self._of_one(at, target.replace(steps=part[1] * target.steps), None)
             return None if rollout is None else rollout.values
 
         found = dict(zip(wanted, self._parallel(solved, wanted), strict=True))
         refined = list[Any]()
-        for k, rollout in zip(chosen, rollouts, strict=True):
-            if rollout is not None and k in targets:
-                values, finer = found.get((k, 1), rollout.plain), found.get((k, 2))
+        for rollout in rollouts:
+            if rollout is None:
+                refined.append(None)
+                continue
+            key = rollout.key[:2]
+            if key in targets:
+                values, finer = found.get((key, 1), rollout.plain), found.get((key, 2))
                 if values is not None and finer is not None:
                     values = (4.0 * finer - values) / 3.0
-                if values is not None and (finer is not None or k not in resolved):
-                    self._accurate[at.tobytes(), k] = values
-            values = self._accurate.get((at.tobytes(), k))
-            if rollout is not None and values is not None:
-                rollout = rollout.moved(values - rollout.plain)
-            refined.append(rollout)
+                if values is not None and (finer is not None or not targets[key].is_resolved):
+                    self._accurate[key] = values
+            values = self._accurate.get(key)
+            refined.append(rollout if values is None else rollout.moved(values - rollout.plain))
         self._accurate = dict([*self._accurate.items()][-KEPT * len(self.data) :])
         return refined
 
@@ -185,15 +184,14 @@ class Misfit:
         Where no positions were measured it is that of all differences; None: there is no motion. It is that
         of the rows `after` so many in motion, or of all.
         """
-        chosen = [self.data[k] for k in (range(len(self.data)) if which is None else which)]
         errors: list[float | None] = []
-        for data, rollout in zip(chosen, self.whole(x, which), strict=True):
+        for rollout in self.whole(x, which):
             if rollout is None:
                 errors.append(None)
                 continue
-            places = data.positions(rollout.values * data.noise)
+            places = rollout.data.positions(rollout.values * rollout.data.noise)
             squares = rollout.values**2 if places is None else np.sum(places[:, -1] ** 2, axis=-1)
-            squares = squares[0 if after is None else data.moves + after + 1 :]
+            squares = squares[0 if after is None else rollout.data.moves + after + 1 :]
             errors.append(float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else None)
         return errors
 
@@ -249,7 +247,7 @@ class Misfit:
             return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, filled(records), seen_data))
-        return Rollout(errors[: len(records)] / noise, tangents)
+        return Rollout(data, errors[: len(records)] / noise, tangents)
 
     def _columns(
         self, system: Any, output: Output, records: np.ndarray, measured: np.ndarray

@@ -14,7 +14,7 @@ from jaxtyping import Float
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.posterior import Posterior
-from knode_cosserat.identification.search import Search
+from knode_cosserat.identification.search import ParameterSearch
 from knode_cosserat.identification.trials import moved
 from knode_cosserat.schemes.result import SimulationError
 
@@ -50,7 +50,7 @@ class NextExperiment:
 
 
 def next_experiment(
-    search: Search, posterior: Posterior, x: Float[np.ndarray, " n"], undecided: Sequence[str]
+    search: ParameterSearch, posterior: Posterior, x: Float[np.ndarray, " n"], undecided: Sequence[str]
 ) -> NextExperiment | None:
     """Return the experiment after which the numbers of undecided effects are known best.
 
@@ -82,7 +82,7 @@ def next_experiment(
     misfit.differentiated(rollouts)
     usable = search.used(rollouts, np.ones(model.size, dtype=bool))
     on, known = np.flatnonzero(model.mask(undecided)), point.problem.matrix.sum(axis=0) + np.diag(point.prior)
-    before, [unit] = _deviations(known, on), search.units(point.scale[:1], [0])
+    before, unit = _deviations(known, on), point.scale[0][first.groups]
     # a difference counts as in the recordings
     weight = np.sqrt(point.problem.amount[0] / len(first.data) / len(unit)) / unit
     best: tuple[float, NextExperiment | None] = 0.0, None

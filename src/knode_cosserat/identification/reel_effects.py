@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, numbers_at
+from knode_cosserat.estimation.parameters import Number, PossibleEffect, numbers_at
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
@@ -23,7 +23,7 @@ TAKEN_IN, TURN = 0.01, 0.1
 
 
 @register(order=2)
-def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of a robot with reels, or with stated routing."""
     if nominal.drive != "reel":
         return routing_effects(nominal)
@@ -56,26 +56,30 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
     axial = (Number("shear_stiffness", "", 1.0, 1.0, 1e-6, 1e6, True),)
     elastic = (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),)
     effects = [
-        Effect("length", numbers_at(nominal, "length", 0.05, logarithmic=True)),
-        Effect("axial stiffness", axial, _with_axial_stiffness),
-        Effect("motor zeros", zeros, part=_with_part("zero", zero)),
-        Effect("taken in", lengths, _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in)),
-        Effect(
+        PossibleEffect("length", numbers_at(nominal, "length", 0.05, logarithmic=True)),
+        PossibleEffect("axial stiffness", axial, _with_axial_stiffness),
+        PossibleEffect("motor zeros", zeros, part=_with_part("zero", zero)),
+        PossibleEffect(
+            "taken in", lengths, _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in)
+        ),
+        PossibleEffect(
             "springs", springs, _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance)
         ),
-        Effect("tendon elasticity", elastic),
+        PossibleEffect("tendon elasticity", elastic),
     ]
     if radii is not None:
         single = numbers_at(nominal, "reels.radius", 0.05, low=1e-6, high=1.0, logarithmic=True)
         common = (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),)
         effects += [
-            Effect("reel radius", common, _with_radius),
-            Effect("reel radii", single, lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii])),
+            PossibleEffect("reel radius", common, _with_radius),
+            PossibleEffect(
+                "reel radii", single, lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii])
+            ),
         ]
     return [*effects, *routing_effects(nominal)]
 
 
-def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def routing_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     """Return effects that move straight tendons about the rod, if the robot states where they run."""
     routing = nominal.routing
     if routing is None or not all(isinstance(tendon, Straight) for tendon in routing):
@@ -97,8 +101,10 @@ def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     )
     single = tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max()))
     return [
-        Effect("routing", together, lambda robot, v: turned(robot, v[0], [v[1]] * len(routing))),
-        Effect("routing by motor", single, lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors])),
+        PossibleEffect("routing", together, lambda robot, v: turned(robot, v[0], [v[1]] * len(routing))),
+        PossibleEffect(
+            "routing by motor", single, lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors])
+        ),
     ]
 
 

@@ -13,7 +13,7 @@ from knode_cosserat._reprs import robot_text, wrapped
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.next_experiment import NextExperiment
 from knode_cosserat.identification.posterior import SURE, UNLIKELY, Posterior
-from knode_cosserat.identification.search import Point, Search
+from knode_cosserat.identification.search import ParameterSearch, SearchEnd
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.rods.system import System
 
@@ -90,7 +90,7 @@ class Identified:
     @classmethod
     def of(
         cls,
-        search: Search,
+        search: ParameterSearch,
         x: Float[np.ndarray, " n"],
         names: Sequence[str],
         posterior: Posterior,
@@ -247,7 +247,7 @@ def estimates_of(
     return tuple(estimates)
 
 
-def variance_ratio(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> float:
+def variance_ratio(point: SearchEnd, folds: Sequence[Float[np.ndarray, " n"]]) -> float:
     """Return how much more estimates without one recording scatter than expected, at least 1.
 
     Least squares assumes random differences; those of an incomplete model are systematic, and differ between

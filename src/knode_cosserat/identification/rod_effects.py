@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, Replace, numbers_at
+from knode_cosserat.estimation.parameters import Number, PossibleEffect, Replace, numbers_at
 from knode_cosserat.identification.effects import Usual, along_axes, register
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
@@ -28,25 +28,25 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 @register(order=0)
-def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of the rod."""
     placed = (PLACED_BY_REELS if nominal.drive == "reel" else PLACED) * float(nominal.length)
     return [
         *_stiffness_effects(nominal),
         *_inertia_effects(nominal),
-        Effect("base rotation", along_axes("base_rotation", "rad", 0.05), _rotated, _placed),
-        Effect("base position", along_axes("base_position", "m", placed), _displaced, _placed),
+        PossibleEffect("base rotation", along_axes("base_rotation", "rad", 0.05), _rotated, _placed),
+        PossibleEffect("base position", along_axes("base_position", "m", placed), _displaced, _placed),
     ]
 
 
-def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def _stiffness_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     L = float(nominal.length)
     if nominal.youngs_modulus is None:
         # a factor of the table's stiffness
         modulus = Number("cross_section.stiffness", "", 1.0, 0.5, 1e-3, 1e3, True)
-        stiffness = Effect("stiffness", (modulus,), _with_table, basic=True)
+        stiffness = PossibleEffect("stiffness", (modulus,), _with_table, basic=True)
     else:
-        stiffness = Effect(
+        stiffness = PossibleEffect(
             "stiffness", numbers_at(nominal, "youngs_modulus", 0.5, logarithmic=True), basic=True
         )
     curvature = along_axes("curvature", "1/m", 0.3 / L, "xy")
@@ -57,17 +57,17 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     )
     effects = [
         stiffness,
-        Effect("rest curvature", (*curvature, *slope), _with_curvature, _stretchable),
-        Effect("taper", (Number("taper", "", 0.0, 0.4, -1.8, 1.8),), _with_taper, _stretchable),
-        Effect("sleeve", sleeve, _with_sleeve, _sleeved, usual=True),
+        PossibleEffect("rest curvature", (*curvature, *slope), _with_curvature, _stretchable),
+        PossibleEffect("taper", (Number("taper", "", 0.0, 0.4, -1.8, 1.8),), _with_taper, _stretchable),
+        PossibleEffect("sleeve", sleeve, _with_sleeve, _sleeved, usual=True),
     ]
     if nominal.youngs_modulus is not None:
         axes = tuple(Number(label, "", 0.0, 0.1, -0.9, 0.9) for label in ("anisotropy", "anisotropy_turned"))
-        effects.append(Effect("stiffness axes", axes, _with_axes))
+        effects.append(PossibleEffect("stiffness axes", axes, _with_axes))
     return effects
 
 
-def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def _inertia_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     """Return the effects of damping, drag and masses."""
     L, EI = float(nominal.length), float(nominal.Kbt[0, 0])
     masses = [(k, float(load.mass)) for k, load in enumerate(nominal.loads) if isinstance(load, AttachedMass)]
@@ -86,20 +86,22 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     added = Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1)
     if nominal.density is None:
         lines = numbers_at(nominal, "cross_section.mass_per_length", 0.1, logarithmic=True)
-        along = Effect("mass along the rod", lines, Replace(("cross_section.mass_per_length",), "multiple"))
+        along = PossibleEffect(
+            "mass along the rod", lines, Replace(("cross_section.mass_per_length",), "multiple")
+        )
     else:
-        along = Effect("mass along the rod", numbers_at(nominal, "density", 0.1, logarithmic=True))
+        along = PossibleEffect("mass along the rod", numbers_at(nominal, "density", 0.1, logarithmic=True))
     effects = [
-        Effect("damping", (viscous,), basic=True),
-        Effect("creep", creep, part=_relaxing),
-        Effect("linear drag", linear, part=_draggable, usual=True),
-        Effect("square drag", square),
-        Effect("tip mass", (added,), tip, _with_tip_mass),
+        PossibleEffect("damping", (viscous,), basic=True),
+        PossibleEffect("creep", creep, part=_relaxing),
+        PossibleEffect("linear drag", linear, part=_draggable, usual=True),
+        PossibleEffect("square drag", square),
+        PossibleEffect("tip mass", (added,), tip, _with_tip_mass),
         along,
     ]
     ribs = [f"loads.{k}.mass" for k, mass in masses if mass > 0.0]
     known = [it for path in ribs for it in numbers_at(nominal, path, 0.3, logarithmic=True)]
-    return [*effects, Effect("rib masses", tuple(known))] if known else effects
+    return [*effects, PossibleEffect("rib masses", tuple(known))] if known else effects
 
 
 # parts that effects change, where a robot lacks them

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, numbers_at
+from knode_cosserat.estimation.parameters import Number, PossibleEffect, numbers_at
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
@@ -19,7 +19,7 @@ UNBOUNDED = {"low": -np.inf, "high": np.inf}
 
 
 @register(order=1)
-def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of tendons; a robot with reels has only those that it states."""
     pulled = nominal.drive != "reel"
     return [
@@ -30,13 +30,13 @@ def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
     ]
 
 
-def _place_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def _place_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     offset = Number("tendon_offset", "m", float(nominal.tendon_offset) or 1e-3, 0.1, 1e-5, 1.0, True)
     twisted = nominal.replace(tendon_twist=nominal.tendon_twist or 0.0)
     return [
-        Effect("tendon offset", (offset,), usual=True),
-        Effect("tendon angles", numbers_at(nominal, "tendon_angles", 0.06, **UNBOUNDED)),
-        Effect(
+        PossibleEffect("tendon offset", (offset,), usual=True),
+        PossibleEffect("tendon angles", numbers_at(nominal, "tendon_angles", 0.06, **UNBOUNDED)),
+        PossibleEffect(
             "tendon twist",
             numbers_at(twisted, "tendon_twist", 0.06, **UNBOUNDED),
             part=lambda robot: robot.replace(tendon_twist=robot.tendon_twist or 0.0),
@@ -44,25 +44,25 @@ def _place_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     ]
 
 
-def _load_cell_effects(nominal: RoutedTendonRobot, tension: float) -> list[Effect]:
+def _load_cell_effects(nominal: RoutedTendonRobot, tension: float) -> list[PossibleEffect]:
     cells = _with_cells(nominal)
     gain = numbers_at(cells, "load_cells.gain", 0.05, low=0.1, high=10.0, logarithmic=True)
     # of a usual size: a few samples of 20 to 50 Hz
     late = numbers_at(cells, "load_cells.latency", 0.02, low=-0.2, high=0.2)
     share = numbers_at(_anchored(nominal), "anchors.share", 0.5, nominal=1.0, low=0.0, high=1.0, begin=-0.3)
     return [
-        Effect("load cell gains", gain, part=_with_cells),
-        Effect(
+        PossibleEffect("load cell gains", gain, part=_with_cells),
+        PossibleEffect(
             "load cell offsets",
             numbers_at(cells, "load_cells.offset", 0.03 * tension, **UNBOUNDED),
             part=_with_cells,
         ),
-        Effect("early anchors", share, part=_anchored),
-        Effect("latency", late, part=_with_cells, of_recordings=True),
+        PossibleEffect("early anchors", share, part=_anchored),
+        PossibleEffect("latency", late, part=_with_cells, of_recordings=True),
     ]
 
 
-def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[Effect]:
+def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[PossibleEffect]:
     L, stated = float(nominal.length), nominal.rib_spacing
     if nominal.drive == "reel" and stated is None:
         return []
@@ -79,11 +79,14 @@ def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[
     usual = (0.2 * L) ** 2 / 12.0
     softening = numbers_at(ribbed(nominal), "rib_spacing.softening", usual, high=L**2, begin=0.3)
     share = numbers_at(ribbed(nominal), "rib_spacing.share", 0.5, begin=0.5)
-    effects = [Effect("rib spacing", softening, part=ribbed), Effect("rib spans", share, part=ribbed)]
+    effects = [
+        PossibleEffect("rib spacing", softening, part=ribbed),
+        PossibleEffect("rib spans", share, part=ribbed),
+    ]
     return effects if ribs.at is not None else effects[:1]
 
 
-def _friction_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def _friction_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return friction, and its loss where tensions are measured."""
     L, rubbing = float(nominal.length), _rubbing(nominal)
     known = rubbing.friction
@@ -103,9 +106,9 @@ def _friction_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         Number("vibration.softening", "m2", 0.0, (0.1 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),
     )
     effects = [
-        Effect("friction", friction, part=_rubbing, usual=True),
-        Effect("friction by curvature", curvature, part=_rubbing, needs=("friction",), usual=True),
-        Effect("vibration", vibration, part=_vibrating, needs=("friction",), usual=True),
+        PossibleEffect("friction", friction, part=_rubbing, usual=True),
+        PossibleEffect("friction by curvature", curvature, part=_rubbing, needs=("friction",), usual=True),
+        PossibleEffect("vibration", vibration, part=_vibrating, needs=("friction",), usual=True),
     ]
     return effects if nominal.drive != "reel" else effects[:2]
 
