@@ -1,12 +1,8 @@
 """Recordings of simulated robots, for tests of identification."""
 
-from types import SimpleNamespace
-
 import numpy as np
 
 import knode_cosserat as kc
-from knode_cosserat.identification import predict
-from knode_cosserat.learning.ensemble import Prediction
 from knode_cosserat.rotation import since_first
 
 DT = 0.025
@@ -53,12 +49,3 @@ def measured(robot, true_tension, source, *, seed=0, noise=NOISE, reading=None, 
         source=source,
         initial_tension=seen[0],
     )
-
-
-def coverage(members, rows, level=0.9):
-    """The part of the measured positions within the interval of several robots."""
-    predicted = []
-    for robot in members:
-        nodes = np.round(FRACTIONS * (robot.nodes - 1)).astype(int)
-        predicted.append(SimpleNamespace(position=np.asarray(predict(robot, rows).position)[:, nodes]))
-    return Prediction(predicted).coverage(rows, level, first=0)

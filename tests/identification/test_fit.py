@@ -7,14 +7,14 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification.effects import library_model
-from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.evaluate import coverage, evaluate
 from knode_cosserat.identification.experiments import poses_of_nodes
 from knode_cosserat.identification.fit import coordinates_of, fit
 from knode_cosserat.identification.residual import PositionErrors, _verdict
 from knode_cosserat.identification.result import Estimate, Identified
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.rods.routing import Polynomial
-from tests.identification.recorded import DT, coverage, measured, tensions
+from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
     length=0.5, radius=0.003, density=1200.0, youngs_modulus=2.0e9, tendon_offset=0.025,

@@ -7,14 +7,14 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification.effects import library_model
-from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification.evaluate import coverage, evaluate
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.section import Sleeve, Stretch
 from knode_cosserat.rods.tendons import LoadCells, RibSpacing, TendonFriction
 from knode_cosserat.solvers.segments import DataError
-from tests.identification.recorded import DT, coverage, measured, tensions
+from tests.identification.recorded import DT, measured, tensions
 
 #: as ruler, scale and data sheet have it: lying along z, with gravity across
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(

@@ -18,7 +18,7 @@ from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.solvers.segments import DataError
-from tests.identification.motions import DT, FOUR, ROBOT, noisy, sines
+from tests.identification.motions import DT, FOUR, ROBOT, noisy, require_exact_slopes, sines
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 pytestmark = pytest.mark.slow
@@ -305,16 +305,6 @@ class Hanging(Bar):
 
 class GuessedRest(Ends, of=Hanging):
     rest_is_guess = True
-
-
-def require_exact_slopes(misfit, size):
-    at, h = np.zeros(size), 1e-4
-    (here,) = misfit.differences(at)
-    for k, along in enumerate(h * np.eye(size)):
-        (high,), (low,) = (misfit.differences(at + sign * along) for sign in (1.0, -1.0))
-        expected = (high.values - low.values) / (2.0 * h)
-        largest = np.nanmax(np.abs(expected))
-        np.testing.assert_allclose(here.derivatives[k], expected, atol=1e-6 * largest, rtol=1e-6)
 
 
 @pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "lobatto4"])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import types
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import jax
@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.identification.steps import simulated_rows
+from knode_cosserat.learning.ensemble import Prediction
 from knode_cosserat.metrics import dtw_distance, pose_mse, rotation_rmse
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -76,6 +77,35 @@ class Evaluation:
         if self.extrapolated:
             parts.append(f"{self.extrapolated:.0%} of the rows extrapolated")
         return ", ".join(parts)
+
+
+def coverage(
+    members: Iterable[System], measured: Recording | Measurements, level: float = 0.9, *,
+    space: str | SpaceScheme = "lobatto4",
+) -> float:  # fmt: skip
+    """Return the fraction of the measured positions within the spread of several models.
+
+    Each starts in its own equilibrium under the initial tensions. The interval contains one more model with
+    the given probability (Student's t), as in `Prediction.interval`; the first row is not counted.
+
+    Args:
+        members: at least two models, such as an `Ensemble`.
+        measured: a recording, or its rows.
+        level: probability.
+        space: the scheme along the rod.
+
+    Raises:
+        SimulationError: a member has no solution.
+        ValueError: there are fewer than two members.
+    """
+    check_arguments(coverage, locals())
+    measured = Measurements.of(measured)
+    predicted = list[Any]()
+    for robot in members:
+        moved = predict(robot, measured, space=space, recovery=RECOVERY)
+        places = places_on(robot, measured.fractions)
+        predicted.append(types.SimpleNamespace(position=positions_at(robot, np.asarray(moved.y), places)))
+    return Prediction(predicted).coverage(measured, level, first=0)
 
 
 def predict(

@@ -322,19 +322,19 @@ def of_trajectory(trajectory: Trajectory, robot: System, name: str) -> Experimen
         )
     settings, output = trajectory.settings or Settings(), States.of(robot)
     data = np.concatenate([y.reshape(len(y), -1), z.reshape(len(z), -1)], axis=1)
-    if trajectory.time[0] == 0.0:
-        held = control[0]
-        if begins_unstressed(trajectory):
-            data[0] = np.nan
-            return Experiment(trajectory.dt, control[1:], output, data, None, "unstressed", settings, name)
-        return Experiment(trajectory.dt, control[1:], output, data, held, "equilibrium", settings, name)
-    first = 3  # the first row with the whole history of its scheme
-    if len(y) <= first:
-        raise DataError(f"{name} has {len(y)} rows and does not start at rest; at least 4 are needed")
+    first, held = 1, control[0]
+    initial: Any = "equilibrium"
+    if trajectory.time[0] != 0.0:
+        first, held = 3, None  # the first row with the whole history of its scheme
+        if len(y) <= first:
+            raise DataError(f"{name} has {len(y)} rows and does not start at rest; at least 4 are needed")
+        initial = trajectory[:first]
+    elif begins_unstressed(trajectory):
+        held, initial = None, "unstressed"
     data = data[first - 1 :]
-    data[0] = np.nan
-    initial = trajectory[:first]
-    return Experiment(trajectory.dt, control[first:], output, data, None, initial, settings, name)
+    if held is None:
+        data[0] = np.nan
+    return Experiment(trajectory.dt, control[first:], output, data, held, initial, settings, name)
 
 
 def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:

@@ -170,7 +170,7 @@ def with_residual(
     begin = np.zeros(both.size)
     begin[: np.sum(model.mask(effects))] = x[model.mask(effects)]
     data = experiments_of(measured, model, space)
-    return learn_residual(both, begin, data, space, progress or log.info)
+    return learn_residual(both, begin, data, space, Journal(progress or log.info))
 
 
 def coordinates_of(model: ParameterModel, identified: Identified) -> np.ndarray:

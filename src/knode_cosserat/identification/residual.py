@@ -135,7 +135,7 @@ def learn_residual(
     begin: Float[np.ndarray, " n"],
     data: Sequence[Experiment],
     space: str | SpaceScheme,
-    tell: Callable[[str], None],
+    journal: Journal,
 ) -> LearnedResidual:
     """Learn a residual on an identified robot from at least two recordings.
 
@@ -144,13 +144,13 @@ def learn_residual(
         begin: coordinates of the identified robot without a residual.
         data: recordings of one length.
         space: the scheme along the rod.
-        tell: called with a line of progress.
+        journal: course of the search.
 
     Raises:
         SearchError: the identified robot cannot be simulated.
     """
     misfit = Misfit(model, data)
-    search = ParameterSearch(misfit, Journal(tell))
+    search = ParameterSearch(misfit, journal)
     rollouts = search.solved(begin)
     if rollouts is None:
         raise SearchError("the identified robot cannot be simulated")
@@ -163,7 +163,7 @@ def learn_residual(
     point = SearchEnd(begin, scale, problem, model.mask(identified), search.prior)
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
-    before, steps = [fold.errors for fold in without], list[str]()
+    before = [fold.errors for fold in without]
     recordings = [experiment.name for experiment in data]
     tested: dict[float, list[PositionErrors]] = {}
 
@@ -172,15 +172,17 @@ def learn_residual(
         after = tested.get(fraction or 1.0, ())
         without_it, with_it = (dict(zip(recordings, it, strict=False)) for it in (before, after))
         covariance = _widened(end, folds)
-        return LearnedResidual(model, x, covariance, fraction > 0.0, without_it, with_it, tuple(steps))
+        return LearnedResidual(
+            model, x, covariance, fraction > 0.0, without_it, with_it, tuple(journal.steps)
+        )
 
     if not widths:
-        steps.append("no part of a residual promises a lower error of held-out recordings")
+        journal.step("no part of a residual promises a lower error of held-out recordings")
     while widths:
         prior = np.ones(model.size)
         for part, width in widths.items():
             prior[model.slice(f"{RESIDUAL}.{part}")] = width**-2
-        wider = ParameterSearch(misfit, search.journal, prior)
+        wider = ParameterSearch(misfit, journal, prior)
         mask = model.mask([*identified, *(f"{RESIDUAL}.{part}" for part in widths)])
         free = dataclasses.replace(point, free=mask, prior=wider.prior)
         folds = [
@@ -191,15 +193,14 @@ def learn_residual(
         tested = _shrunk_errors(search, without, folds) if len(folds) == len(without) else {}
         fraction, words = _verdict(before, tested)
         listed = ", ".join(f"{part} x {width:g}" for part, width in widths.items())
-        steps.append(f"residual ({listed}): {words}")
-        tell(steps[-1])
+        journal.step(f"residual ({listed}): {words}")
         if fraction:
             end = wider.run(begin, mask, effort=FINE, scale=scale)
             x = begin + fraction * (end.x - begin)
             reason = failed_trial(model.robot(x), data, space)
             if reason is None:
                 return learned(x, end, folds, fraction)
-            steps.append(f"not accepted: {reason}")
+            journal.step(f"not accepted: {reason}")
         widths = dict(list(widths.items())[: len(widths) // 2])
     return learned(begin, point, without, 0.0)
 
