@@ -18,9 +18,9 @@ from knode_cosserat.figures.comparison import METHODS as LOOKS
 from knode_cosserat.figures.comparison import REFERENCE, legend_below, require_some
 from knode_cosserat.figures.drawing import equal_scales
 from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
+from knode_cosserat.identification import IdentificationError, identify
 from knode_cosserat.identification.evaluate import Evaluation, compared, predict
 from knode_cosserat.identification.fit import fit as learn
-from knode_cosserat.identification.identify import IdentificationError, identify
 from knode_cosserat.learning.config import FitConfig, FitError
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.recordings.config import RecordingConfig

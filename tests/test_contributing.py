@@ -13,7 +13,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification import effects, reel_effects, rod_effects, tendon_effects
-from knode_cosserat.identification.effects import Effect, along_axes, register
+from knode_cosserat.identification.effects import PossibleEffect, along_axes, register
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = re.findall(
@@ -36,7 +36,7 @@ def tilt(monkeypatch):
     @register()
     def tilt_effects(nominal, usual):
         """Return the effect of a table that is not level."""
-        return [Effect("tilt", "gravity across the rod", along_axes("gravity", "m/s2", 0.5, "xy"), tilted)]
+        return [PossibleEffect("tilt", along_axes("gravity", "m/s2", 0.5, "xy"), tilted)]
 
 
 def test_each_way_to_extend_the_package_has_an_example():

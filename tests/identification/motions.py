@@ -55,3 +55,14 @@ def as_measured(trajectories: list[kc.Trajectory], noise: float, seed: int) -> l
                 )
         result.append(dataclasses.replace(each, y=y, z=np.full_like(each.z, np.nan)))
     return result
+
+
+def require_exact_slopes(misfit: Any, size: int, rtol: float = 1e-6) -> None:
+    """Compare derivatives at the nominal robot with central differences."""
+    at, h = np.zeros(size), 1e-4
+    (here,) = misfit.differences(at)
+    for k, along in enumerate(h * np.eye(size)):
+        (high,), (low,) = (misfit.differences(at + sign * along) for sign in (1.0, -1.0))
+        expected = (high.values - low.values) / (2.0 * h)
+        largest = np.nanmax(np.abs(expected))
+        np.testing.assert_allclose(here.derivatives[k], expected, atol=1e-6 * largest, rtol=rtol)

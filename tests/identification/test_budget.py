@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification.search import OutOfTimeError, Search
+from knode_cosserat.identification import journal
+from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError
+from knode_cosserat.identification.search import ParameterSearch
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
 from tests.identification.test_journal import FREE, Curve
 from tests.identification.test_selection import ROWS
 
-IDENTIFY, SEARCH = (
-    importlib.import_module(f"knode_cosserat.identification.{it}") for it in ("identify", "search")
-)
+IDENTIFY = importlib.import_module("knode_cosserat.identification.identify")
 
 
 class Clock:
@@ -39,8 +39,7 @@ class Clock:
 @pytest.fixture
 def use(monkeypatch):
     def used(clock):
-        for module in (IDENTIFY, SEARCH):
-            monkeypatch.setattr(module, "clock", clock)
+        monkeypatch.setattr(journal, "clock", clock)
         return clock
 
     return used
@@ -48,19 +47,20 @@ def use(monkeypatch):
 
 def test_nothing_is_solved_after_the_deadline(use):
     use(Clock())
-    search = Search(Curve(), deadline=60.0)
+    search = ParameterSearch(Curve(), Journal(minutes=1.0))
     end = search.run(np.zeros(3), FREE)
-    assert search.last is end
+    assert search.journal.last == (search, end)
     use(Clock(calls=2))
     with pytest.raises(OutOfTimeError):
         search.run(np.zeros(3), FREE)
-    assert search.last is end
+    assert search.journal.last == (search, end)
 
 
 def _run(monkeypatch, clock, stages):
     """Begin some stages in place of a search; the last one may be an interruption."""
 
-    def staged(search, course, *_):
+    def staged(searched, *_):
+        course = searched(NOMINAL).journal
         for stage in stages:
             if stage is KeyboardInterrupt:
                 raise KeyboardInterrupt
@@ -68,26 +68,28 @@ def _run(monkeypatch, clock, stages):
             if stage == "trials":
                 course.result = kc.identification.Identified(TRUE)
 
-    monkeypatch.setattr(IDENTIFY, "Search", lambda misfit, *_, **__: Search(Curve()))
+    monkeypatch.setattr(
+        IDENTIFY, "ParameterSearch", lambda misfit, journal: ParameterSearch(Curve(), journal)
+    )
     monkeypatch.setattr(IDENTIFY, "Misfit", lambda *_: None)
-    monkeypatch.setattr(IDENTIFY, "_with_effects", staged)
+    monkeypatch.setattr(IDENTIFY, "identify_effects", staged)
     return kc.identify(NOMINAL, [ROWS], minutes=1.0, progress=clock.tell)
 
 
-@pytest.mark.parametrize("stage", IDENTIFY.STAGES)
+@pytest.mark.parametrize("stage", STAGES)
 def test_a_result_says_what_was_not_done(monkeypatch, use, stage):
     clock = use(Clock(f", {stage}"))
-    found = _run(monkeypatch, clock, IDENTIFY.STAGES)
+    found = _run(monkeypatch, clock, STAGES)
     assert not found.complete and not found.to_dict()["complete"]
-    missing = ", ".join(IDENTIFY.STAGES[IDENTIFY.STAGES.index(stage) :])
+    missing = ", ".join(STAGES[STAGES.index(stage) :])
     assert found.steps[-1] == f"not complete, the time is over; not done: {missing}"
-    assert (found.robot is TRUE) == (stage == IDENTIFY.STAGES[-1])
+    assert (found.robot is TRUE) == (stage == STAGES[-1])
     assert clock.lines[0] == "stage 1 of 6, first answer, 60 s left"
 
 
 def test_the_best_robot_belongs_to_an_interruption(monkeypatch, use):
     with pytest.raises(KeyboardInterrupt) as stopped:
-        _run(monkeypatch, use(Clock()), [*IDENTIFY.STAGES, KeyboardInterrupt])
+        _run(monkeypatch, use(Clock()), [*STAGES, KeyboardInterrupt])
     assert stopped.value.best.robot is TRUE and "interrupted" in stopped.value.best.steps[-1]
 
 
@@ -102,7 +104,7 @@ def test_a_budget_ends_in_each_stage_and_a_later_run_resumes(tmp_path, use):
     given = [
         measured(TRUE, tensions(kind, 2.0, seed=k), f"r{k}", seed=k) for k, kind in enumerate((1.0, "random"))
     ]
-    for stage in IDENTIFY.STAGES:
+    for stage in STAGES:
         clock = use(Clock(f", {stage}"))
         found = kc.identify(NOMINAL, given, minutes=1.0, progress=clock.tell, checkpoint=tmp_path)
         assert found.steps[-1].startswith("not complete") and stage in found.steps[-1]

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from knode_cosserat.identification.information import Problem
+from knode_cosserat.identification.information import NormalEquations
 from knode_cosserat.identification.result import variance_ratio
-from knode_cosserat.identification.search import Point
+from knode_cosserat.identification.search import SearchEnd
 
 SIZE, RECORDINGS = 30, 3
 
@@ -13,8 +13,8 @@ SIZE, RECORDINGS = 30, 3
 def point_of(matrices):
     """The end of a search of `SIZE` numbers by linear recordings with these normal equations."""
     count = len(matrices)
-    problem = Problem(np.ones(count), np.ones(count), np.zeros((count, SIZE)), np.array(matrices))
-    return Point(np.zeros(SIZE), np.ones(count), problem, np.ones(SIZE, dtype=bool), np.ones(SIZE))
+    problem = NormalEquations(np.ones(count), np.ones(count), np.zeros((count, SIZE)), np.array(matrices))
+    return SearchEnd(np.zeros(SIZE), np.ones(count), problem, np.ones(SIZE, dtype=bool), np.ones(SIZE))
 
 
 def folds_of(point, correlated, rng):

@@ -9,9 +9,9 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.estimation import BodyPositions
 from knode_cosserat.identification.experiments import Experiment
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Rollout
-from knode_cosserat.identification.search import Search, SearchError, Subset
-from knode_cosserat.learning.training.checkpoint import Checkpoints
+from knode_cosserat.identification.search import ParameterSearch, Subset
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
 
@@ -50,12 +50,12 @@ class Curve:
         chosen = [self.data[k] for k in (range(2) if which is None else which)]
         if self.fails:
             return [None for _ in chosen]
-        return [Rollout(value[:, None] - it.data, lambda which: slope[which]) for it in chosen]
+        return [Rollout(it, value[:, None] - it.data, lambda which: slope[which]) for it in chosen]
 
     def whole(self, x, which=None):
         return self.differences(x, None, which)
 
-    def refined(self, rollouts, x, which=None):
+    def refined(self, rollouts, x):
         return rollouts
 
     def differentiated(self, rollouts, which=None):
@@ -67,7 +67,7 @@ FREE = np.array([True, True, True])
 
 def searched(folder, curve, stop=None):
     """Three searches; the run is interrupted before the one with the number `stop`."""
-    search = Search(curve, journal=None if folder is None else Checkpoints(folder))
+    search = ParameterSearch(curve, Journal(folder=folder))
     ends = []
     for k, which in enumerate((None, [0], [1])):
         if k == stop:

@@ -8,17 +8,17 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.estimation import BaseWrench, Curvatures
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification import Experiment, IdentificationError, identify, search
-from knode_cosserat.identification.effects import parameter_effects
 from knode_cosserat.identification.experiments import experiments_of
+from knode_cosserat.identification.free_parameters import parameter_effects
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.residual import Residual
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.solvers.segments import DataError
-from tests.identification.motions import DT, FOUR, ROBOT, noisy, sines
+from tests.identification.motions import DT, FOUR, ROBOT, noisy, require_exact_slopes, sines
 from tests.learning.bar import BAR, WRONG, Bar, pulled
 
 pytestmark = pytest.mark.slow
@@ -307,23 +307,13 @@ class GuessedRest(Ends, of=Hanging):
     rest_is_guess = True
 
 
-def require_exact_slopes(misfit, size):
-    at, h = np.zeros(size), 1e-4
-    (here,) = misfit.differences(at)
-    for k, along in enumerate(h * np.eye(size)):
-        (high,), (low,) = (misfit.differences(at + sign * along) for sign in (1.0, -1.0))
-        expected = (high.values - low.values) / (2.0 * h)
-        largest = np.nanmax(np.abs(expected))
-        np.testing.assert_allclose(here.derivatives[k], expected, atol=1e-6 * largest, rtol=1e-6)
-
-
 @pytest.mark.parametrize("space", [pytest.param("euler", marks=pytest.mark.campaign), "lobatto4"])
 def test_slopes_of_a_start_that_has_to_be_found_are_exact(space):
     bar = Hanging(**{name: getattr(BAR, name) for name in BAR.parameters()}, nodes=6)
     moved = pulled(1.0, robot=bar, space=space)
     assert moved.y[0, -1, 0] > 1.1
     other = bar.replace(stiffness=25.0)
-    model = Model(other, parameter_effects(other, ["length", "density", "stiffness", "damping"]))
+    model = ParameterModel(other, parameter_effects(other, ["length", "density", "stiffness", "damping"]))
     require_exact_slopes(Misfit(model, experiments_of([moved], model)), 4)
 
 
@@ -333,7 +323,7 @@ def test_slopes_of_a_start_that_has_to_be_found_are_exact(space):
 def test_matrices_and_vectors_as_numbers():
     robot = ROBOT.replace(bending_damping=[0.03, 0.04, 0.05])
     effects = parameter_effects(robot, ["bending_damping", "drag", "gravity", "radius"])
-    model = Model(robot, effects)
+    model = ParameterModel(robot, effects)
     assert model.labels == (
         "bending_damping[0]", "bending_damping[1]", "bending_damping[2]", "drag",
         "gravity[0]", "gravity[1]", "gravity[2]", "radius",

@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from knode_cosserat.estimation.parameters import Effect, Model, Number
+from knode_cosserat.estimation.parameters import Number, ParameterModel, PossibleEffect
 from knode_cosserat.identification.imperfections import nominal_robot
-from knode_cosserat.identification.information import Problem, dispersion
+from knode_cosserat.identification.information import NormalEquations, dispersion
 from knode_cosserat.identification.misfit import Rollout
 from knode_cosserat.identification.posterior import SURE, Posterior
-from knode_cosserat.identification.search import Point
+from knode_cosserat.identification.search import SearchEnd
 
 EFFECTS, ROWS = 8, 60
 
@@ -19,18 +19,18 @@ def model_of(needs=(), count=EFFECTS):
     def effect(k):
         numbers = (Number(f"n{k}", "", 0.0, 1.0),)
         wanted = ("e0",) if k in needs else ()
-        return Effect(f"e{k}", "", numbers, lambda robot, values: robot, needs=wanted)
+        return PossibleEffect(f"e{k}", numbers, lambda robot, values: robot, needs=wanted)
 
-    return Model(nominal_robot(), [effect(k) for k in range(count)])
+    return ParameterModel(nominal_robot(), [effect(k) for k in range(count)])
 
 
 def point_of(slopes, rows, x):
     """The end of a search where rows = slopes @ truth + white noise of deviation one."""
     off = slopes @ x - rows
-    problem = Problem(
+    problem = NormalEquations(
         np.array([off @ off]), np.array([float(len(off))]), (slopes.T @ off)[None], (slopes.T @ slopes)[None]
     )
-    return Point(x, np.ones((1, 1)), problem, np.ones(len(x), dtype=bool), np.ones(len(x)))
+    return SearchEnd(x, np.ones((1, 1)), problem, np.ones(len(x), dtype=bool), np.ones(len(x)))
 
 
 def drawn(rng, model, size):
@@ -85,16 +85,18 @@ def test_an_effect_is_never_without_those_that_it_needs():
 def test_the_shape_of_an_effect_that_is_hardly_there_is_no_evidence_for_it():
     """rows = a curve(s): the evidence against a small a is that without its derivative by the shape s."""
     numbers = Number("a", "", 0.0, 1.0), Number("s", "", 0.0, 1.0, shape=True)
-    model = Model(nominal_robot(), [Effect("bent", "", numbers, lambda robot, values: robot)])
+    model = ParameterModel(nominal_robot(), [PossibleEffect("bent", numbers, lambda robot, values: robot)])
     rng, places, small, shape = np.random.default_rng(6), np.linspace(0.0, 3.0, ROWS), 0.1, 2.0
     rows = rng.normal(size=ROWS)
     curve, slope = np.sin(places + shape), np.cos(places + shape)
     slopes, off = np.stack([curve, small * slope], axis=1), small * curve - rows
-    problem = Problem(
+    problem = NormalEquations(
         np.array([off @ off]), np.array([float(ROWS)]), (slopes.T @ off)[None], (slopes.T @ slopes)[None]
     )
     x = np.array([small, shape])
-    posterior = Posterior.of(model, Point(x, np.ones((1, 1)), problem, np.ones(2, dtype=bool), np.ones(2)))
+    posterior = Posterior.of(
+        model, SearchEnd(x, np.ones((1, 1)), problem, np.ones(2, dtype=bool), np.ones(2))
+    )
     # exact: costs with a = 0 and with the mode, whatever the shape
     at_mode = posterior.mode(["bent"])
     with_it = np.sum((slopes @ (at_mode - x) + off) ** 2) + at_mode @ at_mode
@@ -133,7 +135,7 @@ def test_correlated_rows_count_less(memory):
         noise, values = rng.normal(size=rows) * np.sqrt(1.0 - memory**2), np.zeros(rows)
         for k in range(1, rows):
             values[k] = memory * values[k - 1] + noise[k]
-        rollout = Rollout(values[:, None], lambda which: np.ones((1, rows, 1)))
+        rollout = Rollout(None, values[:, None], lambda which: np.ones((1, rows, 1)))
         found.append(dispersion([rollout], [np.ones(1)], [0.05], np.array([True])))
     assert np.mean(found) == pytest.approx((1.0 + memory) / (1.0 - memory), rel=0.25)
 
@@ -141,5 +143,5 @@ def test_correlated_rows_count_less(memory):
 def test_bodies_that_move_together_count_as_one():
     rng = np.random.default_rng(5)
     values = np.repeat(rng.normal(size=(600, 1)), 4, axis=1)
-    rollout = Rollout(values, lambda which: np.ones((1, 600, 4)))
+    rollout = Rollout(None, values, lambda which: np.ones((1, 600, 4)))
     assert dispersion([rollout], [np.ones(4)], [0.05], np.array([True])) == pytest.approx(4.0, rel=0.25)

@@ -9,7 +9,7 @@ from knode_cosserat.identification.imperfections import nominal_robot
 from knode_cosserat.identification.misfit import Misfit, Rollout
 from knode_cosserat.identification.next_experiment import next_experiment
 from knode_cosserat.identification.posterior import Posterior
-from knode_cosserat.identification.search import LARGEST, Search
+from knode_cosserat.identification.search import LARGEST, ParameterSearch
 from tests.identification.recorded import measured, tensions
 
 NOMINAL = nominal_robot()
@@ -19,7 +19,7 @@ ROWS = measured(NOMINAL, tensions(1.0, 2.0), "one")
 @pytest.fixture(scope="module")
 def search():
     model = library_model(NOMINAL, ROWS.tension, ROWS.fractions)
-    return Search(Misfit(model, [each.rough() for each in experiments_of([ROWS], model)]))
+    return ParameterSearch(Misfit(model, [each.rough() for each in experiments_of([ROWS], model)]))
 
 
 def test_rows_that_depend_on_everything_are_not_used(search):
@@ -27,7 +27,7 @@ def test_rows_that_depend_on_everything_are_not_used(search):
     values, slopes = np.zeros((5, 3)), np.full((search.misfit.model.size, 5, 3), 0.01)
     values[1, 2], slopes[:, 3, 1] = np.nan, 2.0 * LARGEST * search.length
     every = np.ones(len(slopes), dtype=bool)
-    [used] = search.used([Rollout(values, lambda which: slopes[which])], every)
+    [used] = search.used([Rollout(search.misfit.data[0], values, lambda which: slopes[which])], every)
     assert used.sum() == 11 and not used[1, 2] and not used[3].any()
 
 
@@ -44,7 +44,7 @@ def test_the_next_experiment_tells_what_it_promises(search):
     assert "deviation" in str(found)
     # the same experiment, carried out and added to the others
     more = measured(NOMINAL, found.control, "two")
-    both = Search(Misfit(model, [each.rough() for each in experiments_of([ROWS, more], model)]))
+    both = ParameterSearch(Misfit(model, [each.rough() for each in experiments_of([ROWS, more], model)]))
     scale = np.tile(point.scale, (2, 1))
     again = both.run(point.x, model.mask(names), effort=(0, 0.0), scale=scale, equations="all")
     share = point.problem.amount[0] / again.problem.amount[0]

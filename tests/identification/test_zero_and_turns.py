@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.estimation.parameters import Model
-from knode_cosserat.identification.effects import parameter_effects
+from knode_cosserat.estimation.parameters import ParameterModel
+from knode_cosserat.identification.free_parameters import parameter_effects
 from knode_cosserat.rods.parameters import value_at
 
 ends, loads = kc.robots.ends, kc.robots.loads
@@ -32,7 +32,7 @@ def rod(**changes):
 )
 def test_a_quaternion_is_searched_by_its_turn(nominal, turn):
     robot = rod(base_end=ends.Clamped(orientation=nominal))
-    model = Model(robot, parameter_effects(robot, ["base_end.orientation"]))
+    model = ParameterModel(robot, parameter_effects(robot, ["base_end.orientation"]))
     assert model.size == 3 and [it.unit for it in model.numbers] == ["rad"] * 3
     found = Rotation.from_quat(
         np.asarray(value_at(model.robot(np.array(turn)), "base_end.orientation")), scalar_first=True

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat.rods.parameters import ParameterError, owner_at, parameters_of, value_at
+from knode_cosserat.rods.parameters import ParameterError, parameter_at, value_at
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import quaternion_of, quaternion_product
@@ -78,46 +78,72 @@ class Number(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Effect:
+class PossibleEffect:
     """A physical cause, its numbers, and the change that it makes to a robot.
 
-    `part` adds the part that the effect changes to a robot without it. `needs` names effects that it
-    requires. A `basic` effect is always identified. A search with few effects starts with the `usual` ones.
-    An effect `of_recordings` belongs to the recordings, not to the robot.
+    By default the numbers replace the parameters that their labels name (`numbers_at`). `part` adds the part
+    that the effect changes to a robot without it. `needs` names effects that it requires. A `basic` effect is
+    always identified. A search with few effects starts with the `usual` ones. An effect `of_recordings`
+    belongs to the recordings, not to the robot.
     """
 
     name: str
-    meaning: str
     numbers: tuple[Number, ...]
-    apply: Change
+    change: Change = None  # type: ignore[assignment]
     part: Callable[[Any], Any] | None = None
     needs: tuple[str, ...] = ()
     basic: bool = False
     usual: bool = False
     of_recordings: bool = False
 
+    def __post_init__(self) -> None:
+        if self.change is None:
+            paths = tuple(dict.fromkeys(number.label.partition("[")[0] for number in self.numbers))
+            several = self.numbers[0].label.endswith("]")
+            object.__setattr__(self, "change", Replace(paths, "vector" if several else "numbers"))
+
+
+def numbers_at(robot: Any, path: str, width: float, **options: Any) -> tuple[Number, ...]:
+    """Return the numbers of a part's parameter, one for each component, as the part states it.
+
+    Unit, range and nominal value are those of the parameter; a symmetric matrix is one number, its first
+    entry.
+
+    Args:
+        robot: robot that has the part.
+        path: name of the parameter, such as `friction.wobble` or `loads.0.mass`.
+        width: of the prior of each number.
+        options: further fields of each `Number`, such as a narrower range.
+    """
+    stated, value = parameter_at(robot, path), np.asarray(value_at(robot, path), dtype=float)
+    assert stated is not None
+    one: dict[str, Any] = {"unit": stated.unit, "width": width, "low": stated.low, "high": stated.high}
+    labels = [f"{path}[{k}]" for k in range(len(value))] if value.ndim == 1 else [path]
+    values = value if value.ndim == 1 else value.ravel()[:1]
+    return tuple(
+        Number(**one | {"label": label, "nominal": float(at)} | options)
+        for label, at in zip(labels, values, strict=True)
+    )
+
 
 @dataclasses.dataclass(frozen=True)
 class Replace:
     """Replaces parameters by name, such as `youngs_modulus` or `loads.0.mass`; one number each.
 
-    Numbers of one parameter are its components ("vector"), its diagonal (one number or three), the
-    coefficients of a residual, or the first entry of a matrix or list that is multiplied as a whole
-    ("multiple"), or the rotation vector (rad, global frame) that turns a quaternion ("turn"): the size of
-    a quaternion has no effect.
+    Numbers of one parameter are its components or diagonal ("vector"), the coefficients of a residual, the
+    first entry of a matrix or list that is multiplied as a whole ("multiple"), or the rotation vector (rad,
+    global frame) that turns a quaternion ("turn"): the size of a quaternion has no effect.
     """
 
     parameters: tuple[str, ...]
-    kind: Literal["numbers", "vector", "diagonal", "coefficients", "multiple", "turn"] = "numbers"
+    kind: Literal["numbers", "vector", "coefficients", "multiple", "turn"] = "numbers"
 
     def __call__(self, robot: Any, values: list[Any]) -> Any:
         """Return the robot with these values."""
         if self.kind == "numbers":
             return robot.replace(**dict(zip(self.parameters, values, strict=True)))
         name, numbers = self.parameters[0], jnp.stack(values)
-        if self.kind == "diagonal":
-            numbers = jnp.diag(jnp.broadcast_to(numbers, (3,)))
-        elif self.kind == "coefficients":
+        if self.kind == "coefficients":
             numbers = numbers.reshape(np.shape(_stated(robot, name)))
         elif self.kind == "turn":
             numbers = quaternion_product(quaternion_of(numbers), _stated(robot, name))
@@ -165,7 +191,7 @@ class ParametrisedRobot(eqx.Module):
         return robot
 
 
-class Model:
+class ParameterModel:
     """Unknown numbers of one robot, and the robot with them for any coordinates.
 
     Attributes:
@@ -175,7 +201,7 @@ class Model:
         robot: the robot with all effects, a function of coordinates.
     """
 
-    def __init__(self, nominal: System, effects: Iterable[Effect]):
+    def __init__(self, nominal: System, effects: Iterable[PossibleEffect]):
         self.nominal, self.effects = nominal, tuple(effects)
         self.numbers: tuple[Number, ...] = tuple(it for effect in self.effects for it in effect.numbers)
         self.robot = ParametrisedRobot(
@@ -183,7 +209,7 @@ class Model:
             np.array([number.nominal for number in self.numbers], dtype=float),
             np.array([number.width for number in self.numbers], dtype=float),
             tuple(number.logarithmic for number in self.numbers),
-            tuple((effect.apply, len(effect.numbers)) for effect in self.effects),
+            tuple((effect.change, len(effect.numbers)) for effect in self.effects),
         )
 
     @property
@@ -227,7 +253,7 @@ class Model:
         first = sum(len(effect.numbers) for effect in before)
         return slice(first, first + len(self.effect(name).numbers))
 
-    def effect(self, name: str) -> Effect:
+    def effect(self, name: str) -> PossibleEffect:
         """Return the effect of that name."""
         return self.effects[self.names.index(name)]
 
@@ -252,7 +278,7 @@ class Model:
         values = self.robot.values(x) if isinstance(x, jax.core.Tracer) else self.values(x)
         for effect in self.effects:
             if effect.name in names:
-                robot = effect.apply(robot, list(values[self.slice(effect.name)]))
+                robot = effect.change(robot, list(values[self.slice(effect.name)]))
         return robot
 
     def _with_parts(self, names: Sequence[str]) -> Any:
@@ -295,7 +321,9 @@ class _Adaptable(Protocol):
         ...
 
 
-def adapted_model(robot: System, adapted: Sequence[Adapted | str]) -> tuple[Model, Float[np.ndarray, " n"]]:
+def adapted_model(
+    robot: System, adapted: Sequence[Adapted | str]
+) -> tuple[ParameterModel, Float[np.ndarray, " n"]]:
     """Return a robot with adapted parameters, and the drift (n,) of the coordinates in one second.
 
     Coordinates are zero at the robot's values and have deviation one. Positive parameters are logarithmic.
@@ -308,7 +336,7 @@ def adapted_model(robot: System, adapted: Sequence[Adapted | str]) -> tuple[Mode
     for it in adapted:
         choice = Adapted(it) if isinstance(it, str) else it
         choices += _parts_of_residual(robot, choice) if choice.name == RESIDUAL else [choice]
-    model = Model(robot, [_adapted_effect(robot, choice) for choice in choices])
+    model = ParameterModel(robot, [_adapted_effect(robot, choice) for choice in choices])
     if model.size > MOST:
         raise ParameterError(
             f"{model.size} numbers are to be adapted ({', '.join(model.names)}); allowed are at most {MOST}"
@@ -338,7 +366,7 @@ def _stated(robot: System, name: str) -> Any:
     return parts[part]
 
 
-def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
+def _adapted_effect(robot: System, adapted: Adapted) -> PossibleEffect:
     name, deviation = adapted.name, adapted.deviation
     stated = _stated(robot, name)
     try:
@@ -360,20 +388,20 @@ def _adapted_effect(robot: System, adapted: Adapted) -> Effect:
         width = RELATIVE if deviation is None else float(deviation) / (1.0 if value.ndim else first)
         low, high = (first * float(np.exp(end * width)) for end in (-WIDEST, WIDEST))
         numbers = [Number(name, "", first, width, low, high, True)]
-        return Effect(name, name, tuple(numbers), Replace((name,), "multiple" if value.ndim else "numbers"))
+        return PossibleEffect(name, tuple(numbers), Replace((name,), "multiple" if value.ndim else "numbers"))
     if deviation is None and learned:
         deviation = RELATIVE * float(np.sqrt(np.mean(value**2))) or None
     if deviation is None:
         raise ParameterError(f"{name} is {value.tolist()}: give its deviation, in its unit")
     reach, low, high = WIDEST * deviation, -np.inf, np.inf
     if not value.ndim and not learned:
-        owner, last = owner_at(nominal_model(robot), name)
-        known = parameters_of(type(owner))[last]
+        known = parameter_at(nominal_model(robot), name)
+        assert known is not None
         low, high = known.low, known.high
     several = value.ndim == 1 or learned
     numbers = []
     for k, at in enumerate(value.ravel().tolist()):
         ends = max(low, at - reach), min(high, at + reach)
         numbers.append(Number(f"{name}[{k}]" if several else name, "", at, deviation, *ends))
-    replace = Replace((name,), "coefficients" if learned else "vector" if several else "numbers")
-    return Effect(name, name, tuple(numbers), replace)
+    effect = PossibleEffect(name, tuple(numbers))
+    return dataclasses.replace(effect, change=Replace((name,), "coefficients")) if learned else effect

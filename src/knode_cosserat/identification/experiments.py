@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, Several, States
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
@@ -87,6 +87,19 @@ class Experiment:
             return np.full(self.data.shape[1], self.output.sigma)
         return self.output.noise
 
+    def positions(self, rows: Float[np.ndarray, "rows w"]) -> Float[np.ndarray, "rows M d"] | None:
+        """Return the positions in rows of data, or their errors in rows of errors; None: there are none."""
+        outputs: tuple[Any, ...] = getattr(self.output, "outputs", (self.output,))
+        output, *others = outputs
+        if isinstance(output, States):
+            where = np.flatnonzero([label == "p" for label in output.labels])
+            return rows[:, where].reshape(len(rows), output.nodes, -1) if len(where) else None
+        if not output.labels[0].startswith("position"):
+            return None
+        errors = rows.shape[1] == len(self.noise)
+        width = rows.shape[1] - sum(len(it.noise) if errors else it.size for it in others)
+        return rows[:, :width].reshape(len(rows), len(output.fractions), -1)[..., :3]
+
     @property
     def is_resolved(self) -> bool:
         """True if time steps follow a continuous signal, so that shorter ones are nearer to the robot."""
@@ -115,32 +128,12 @@ class Experiment:
         )
 
 
-def experiments_of(data: Any, model: Model, space: str | SpaceScheme = "lobatto4") -> list[Experiment]:
-    """Return the experiments of recordings, measurements, trajectories or experiments.
-
-    Those of measurements have one length, so that they share compiled programs.
+def listed_rows(data: Any) -> list[Measurements | Trajectory | Experiment]:
+    """Return data in a list, recordings as rows with mean tensions.
 
     Raises:
-        DataError: data that do not fit the robot or each other, are too short or not finite.
+        DataError: anything else, or time steps of recordings that differ.
     """
-    rows = listed_rows(data)
-    measured = [it for it in rows if isinstance(it, Measurements)]
-    same_steps(measured)
-    names = iter(names_of(measured))
-    experiments = [
-        it if isinstance(it, Experiment)
-        else of_measurements(it, model, next(names), space) if isinstance(it, Measurements)
-        else of_trajectory(it, model.nominal, f"trajectory {k}")
-        for k, it in enumerate(rows)
-    ]  # fmt: skip
-    if len(measured) < len(rows):
-        return experiments
-    longest = max(len(it.control) for it in experiments)
-    return [it.padded(longest) for it in experiments]
-
-
-def listed_rows(data: Any) -> list[Any]:
-    """Return data in a list, recordings as rows with mean tensions; `DataError` for anything else."""
     if isinstance(data, str | Recording | Measurements | Trajectory | Experiment) or not isinstance(
         data, Sequence
     ):
@@ -154,6 +147,9 @@ def listed_rows(data: Any) -> list[Any]:
                 f"data holds a {type(it).__name__}; allowed is what load_recording returns, its "
                 "sampled(0.0125, mean=True), or a Trajectory"
             )
+    steps = sorted({it.dt for it in rows if isinstance(it, Measurements)}) or [0.0]
+    if steps[-1] - steps[0] > 1e-9:
+        raise DataError(f"time steps differ: {', '.join(f'{dt:g}' for dt in steps)} s; allowed is one")
     return rows
 
 
@@ -163,15 +159,34 @@ def measured_rows(data: Any) -> list[Measurements]:
     for it in rows:
         if not isinstance(it, Measurements):
             raise DataError(f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of")
-    same_steps(rows)
-    return rows
+    return rows  # type: ignore[return-value]
 
 
-def same_steps(measured: Sequence[Measurements]) -> None:
-    """Raise `DataError` if the time steps differ."""
-    steps = sorted({it.dt for it in measured}) or [0.0]
-    if steps[-1] - steps[0] > 1e-9:
-        raise DataError(f"time steps differ: {', '.join(f'{dt:g}' for dt in steps)} s; allowed is one")
+def experiments_of(
+    rows: Sequence[Measurements | Trajectory | Experiment],
+    model: ParameterModel,
+    space: str | SpaceScheme = "lobatto4",
+) -> list[Experiment]:
+    """Return the experiments of measurements, trajectories or experiments.
+
+    Those of measurements have one length, so that they share compiled programs.
+
+    Raises:
+        DataError: data that do not fit the robot, are too short or not finite.
+    """
+    names = iter(names_of([it for it in rows if isinstance(it, Measurements)]))
+    experiments = [
+        it
+        if isinstance(it, Experiment)
+        else of_measurements(it, model, next(names), space)
+        if isinstance(it, Measurements)
+        else of_trajectory(it, model.nominal, f"trajectory {k}")
+        for k, it in enumerate(rows)
+    ]
+    if not all(isinstance(it, Measurements) for it in rows):
+        return experiments
+    longest = max(len(it.control) for it in experiments)
+    return [it.padded(longest) for it in experiments]
 
 
 def names_of(measured: Sequence[Measurements]) -> list[str]:
@@ -181,7 +196,10 @@ def names_of(measured: Sequence[Measurements]) -> list[str]:
 
 
 def of_measurements(
-    measured: Measurements, model: Model, name: str = "recording", space: str | SpaceScheme = "lobatto4"
+    measured: Measurements,
+    model: ParameterModel,
+    name: str = "recording",
+    space: str | SpaceScheme = "lobatto4",
 ) -> Experiment:
     """Return the experiment of measurements, which start in the equilibrium before row 0.
 
@@ -304,19 +322,19 @@ def of_trajectory(trajectory: Trajectory, robot: System, name: str) -> Experimen
         )
     settings, output = trajectory.settings or Settings(), States.of(robot)
     data = np.concatenate([y.reshape(len(y), -1), z.reshape(len(z), -1)], axis=1)
-    if trajectory.time[0] == 0.0:
-        held = control[0]
-        if begins_unstressed(trajectory):
-            data[0] = np.nan
-            return Experiment(trajectory.dt, control[1:], output, data, None, "unstressed", settings, name)
-        return Experiment(trajectory.dt, control[1:], output, data, held, "equilibrium", settings, name)
-    first = 3  # the first row with the whole history of its scheme
-    if len(y) <= first:
-        raise DataError(f"{name} has {len(y)} rows and does not start at rest; at least 4 are needed")
+    first, held = 1, control[0]
+    initial: Any = "equilibrium"
+    if trajectory.time[0] != 0.0:
+        first, held = 3, None  # the first row with the whole history of its scheme
+        if len(y) <= first:
+            raise DataError(f"{name} has {len(y)} rows and does not start at rest; at least 4 are needed")
+        initial = trajectory[:first]
+    elif begins_unstressed(trajectory):
+        held, initial = None, "unstressed"
     data = data[first - 1 :]
-    data[0] = np.nan
-    initial = trajectory[:first]
-    return Experiment(trajectory.dt, control[first:], output, data, None, initial, settings, name)
+    if held is None:
+        data[0] = np.nan
+    return Experiment(trajectory.dt, control[first:], output, data, held, initial, settings, name)
 
 
 def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:

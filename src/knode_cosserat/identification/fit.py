@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import (
@@ -20,10 +20,11 @@ from knode_cosserat.identification.experiments import (
     poses_of_nodes,
 )
 from knode_cosserat.identification.identify import identify
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual, residual_model
 from knode_cosserat.identification.result import Identified
-from knode_cosserat.identification.search import Search, SearchError
+from knode_cosserat.identification.search import ParameterSearch
 from knode_cosserat.learning.config import FitConfig, FitError, PassiveOptions, StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
@@ -169,10 +170,10 @@ def with_residual(
     begin = np.zeros(both.size)
     begin[: np.sum(model.mask(effects))] = x[model.mask(effects)]
     data = experiments_of(measured, model, space)
-    return learn_residual(both, begin, data, space, progress or log.info)
+    return learn_residual(both, begin, data, space, Journal(progress or log.info))
 
 
-def coordinates_of(model: Model, identified: Identified) -> np.ndarray:
+def coordinates_of(model: ParameterModel, identified: Identified) -> np.ndarray:
     """Return the coordinates of an identified robot, by its estimates."""
     values = {it.label: it.value for it in identified.estimates}
     return np.array([it.coordinate(values[it.label]) if it.label in values else 0.0 for it in model.numbers])
@@ -216,8 +217,10 @@ def _with_network(knowledge: System, poses: _Poses, config: FitConfig, tell: Tel
     tension = np.concatenate([it.tension for it in poses.measured])
     options = config.residual
     assert isinstance(options, PassiveOptions)
-    model = residual_model(Model(knowledge, ()), (), passive(knowledge, tension, 0, options.hidden), WIDE)
-    search = Search(Misfit(model, experiments_of(poses.measured, model, poses.space)), tell)
+    model = residual_model(
+        ParameterModel(knowledge, ()), (), passive(knowledge, tension, 0, options.hidden), WIDE
+    )
+    search = ParameterSearch(Misfit(model, experiments_of(poses.measured, model, poses.space)), Journal(tell))
     try:
         point = search.from_far(model.mask(model.names))
     except SearchError as error:

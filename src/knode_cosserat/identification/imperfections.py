@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.parameters import Model
+from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.virtual import commands
@@ -41,7 +41,7 @@ class Imperfect:
     robot: RoutedTendonRobot
     effects: tuple[str, ...]
     values: Mapping[str, float]
-    model: Model
+    model: ParameterModel
     x: Float[np.ndarray, " n"]
 
 

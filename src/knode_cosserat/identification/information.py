@@ -16,7 +16,7 @@ ROBUST = 3.0
 SPACING, ORDER = 0.05, 8
 
 
-class Problem(NamedTuple):
+class NormalEquations(NamedTuple):
     """Normal equations at a point: robust cost, gradient and Gauss-Newton matrix of each recording."""
 
     cost: Float[np.ndarray, " R"]
@@ -35,7 +35,7 @@ def huber(values: Float[np.ndarray, " m"]) -> tuple[np.ndarray, np.ndarray]:
 
 def normal_equations(
     rollouts: Sequence[Rollout], units: Sequence[np.ndarray], thinned: float, which: Bool[np.ndarray, " n"]
-) -> Problem:
+) -> NormalEquations:
     """Return the normal equations of each rollout; a difference counts 1 / `thinned`.
 
     `units` are sizes (e,) of the differences of each rollout. Equations of coordinates that are not among
@@ -51,7 +51,7 @@ def normal_equations(
         weighted = slopes * weights
         sums = cost.sum(), known.sum(), weighted @ scaled[known], weighted @ slopes.T
         parts.append([part / thinned for part in sums])
-    return Problem(*(np.array(part) for part in zip(*parts, strict=True)))
+    return NormalEquations(*(np.array(part) for part in zip(*parts, strict=True)))
 
 
 def dispersion(

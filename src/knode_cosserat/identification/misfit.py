@@ -1,7 +1,7 @@
 """Differences between simulated and measured rows of experiments, and their derivatives.
 
-Every solved step is differentiated by the implicit function theorem (`solvers.sensitivity`), and outputs as
-in the online observers (`estimation.online.errors_along`), also by parameters such as places of bodies.
+Motions and their derivatives come from `solvers.tangent_motion`; outputs are differentiated as in the online
+observers (`estimation.online.errors_along`), also by parameters such as places of bodies.
 """
 
 from __future__ import annotations
@@ -9,9 +9,8 @@ from __future__ import annotations
 import concurrent.futures
 import copy
 import dataclasses
-import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,21 +20,13 @@ from jaxtyping import Bool, Float
 from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.online import errors_along, errors_of, sensitive
 from knode_cosserat.estimation.outputs import Output
-from knode_cosserat.estimation.parameters import Model, ParametrisedRobot
+from knode_cosserat.estimation.parameters import ParameterModel, ParametrisedRobot
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import stepped
-from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.tendons import LoadCells
 from knode_cosserat.rods.wrapped import nominal_model
-from knode_cosserat.schemes.history import StateHistory, at_stages
-from knode_cosserat.schemes.settings import Settings
-from knode_cosserat.solvers.initial import continued_state, initial_state
-from knode_cosserat.solvers.replay import at_one_state
-from knode_cosserat.solvers.rest import constant_history, rest_record, resting_history
-from knode_cosserat.solvers.run import TimeIntegration, run_one, usable_cores
-from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tangents, tangent_time_loop
-from knode_cosserat.solvers.static_run import static_run
-from knode_cosserat.trajectory import Trajectory
+from knode_cosserat.solvers.run import TimeIntegration, usable_cores
+from knode_cosserat.solvers.tangent_motion import start_at, tangent_motion
 
 #: number of points whose accurate differences are kept, and of those whose derivatives are
 KEPT, DIFFERENTIATED = 8, 2
@@ -47,15 +38,19 @@ class Rollout:
     """A simulated experiment: differences from its data in units of the noise; NaN where there are none.
 
     `offset` is what finer time steps add to the differences; it is part of the values. The `key` is that of a
-    `Misfit`.
+    `Misfit`: coordinates, number of the experiment, and rows.
     """
 
     key: Any = None
 
     def __init__(
-        self, values: Float[np.ndarray, "rows e"], tangents: Callable[[Any], np.ndarray], offset: Any = 0.0
+        self,
+        data: Experiment,
+        values: Float[np.ndarray, "rows e"],
+        tangents: Callable[[Any], np.ndarray],
     ):
-        self.plain, self.values, self.offset, self._tangents = values, values + offset, offset, tangents
+        self.data, self.plain, self.values, self._tangents = data, values, values, tangents
+        self.offset: Any = 0.0
         #: derivatives by some coordinates (a mask, or a slice of all), shared by copies
         self._known: list[Any] = []
 
@@ -86,25 +81,10 @@ class Rollout:
         return self._known[1][which[self._known[0]]]
 
 
-class _Start(NamedTuple):
-    """Start of a simulation: record and history, and the tangents of both by the coordinates."""
-
-    #: y and z at the nodes
-    record: Float[Any, "N x"]
-    #: history, or y at all points before a list of equilibria
-    state: Any
-    before: Any
-    #: earlier states that the first step may use, as in `TimeIntegration`
-    known: int
-    sudden: bool
-    #: of tangent systems and the weights of each in each tangent
-    tangents: Callable[[Any, np.ndarray], tuple[Any, StateHistory, Any]]
-
-
 class Misfit:
     """Differences of simulations from data, by the coordinates of a model."""
 
-    def __init__(self, model: Model, data: Sequence[Experiment]):
+    def __init__(self, model: ParameterModel, data: Sequence[Experiment]):
         self.model, self.data = model, tuple(data)
         self._first = True
         self._known_columns: dict[Output, tuple[int, ...]] = {}
@@ -145,46 +125,41 @@ class Misfit:
 
     def whole(self, x: Float[np.ndarray, " n"], which: Sequence[int] | None = None) -> list[Rollout | None]:
         """Return the refined rollouts of whole experiments at a point; None if one failed."""
-        return self.refined(self.differences(x, which=which), x, which)
+        return self.refined(self.differences(x, which=which), x)
 
-    def refined(
-        self, rollouts: Sequence[Rollout | None], x: Float[np.ndarray, " n"],
-        which: Sequence[int] | None = None,
-    ) -> list[Any]:  # fmt: skip
+    def refined(self, rollouts: Sequence[Rollout | None], x: Float[np.ndarray, " n"]) -> list[Any]:
         """Return whole rollouts at a point with the differences of the accurate experiments, as an offset.
 
         Between continuous controls these are extrapolated from half the steps (Richardson), for schemes of
         order two. Derivatives are not refined. Held controls belong to the steps of their scheme.
         """
-        at, chosen = np.asarray(x, dtype=float), range(len(self.data)) if which is None else which
-        targets = {
-            k: self.data[k].accurate or self.data[k]
-            for k, rollout in zip(chosen, rollouts, strict=True)
-            if rollout is not None and (at.tobytes(), k) not in self._accurate
-        }
-        resolved = [k for k, target in targets.items() if target.is_resolved]
+        at = np.asarray(x, dtype=float)
+        new = {it.key[:2]: it.data for it in rollouts if it and it.key[:2] not in self._accurate}
+        targets = {key: data.accurate or data for key, data in new.items()}
         # the longest ones first
-        wanted = [(k, 2) for k in resolved]
-        wanted += [(k, 1) for k, target in targets.items() if target is not self.data[k]]
+        wanted = [(key, 2) for key, target in targets.items() if target.is_resolved]
+        wanted += [(key, 1) for key, target in targets.items() if target is not new[key]]
 
-        def solved(part: tuple[int, int]) -> np.ndarray | None:
+        def solved(part: tuple[Any, int]) -> np.ndarray | None:
             target = targets[part[0]]
             rollout = self._of_one(at, target.replace(steps=part[1] * target.steps), None)
             return None if rollout is None else rollout.values
 
         found = dict(zip(wanted, self._parallel(solved, wanted), strict=True))
         refined = list[Any]()
-        for k, rollout in zip(chosen, rollouts, strict=True):
-            if rollout is not None and k in targets:
-                values, finer = found.get((k, 1), rollout.plain), found.get((k, 2))
+        for rollout in rollouts:
+            if rollout is None:
+                refined.append(None)
+                continue
+            key = rollout.key[:2]
+            if key in targets:
+                values, finer = found.get((key, 1), rollout.plain), found.get((key, 2))
                 if values is not None and finer is not None:
                     values = (4.0 * finer - values) / 3.0
-                if values is not None and (finer is not None or k not in resolved):
-                    self._accurate[at.tobytes(), k] = values
-            values = self._accurate.get((at.tobytes(), k))
-            if rollout is not None and values is not None:
-                rollout = rollout.moved(values - rollout.plain)
-            refined.append(rollout)
+                if values is not None and (finer is not None or not targets[key].is_resolved):
+                    self._accurate[key] = values
+            values = self._accurate.get(key)
+            refined.append(rollout if values is None else rollout.moved(values - rollout.plain))
         self._accurate = dict([*self._accurate.items()][-KEPT * len(self.data) :])
         return refined
 
@@ -198,6 +173,33 @@ class Misfit:
         kept = {key: it for key, it in self._differentiated.items() if key not in new} | new
         self._differentiated = dict([*kept.items()][-DIFFERENTIATED * len(self.data) :])
 
+    def errors(
+        self,
+        x: Float[np.ndarray, " n"],
+        which: Sequence[int] | None = None,
+        after: int | None = None,
+    ) -> list[float | None]:
+        """Return the root mean square error of the last body's position (m), by experiment.
+
+        Where no positions were measured it is that of all differences; None: there is no motion. It is that
+        of the rows `after` so many in motion, or of all.
+        """
+        errors: list[float | None] = []
+        for rollout in self.whole(x, which):
+            if rollout is None:
+                errors.append(None)
+                continue
+            places = rollout.data.positions(rollout.values * rollout.data.noise)
+            squares = rollout.values**2 if places is None else np.sum(places[:, -1] ** 2, axis=-1)
+            squares = squares[0 if after is None else rollout.data.moves + after + 1 :]
+            errors.append(float(np.sqrt(np.nanmean(squares))) if np.isfinite(squares).any() else None)
+        return errors
+
+    def tip_errors(self, x: Float[np.ndarray, " n"]) -> dict[str, float | None]:
+        """Return the error of each experiment by its name; None where no positions were measured."""
+        pairs = zip(self.data, self.errors(x), strict=True)
+        return {it.name: None if it.positions(it.data) is None else error for it, error in pairs}
+
     def _parallel(self, work: Any, items: Sequence[Any]) -> list[Any]:
         if self._first:  # programs are compiled one by one
             return [work(item) for item in items]
@@ -206,65 +208,46 @@ class Misfit:
 
     def _of_one(self, x: np.ndarray, data: Experiment, rows: int | None) -> Rollout | None:
         seen = len(data.control) if rows is None else min(len(data.control), data.moves + rows)
-        steps = seen * data.steps
-        system = self.system(x)
-        start = self._start(system, x, data)
+        system, robot = self.system(x), self.model.robot
+        settings = dataclasses.replace(data.settings, time=None) if data.static else data.settings
+        task = TimeIntegration(
+            settings, 0.0 if data.static else data.dt / data.steps, recovery_budget=RECOVERY
+        )
+        start = start_at(robot, x, system, task, data.held, data.initial)
         if start is None:
             return None
         acting, slope = _acting(system, data)
-        # a search does not read the errors of its motions
-        settings = dataclasses.replace(data.settings, errors=False)
-        task: Any = TimeIntegration(settings, data.dt / data.steps, max(steps, 1), start.known, RECOVERY)
-        if data.static:
-            task = dataclasses.replace(task, settings=dataclasses.replace(settings, time=None), dt=0.0)
-        else:
-            acting = at_stages(system, data.settings, acting, start.before[None], start.sudden)
-        solved_rows, _, cause = run_one(task, system, acting, (start.state, start.before), watch=None)
-        if cause:
+        motion = tangent_motion(task, system, start, acting, seen * data.steps)
+        if motion is None:
             return None
-        size = system.y_layout.size + system.z_layout.size
-        compared = slice(data.steps - 1, steps, data.steps)
-        records = np.concatenate([start.record[None], solved_rows.records[compared, :, :size]])
-
         # outputs of all rows, a quarter, or a sixteenth: few compiled programs serve all horizons
+        records = motion.records[:: data.steps]
         sizes = (-(-len(data.data) // part) for part in (1, 4, 16))
         count = min(size for size in sizes if size >= len(records))
-        seen_data = data.data[:count]
+        seen_data, noise = data.data[:count], data.noise
 
         def filled(rows: np.ndarray) -> np.ndarray:
             return np.concatenate([rows, np.repeat(rows[-1:], count - len(rows), axis=0)])
 
-        noise, stages = data.noise, 1 if data.static else data.settings.stages
-
         def tangents(which: Any) -> np.ndarray:
-            directions, by_latency = _directions(self.model.robot, x)
+            directions, by_latency = _directions(robot, x)
             directions = jax.tree.map(with_moving, directions, self._moving)
             weights = np.eye(len(x))[:, which]
-            d_first, past, d_past = start.tangents(directions, weights)
-            controls = acting[:steps]
-            d_controls = np.zeros((*controls.shape, weights.shape[1]))
+            d_controls = np.zeros((*motion.controls.shape, weights.shape[1]))
             if slope is not None:
-                d_controls = slope[:steps, :, None] * np.asarray(by_latency)[which]
-            at, columns = (system, controls), self._columns(system, data.output, filled(records), seen_data)
-            used = np.isin(np.arange(records[0].size), columns).reshape(records[0].shape)
-            changes = Changes(d_controls, directions, weights, kept=used)
-            solved = tuple(part[: steps * stages] for part in solved_rows.every_stage)
-            if data.static:
-                d_rows = static_tangents(task.settings, solved, at, changes)[0]
-            else:
-                state = TangentState.of(system, data.settings.space, past, *d_past)
-                d_rows = tangent_time_loop(task.coefficients, solved, at, changes, state)[1][0]
+                d_controls = slope[: len(d_controls), :, None] * np.asarray(by_latency)[which]
+            columns = self._columns(system, data.output, filled(records), seen_data)
+            kept = np.isin(np.arange(records[0].size), columns).reshape(records[0].shape)
             # zeros in all other columns: one compiled program serves any coordinates
-            whole = np.zeros((len(records), len(columns), len(x)))
-            whole[:1, :, which] = d_first[None, :, :size][:, used]
-            whole[1:, :, which] = d_rows[stages - 1 :: stages][compared]
+            d_records = np.zeros((len(records), len(columns), len(x)))
+            d_records[:, :, which] = motion.tangents(directions, weights, d_controls, kept)[:: data.steps]
             _, slopes = errors_along(
-                system, data.output, filled(records), filled(whole), seen_data, directions, columns
+                system, data.output, filled(records), filled(d_records), seen_data, directions, columns
             )
             return np.asarray(slopes)[which, : len(records)] / noise
 
         errors = np.asarray(errors_of(system, data.output, filled(records), seen_data))
-        return Rollout(errors[: len(records)] / noise, tangents)
+        return Rollout(data, errors[: len(records)] / noise, tangents)
 
     def _columns(
         self, system: Any, output: Output, records: np.ndarray, measured: np.ndarray
@@ -276,49 +259,6 @@ class Misfit:
         columns = tuple(np.union1d(found, known).astype(int).tolist())
         self._known_columns[output] = columns
         return columns
-
-    def _start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start | None:
-        """Return the start of an experiment; None if there is no equilibrium."""
-        settings, size = data.settings, system.y_layout.size + system.z_layout.size
-        named = not isinstance(data.initial, Trajectory)
-        if data.held is None and not (named and Ends.of(system).rest_is_guess):
-            return self._moving_start(system, x, data)
-        control = (
-            np.zeros(system.control_layout.size) if data.held is None else np.asarray(data.held, dtype=float)
-        )
-        still = dataclasses.replace(settings, time=None)
-        rest, y, cause = static_run(TimeIntegration(still, recovery_budget=RECOVERY), system, control[None])
-        if cause:
-            return None
-        record = np.asarray(rest.records[0][:, :size])
-        past = None if data.static else at_one_state(system, settings, record, control)
-
-        def tangents(directions: Any, weights: np.ndarray) -> Any:
-            held, solved = control[None], (rest.records, rest.unknowns)
-            changes = Changes(np.zeros((*held.shape, weights.shape[1])), directions, weights)
-            d_rows, _, d_records = static_tangents(still, solved, (system, held), changes)
-            return d_rows[0], past, (np.stack([d_records] * data.settings.memory), np.zeros_like(d_records))
-
-        return _Start(record, y if data.static else past, control, 1, True, tangents)
-
-    def _moving_start(self, system: Any, x: np.ndarray, data: Experiment) -> _Start:
-        """Return the start in the unstressed state, or from given rows."""
-        settings = data.settings
-        if not isinstance(data.initial, Trajectory):
-            at_start, rows = initial_state(system, settings), None
-        else:
-            at_start = continued_state(system, data.initial, settings, data.dt)
-            # a control acts on the history only where that is one state
-            one_state = at_start.state.known(settings) == 1
-            rows = (at_start.record, at_start.control) if one_state else (at_start.record,)
-        known, past = at_start.state.known(settings), at_start.state.history
-        record = np.asarray(at_start.record)[:, : system.y_layout.size + system.z_layout.size]
-
-        def tangents(directions: Any, weights: np.ndarray) -> Any:
-            begun, d_record, d_past = _begun(self.model.robot, x, rows, past, settings)
-            return np.asarray(d_record) @ weights, begun, tuple(np.asarray(part) @ weights for part in d_past)
-
-        return _Start(record, past, np.asarray(at_start.control), known, at_start.state.dt is None, tangents)
 
 
 def _cells(system: Any) -> LoadCells | None:
@@ -360,25 +300,3 @@ def _directions(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
         return d_system, jnp.zeros(()) if cells is None else cells.latency
 
     return jax.vmap(along)(jnp.eye(len(x)))
-
-
-@functools.partial(jax.jit, static_argnames="settings")
-def _begun(robot: ParametrisedRobot, x: Any, rows: Any, past: Any, settings: Settings) -> Any:
-    """Return the history of an unstressed robot or of rows, and tangents of record and history.
-
-    `rows` are the record of the last row and, if it is the whole history, its control; None: unstressed.
-    """
-
-    def begun(x: Any) -> Any:
-        system = robot(x)
-        if rows is None:
-            return rest_record(system), resting_history(system, settings)
-        if system.mixed and len(rows) == 2:
-            return rows[0], constant_history(system, settings, *rows, past.t0)
-        return rows[0], past
-
-    def along(direction: Any) -> Any:
-        (_, start), (d_record, d_past) = jax.jvp(begun, (x,), (direction,))
-        return start, d_record, (d_past.records, d_past.rate)
-
-    return jax.vmap(along, out_axes=(None, -1, -1))(jnp.eye(x.shape[0]))

@@ -14,12 +14,12 @@ from jaxtyping import Float
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.posterior import Posterior
-from knode_cosserat.identification.search import Search
-from knode_cosserat.identification.trials import moved
+from knode_cosserat.identification.search import ParameterSearch
+from knode_cosserat.identification.trials import HELD, control_range, moved, random_controls
 from knode_cosserat.schemes.result import SimulationError
 
-#: longest experiment (s), periods of sines (s), and for how long each random control is held (s)
-LONGEST, PERIODS, HELD = 8.0, (1.0, 3.0), 0.4
+#: longest experiment (s), and periods of sines (s)
+LONGEST, PERIODS = 8.0, (1.0, 3.0)
 #: an experiment ends when so much of the information of the longest one is there
 ENOUGH = 0.8
 
@@ -50,7 +50,7 @@ class NextExperiment:
 
 
 def next_experiment(
-    search: Search, posterior: Posterior, x: Float[np.ndarray, " n"], undecided: Sequence[str]
+    search: ParameterSearch, posterior: Posterior, x: Float[np.ndarray, " n"], undecided: Sequence[str]
 ) -> NextExperiment | None:
     """Return the experiment after which the numbers of undecided effects are known best.
 
@@ -82,7 +82,7 @@ def next_experiment(
     misfit.differentiated(rollouts)
     usable = search.used(rollouts, np.ones(model.size, dtype=bool))
     on, known = np.flatnonzero(model.mask(undecided)), point.problem.matrix.sum(axis=0) + np.diag(point.prior)
-    before, [unit] = _deviations(known, on), search.units(point.scale[:1], [0])
+    before, unit = _deviations(known, on), point.scale[0][first.groups]
     # a difference counts as in the recordings
     weight = np.sqrt(point.problem.amount[0] / len(first.data) / len(unit)) / unit
     best: tuple[float, NextExperiment | None] = 0.0, None
@@ -106,7 +106,7 @@ def _deviations(information: np.ndarray, on: np.ndarray) -> np.ndarray:
 
 def _controls(data: Sequence[Experiment], count: int) -> Iterator[tuple[str, np.ndarray]]:
     """Yield words and controls (count, c) within those of the recordings."""
-    low, high = (end([end(it.control, axis=0) for it in data], axis=0) for end in (np.min, np.max))
+    low, high = control_range(data)
     held = low if data[0].held is None else np.asarray(data[0].held)
     time, size = data[0].dt * np.arange(1, count + 1), len(low)
     for k in range(size):
@@ -121,6 +121,4 @@ def _controls(data: Sequence[Experiment], count: int) -> Iterator[tuple[str, np.
             low + swing * (high - low),
         )
     yield "all controls rise together to the highest", held + np.outer(time / time[-1], high - held)
-    hold = max(round(HELD / data[0].dt), 1)
-    drawn = np.random.default_rng(0).uniform(low, high, (-(-count // hold), size))
-    yield f"random controls, new ones every {HELD:g} s", np.repeat(drawn, hold, axis=0)[:count]
+    yield f"random controls, new ones every {HELD:g} s", random_controls(data, count * data[0].dt)

@@ -14,15 +14,15 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.estimation.parameters import Model
-from knode_cosserat.identification.search import Point
+from knode_cosserat.estimation.parameters import ParameterModel
+from knode_cosserat.identification.search import SearchEnd
 
 #: sweeps over all effects, and those at the begin that do not count
 SWEEPS, BURNT = 200, 40
 #: draws of the coordinates
 DRAWS = 4000
-#: an effect is found, or is left out, with this probability
-SURE = 0.95
+#: an effect is found with this probability, and left out below the other one
+SURE, UNLIKELY = 0.95, 1.0 - 0.95
 
 
 @dataclasses.dataclass(frozen=True)
@@ -36,13 +36,13 @@ class Posterior:
         draws: of the coordinates (D, n); None if the effects are known.
     """
 
-    model: Model
-    point: Point
+    model: ParameterModel
+    point: SearchEnd
     probability: dict[str, float]
     draws: Float[np.ndarray, "D n"] | None = None
 
     @classmethod
-    def of(cls, model: Model, point: Point, names: Sequence[str] | None = None) -> Posterior:
+    def of(cls, model: ParameterModel, point: SearchEnd, names: Sequence[str] | None = None) -> Posterior:
         """Return the distribution about the end of a search.
 
         Args:
@@ -181,7 +181,7 @@ class Posterior:
         return self._clipped(np.concatenate(draws))
 
 
-def _with_needs(names: Iterable[str], model: Model, added: bool = True) -> tuple[str, ...]:
+def _with_needs(names: Iterable[str], model: ParameterModel, added: bool = True) -> tuple[str, ...]:
     """Return effects with those that they need, or without those that lack one, in the model's order."""
     present = set(names)
     for effect in model.effects if not added else reversed(model.effects):

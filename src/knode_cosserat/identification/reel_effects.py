@@ -12,7 +12,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, Replace
+from knode_cosserat.estimation.parameters import Number, PossibleEffect, numbers_at
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.routing import Straight
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
@@ -23,7 +23,7 @@ TAKEN_IN, TURN = 0.01, 0.1
 
 
 @register(order=2)
-def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of a robot with reels, or with stated routing."""
     if nominal.drive != "reel":
         return routing_effects(nominal)
@@ -45,59 +45,41 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
         Number(f"taken_in to {end:g} L", "m", float(np.mean(taken_in[ends == end])), TAKEN_IN * L)
         for end in levels
     )
+    springs = tuple(
+        _spring(f"compliance to {end:g} L", float(np.mean(compliance[ends == end])), nominal)
+        for end in levels
+    )
+    unit = "m" if radii is None else "rad"
+    zeros = tuple(
+        Number(f"reels.zero[{k}]", unit, float(zero[k]), float(widths[k])) for k in range(len(zero))
+    )
+    axial = (Number("shear_stiffness", "", 1.0, 1.0, 1e-6, 1e6, True),)
+    elastic = (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),)
     effects = [
-        Effect(
-            "length", "length of the rod", (Number("length", "m", L, 0.05, 1e-3, 20.0, True),),
-            Replace(("length",)),
+        PossibleEffect("length", numbers_at(nominal, "length", 0.05, logarithmic=True)),
+        PossibleEffect("axial stiffness", axial, _with_axial_stiffness),
+        PossibleEffect("motor zeros", zeros, part=_with_part("zero", zero)),
+        PossibleEffect(
+            "taken in", lengths, _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in)
         ),
-        Effect(
-            "axial stiffness", "stiffness against extension and shear over that of the section",
-            (Number("shear_stiffness", "", 1.0, 1.0, 1e-6, 1e6, True),), _with_axial_stiffness,
+        PossibleEffect(
+            "springs", springs, _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance)
         ),
-        Effect(
-            "motor zeros", "angle of each motor at which its reel has taken in nothing",
-            tuple(
-                Number(f"reels.zero[{k}]", "m" if radii is None else "rad", float(zero[k]), float(widths[k]))
-                for k in range(len(zero))
-            ),
-            Replace(("reels.zero",), "vector"), _with_part("zero", zero),
-        ),
-        Effect(
-            "taken in", "length of tendons that is taken in at the motors' zeros, by where they end", lengths,
-            _ByLevel("reels.taken_in", level_of), _with_part("taken_in", taken_in),
-        ),
-        Effect(
-            "springs", "compliance of the springs in series with tendons, by where these end",
-            tuple(
-                _spring(f"compliance to {end:g} L", float(np.mean(compliance[ends == end])), nominal)
-                for end in levels
-            ),
-            _ByLevel("reels.compliance", level_of), _with_part("compliance", compliance),
-        ),
-        Effect(
-            "tendon elasticity", "compliance of all tendons",
-            (_spring("tendon_compliance", float(nominal.tendon_compliance), nominal),),
-            Replace(("tendon_compliance",)),
-        ),
-    ]  # fmt: skip
+        PossibleEffect("tendon elasticity", elastic),
+    ]
     if radii is not None:
-        single = tuple(
-            Number(f"reels.radius[{k}]", "m", float(at), 0.05, 1e-6, 1.0, True) for k, at in enumerate(radii)
-        )
+        single = numbers_at(nominal, "reels.radius", 0.05, low=1e-6, high=1.0, logarithmic=True)
+        common = (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),)
         effects += [
-            Effect(
-                "reel radius", "radius of all reels over the known one",
-                (Number("reels.radius", "", 1.0, 0.2, 0.01, 100.0, True),), _with_radius,
+            PossibleEffect("reel radius", common, _with_radius),
+            PossibleEffect(
+                "reel radii", single, lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii])
             ),
-            Effect(
-                "reel radii", "radius of each reel", single,
-                lambda robot, v: _with_radius(robot, [jnp.stack(v) / radii]),
-            ),
-        ]  # fmt: skip
+        ]
     return [*effects, *routing_effects(nominal)]
 
 
-def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def routing_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     """Return effects that move straight tendons about the rod, if the robot states where they run."""
     routing = nominal.routing
     if routing is None or not all(isinstance(tendon, Straight) for tendon in routing):
@@ -113,20 +95,17 @@ def routing_effects(nominal: RoutedTendonRobot) -> list[Effect]:
             tendons.append(dataclasses.replace(tendon, x=x, y=y))
         return robot.replace(routing=tuple(tendons))
 
-    all_tendons = (
-        Number("routing.offset", "", 1.0, 0.1, 0.01, 100.0, True), Number("routing.turn", "rad", 0.0, TURN)
-    )  # fmt: skip
+    together = (
+        Number("routing.offset", "", 1.0, 0.1, 0.01, 100.0, True),
+        Number("routing.turn", "rad", 0.0, TURN),
+    )
+    single = tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max()))
     return [
-        Effect(
-            "routing", "relative distance of all tendons from the axis, and their rotation about it",
-            all_tendons, lambda robot, v: turned(robot, v[0], [v[1]] * len(routing)),
+        PossibleEffect("routing", together, lambda robot, v: turned(robot, v[0], [v[1]] * len(routing))),
+        PossibleEffect(
+            "routing by motor", single, lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors])
         ),
-        Effect(
-            "routing by motor", "rotation of each motor's tendons, or of each tendon, about the axis",
-            tuple(Number(f"routing.turn[{k}]", "rad", 0.0, 0.5 * TURN) for k in range(motors.max())),
-            lambda robot, v: turned(robot, 1.0, [v[k - 1] for k in motors]),
-        ),
-    ]  # fmt: skip
+    ]
 
 
 @dataclasses.dataclass(frozen=True)

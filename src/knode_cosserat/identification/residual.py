@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from knode_cosserat.estimation.parameters import RESIDUAL, Effect, Model, Number, Replace
+from knode_cosserat.estimation.parameters import RESIDUAL, Number, ParameterModel, PossibleEffect, Replace
 from knode_cosserat.identification.experiments import Experiment
-from knode_cosserat.identification.information import Problem, normal_equations
+from knode_cosserat.identification.information import NormalEquations, normal_equations
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.identification.search import FINE, Point, Search, SearchError, Subset
+from knode_cosserat.identification.search import FINE, ParameterSearch, SearchEnd, Subset
 from knode_cosserat.identification.trials import failed_trial
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import PARTS, POSITIVE, Passive
@@ -59,8 +60,8 @@ class _OfKnowledge:
 
 
 def residual_model(
-    model: Model, names: Sequence[str], residual: Passive, widths: Mapping[str, float] = WIDTHS
-) -> Model:
+    model: ParameterModel, names: Sequence[str], residual: Passive, widths: Mapping[str, float] = WIDTHS
+) -> ParameterModel:
     """Return a model of the named effects, followed by the parts of a residual whose numbers are all zero.
 
     Args:
@@ -70,15 +71,15 @@ def residual_model(
         widths: standard deviations of the priors of the residual's numbers, by part.
     """
     effects = [
-        dataclasses.replace(it, apply=_OfKnowledge(it.apply), part=it.part and _OfKnowledge(it.part))
+        dataclasses.replace(it, change=_OfKnowledge(it.change), part=it.part and _OfKnowledge(it.part))
         for it in model.effects
         if it.name in names
     ]
     for part, value in residual.coefficients().items():
         name, low = f"{RESIDUAL}.{part}", 0.0 if part in POSITIVE else -np.inf
         numbers = [Number(f"{name}[{k}]", "", 0.0, widths[part], low) for k in range(np.size(value))]
-        effects.append(Effect(name, part, tuple(numbers), Replace((name,), "coefficients")))
-    return Model(KNODE(model.nominal, residual), effects)
+        effects.append(PossibleEffect(name, tuple(numbers), Replace((name,), "coefficients")))
+    return ParameterModel(KNODE(model.nominal, residual), effects)
 
 
 class PositionErrors(NamedTuple):
@@ -105,7 +106,7 @@ class LearnedResidual:
         steps: the steps of the search, in words.
     """
 
-    model: Model
+    model: ParameterModel
     x: Float[np.ndarray, " n"]
     covariance: Float[np.ndarray, "n n"]
     kept: bool = True
@@ -130,9 +131,12 @@ class LearnedResidual:
 
 
 def learn_residual(
-    model: Model, begin: Float[np.ndarray, " n"], data: Sequence[Experiment], space: str | SpaceScheme,
-    tell: Callable[[str], None],
-) -> LearnedResidual:  # fmt: skip
+    model: ParameterModel,
+    begin: Float[np.ndarray, " n"],
+    data: Sequence[Experiment],
+    space: str | SpaceScheme,
+    journal: Journal,
+) -> LearnedResidual:
     """Learn a residual on an identified robot from at least two recordings.
 
     Args:
@@ -140,43 +144,45 @@ def learn_residual(
         begin: coordinates of the identified robot without a residual.
         data: recordings of one length.
         space: the scheme along the rod.
-        tell: called with a line of progress.
+        journal: course of the search.
 
     Raises:
         SearchError: the identified robot cannot be simulated.
     """
     misfit = Misfit(model, data)
-    search = Search(misfit, tell)
+    search = ParameterSearch(misfit, journal)
     rollouts = search.solved(begin)
     if rollouts is None:
         raise SearchError("the identified robot cannot be simulated")
     misfit.differentiated(rollouts)
     scale = search.scales_of(rollouts)
     problem = normal_equations(
-        rollouts, search.units(scale), search.thinned(), np.ones(model.size, dtype=bool)
+        rollouts, search.units(scale, rollouts), search.thinned(), np.ones(model.size, dtype=bool)
     )
     identified = [name for name in model.names if not name.startswith(RESIDUAL)]
-    point = Point(begin, scale, problem, model.mask(identified), search.prior)
+    point = SearchEnd(begin, scale, problem, model.mask(identified), search.prior)
     widths = promising(problem, begin, model)
     without = [_fold(search, point, k) for k in range(len(data))]
-    before, steps = [fold.errors for fold in without], list[str]()
+    before = [fold.errors for fold in without]
     recordings = [experiment.name for experiment in data]
     tested: dict[float, list[PositionErrors]] = {}
 
-    def learned(x: np.ndarray, end: Point, folds: Sequence[_Fold], fraction: float) -> LearnedResidual:
+    def learned(x: np.ndarray, end: SearchEnd, folds: Sequence[_Fold], fraction: float) -> LearnedResidual:
         """Return the result with this fraction of the residual; 0: without."""
         after = tested.get(fraction or 1.0, ())
         without_it, with_it = (dict(zip(recordings, it, strict=False)) for it in (before, after))
         covariance = _widened(end, folds)
-        return LearnedResidual(model, x, covariance, fraction > 0.0, without_it, with_it, tuple(steps))
+        return LearnedResidual(
+            model, x, covariance, fraction > 0.0, without_it, with_it, tuple(journal.steps)
+        )
 
     if not widths:
-        steps.append("no part of a residual promises a lower error of held-out recordings")
+        journal.step("no part of a residual promises a lower error of held-out recordings")
     while widths:
         prior = np.ones(model.size)
         for part, width in widths.items():
             prior[model.slice(f"{RESIDUAL}.{part}")] = width**-2
-        wider = Search(misfit, tell, prior)
+        wider = ParameterSearch(misfit, journal, prior)
         mask = model.mask([*identified, *(f"{RESIDUAL}.{part}" for part in widths)])
         free = dataclasses.replace(point, free=mask, prior=wider.prior)
         folds = [
@@ -187,15 +193,14 @@ def learn_residual(
         tested = _shrunk_errors(search, without, folds) if len(folds) == len(without) else {}
         fraction, words = _verdict(before, tested)
         listed = ", ".join(f"{part} x {width:g}" for part, width in widths.items())
-        steps.append(f"residual ({listed}): {words}")
-        tell(steps[-1])
+        journal.step(f"residual ({listed}): {words}")
         if fraction:
             end = wider.run(begin, mask, effort=FINE, scale=scale)
             x = begin + fraction * (end.x - begin)
             reason = failed_trial(model.robot(x), data, space)
             if reason is None:
                 return learned(x, end, folds, fraction)
-            steps.append(f"not accepted: {reason}")
+            journal.step(f"not accepted: {reason}")
         widths = dict(list(widths.items())[: len(widths) // 2])
     return learned(begin, point, without, 0.0)
 
@@ -203,7 +208,9 @@ def learn_residual(
 # parts that promise an improvement
 
 
-def promising(problem: Problem, x: Float[np.ndarray, " n"], model: Model) -> dict[str, float]:
+def promising(
+    problem: NormalEquations, x: Float[np.ndarray, " n"], model: ParameterModel
+) -> dict[str, float]:
     """Return the parts that promise a lower held-out cost, the most promising first, and their widths."""
     identified = [name for name in model.names if not name.startswith(RESIDUAL)]
 
@@ -231,7 +238,7 @@ def promising(problem: Problem, x: Float[np.ndarray, " n"], model: Model) -> dic
 
 
 def held_out(
-    problem: Problem,
+    problem: NormalEquations,
     x: Float[np.ndarray, " n"],
     free: Bool[np.ndarray, " n"],
     bounds: Float[np.ndarray, "2 n"],
@@ -249,7 +256,7 @@ def held_out(
 
 
 def _moves(
-    problem: Problem,
+    problem: NormalEquations,
     x: Float[np.ndarray, " n"],
     free: Bool[np.ndarray, " n"],
     bounds: Float[np.ndarray, "2 n"],
@@ -292,12 +299,12 @@ class _Fold(NamedTuple):
     `over` are the differences of its positions, divided by the standard deviations of the search.
     """
 
-    point: Point | None
+    point: SearchEnd | None
     errors: PositionErrors
     over: Float[np.ndarray, " m"]
 
 
-def _fold(search: Search, point: Point, k: int) -> _Fold:
+def _fold(search: ParameterSearch, point: SearchEnd, k: int) -> _Fold:
     """Leave recording k out."""
     end = search.without(point, k, FOLD)
     rollouts = None if end is None else search.solved(end.x, Subset(None, [k]))
@@ -318,7 +325,7 @@ def _errors(rollout: Rollout) -> PositionErrors:
 
 
 def _shrunk_errors(
-    search: Search, without: Sequence[_Fold], folds: Sequence[_Fold]
+    search: ParameterSearch, without: Sequence[_Fold], folds: Sequence[_Fold]
 ) -> dict[float, list[PositionErrors]]:
     """Return the held-out errors with fractions of the residual."""
     errors = {1.0: [fold.errors for fold in folds]}
@@ -358,7 +365,7 @@ def _verdict(
     return best, words
 
 
-def _widened(point: Point, folds: Sequence[_Fold]) -> Float[np.ndarray, "n n"]:
+def _widened(point: SearchEnd, folds: Sequence[_Fold]) -> Float[np.ndarray, "n n"]:
     """Return the covariance of the free coordinates, as wide as held-out positions are spread."""
     over = np.concatenate([fold.over for fold in folds])
     ratio = np.quantile(over, LEVEL) / NORMAL if len(over) else 1.0

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._reprs import robot_text, wrapped
+from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.next_experiment import NextExperiment
-from knode_cosserat.identification.posterior import SURE, Posterior
-from knode_cosserat.identification.search import Point
+from knode_cosserat.identification.posterior import SURE, UNLIKELY, Posterior
+from knode_cosserat.identification.search import ParameterSearch, SearchEnd
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.rods.system import System
 
@@ -20,6 +21,12 @@ from knode_cosserat.rods.system import System
 LEVEL = 0.95
 #: a number whose uncertainty is more than this part of its prior's is held by the prior
 HELD = 0.8
+
+
+class IdentificationError(KnodeCosseratError, ValueError):
+    """A robot cannot be identified; one line says why."""
+
+    code = "identification"
 
 
 class Estimate(NamedTuple):
@@ -79,6 +86,38 @@ class Identified:
     next_experiment: NextExperiment | None = None
     ensemble: Ensemble | None = None
     complete: bool = True
+
+    @classmethod
+    def of(
+        cls,
+        search: ParameterSearch,
+        x: Float[np.ndarray, " n"],
+        names: Sequence[str],
+        posterior: Posterior,
+        **facts: Any,
+    ) -> Self:
+        """Return the result of a search.
+
+        Args:
+            search: the data, and the model with all effects.
+            x: coordinates of the robot.
+            names: its effects.
+            posterior: probabilities about the end of a search.
+            facts: further attributes.
+        """
+        misfit, estimates = search.misfit, estimates_of(posterior, x, names)
+        shares = {name: it for name, it in posterior.probability.items() if name in names or it >= UNLIKELY}
+        return cls(
+            **{"robot": misfit.model.reduced(x, names)} | facts,
+            effects=tuple(name for name, share in shares.items() if share >= SURE),
+            undecided={name: share for name, share in shares.items() if share < SURE},
+            estimates=estimates,
+            correlation=posterior.correlation([it.label for it in estimates]),
+            nominal_error=misfit.tip_errors(np.zeros(len(x))),
+            error=misfit.tip_errors(x),
+            unexplained=search.unexplained(x),
+            steps=tuple(search.journal.steps),
+        )
 
     def __getitem__(self, label: str) -> Estimate:
         """Return the estimate of a number by its label, such as "youngs_modulus" or "gravity[2]".
@@ -208,7 +247,7 @@ def estimates_of(
     return tuple(estimates)
 
 
-def variance_ratio(point: Point, folds: Sequence[Float[np.ndarray, " n"]]) -> float:
+def variance_ratio(point: SearchEnd, folds: Sequence[Float[np.ndarray, " n"]]) -> float:
     """Return how much more estimates without one recording scatter than expected, at least 1.
 
     Least squares assumes random differences; those of an incomplete model are systematic, and differ between

@@ -8,7 +8,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, Replace
+from knode_cosserat.estimation.parameters import Number, PossibleEffect, Replace, numbers_at
 from knode_cosserat.identification.effects import Usual, along_axes, register
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
@@ -28,62 +28,46 @@ UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
 @register(order=0)
-def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of the rod."""
     placed = (PLACED_BY_REELS if nominal.drive == "reel" else PLACED) * float(nominal.length)
     return [
         *_stiffness_effects(nominal),
         *_inertia_effects(nominal),
-        Effect(
-            "base rotation", "rotation of the clamped end, or of gravity against the frame",
-            along_axes("base_rotation", "rad", 0.05), _rotated, _placed,
-        ),
-        Effect(
-            "base position", "position of the clamped end", along_axes("base_position", "m", placed),
-            _displaced, _placed,
-        ),
-    ]  # fmt: skip
+        PossibleEffect("base rotation", along_axes("base_rotation", "rad", 0.05), _rotated, _placed),
+        PossibleEffect("base position", along_axes("base_position", "m", placed), _displaced, _placed),
+    ]
 
 
-def _stiffness_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def _stiffness_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     L = float(nominal.length)
     if nominal.youngs_modulus is None:
+        # a factor of the table's stiffness
         modulus = Number("cross_section.stiffness", "", 1.0, 0.5, 1e-3, 1e3, True)
-        stiffness = Effect(
-            "stiffness", "factor of the table's stiffness", (modulus,), _with_table, basic=True
-        )
+        stiffness = PossibleEffect("stiffness", (modulus,), _with_table, basic=True)
     else:
-        modulus = Number("youngs_modulus", "Pa", float(nominal.youngs_modulus), 0.5, 1e3, 2e12, True)
-        stiffness = Effect(
-            "stiffness", "Young's modulus", (modulus,), Replace(("youngs_modulus",)), basic=True
+        stiffness = PossibleEffect(
+            "stiffness", numbers_at(nominal, "youngs_modulus", 0.5, logarithmic=True), basic=True
         )
-    curvature = (
-        *along_axes("curvature", "1/m", 0.3 / L, "xy"), *along_axes("curvature_slope", "1/m", 0.6 / L, "xy")
-    )  # fmt: skip
+    curvature = along_axes("curvature", "1/m", 0.3 / L, "xy")
+    slope = along_axes("curvature_slope", "1/m", 0.6 / L, "xy")
     sleeve = (
         Number("sleeve.stiffening", "", 0.0, 1.0, 0.0, 100.0, begin=0.3),
         Number("sleeve.length", "", 0.15, 0.5, 0.01, 0.6, True, shape=True),
     )
-    axes = tuple(Number(label, "", 0.0, 0.1, -0.9, 0.9) for label in ("anisotropy", "anisotropy_turned"))
     effects = [
         stiffness,
-        Effect(
-            "rest curvature", "curvature of the unloaded rod, constant and linear along it", curvature,
-            _with_curvature, _stretchable,
-        ),
-        Effect(
-            "taper", "change of the stiffness along the rod", (Number("taper", "", 0.0, 0.4, -1.8, 1.8),),
-            _with_taper, _stretchable,
-        ),
-        Effect("sleeve", "stiffer base of the rod", sleeve, _with_sleeve, _sleeved, usual=True),
-    ]  # fmt: skip
+        PossibleEffect("rest curvature", (*curvature, *slope), _with_curvature, _stretchable),
+        PossibleEffect("taper", (Number("taper", "", 0.0, 0.4, -1.8, 1.8),), _with_taper, _stretchable),
+        PossibleEffect("sleeve", sleeve, _with_sleeve, _sleeved, usual=True),
+    ]
     if nominal.youngs_modulus is not None:
-        about = "difference of the bending stiffness about two axes"
-        effects.append(Effect("stiffness axes", about, axes, _with_axes))
+        axes = tuple(Number(label, "", 0.0, 0.1, -0.9, 0.9) for label in ("anisotropy", "anisotropy_turned"))
+        effects.append(PossibleEffect("stiffness axes", axes, _with_axes))
     return effects
 
 
-def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def _inertia_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     """Return the effects of damping, drag and masses."""
     L, EI = float(nominal.length), float(nominal.Kbt[0, 0])
     masses = [(k, float(load.mass)) for k, load in enumerate(nominal.loads) if isinstance(load, AttachedMass)]
@@ -91,56 +75,33 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[Effect]:
     # frequency of the first mode (rad/s), damping (N m² s) and drag (kg/(m s)) for its usual damping ratio
     frequency = FIRST_MODE * (EI * L / carried) ** 0.5 / L**2
     damping, drag = 2.0 * DAMPING_RATIO * EI / frequency, 2.0 * DAMPING_RATIO * frequency * carried / L
-    branch, linear = nominal.relaxation, nominal.linear_drag
-    slow = (0.0, 1.0) if branch is None else (float(branch.stiffness), float(branch.time))
-    creep = (
-        Number("relaxation.stiffness", "", slow[0], 0.2, 0.0, 100.0, begin=0.3),
-        Number("relaxation.time", "s", slow[1], 1.0, 0.02, 100.0, True, shape=True),
-    )
-    fluid = Number(
-        "linear_drag", "kg/(m s)", 0.0 if linear is None else float(linear[0, 0]), 3.0 * drag, 0.0, 1e4,
-        begin=0.1,
-    )  # fmt: skip
-    square = Number(
-        "drag", "kg/m2", float(nominal.drag[0, 0]), 3.0 * drag / (0.2 * L * frequency), 0.0, 1e3, begin=0.1
-    )
     viscous = Number("bending_damping", "N m2 s", damping, 1.5, 1e-9, 1e2, True)
-    tip = Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1)
+    relaxing, tip = _relaxing(nominal), Replace((f"loads.{len(nominal.loads)}.mass",))
+    creep = (
+        *numbers_at(relaxing, "relaxation.stiffness", 0.2, high=100.0, begin=0.3),
+        *numbers_at(relaxing, "relaxation.time", 1.0, low=0.02, high=100.0, logarithmic=True, shape=True),
+    )
+    linear = numbers_at(_draggable(nominal), "linear_drag", 3.0 * drag, begin=0.1)
+    square = numbers_at(nominal, "drag", 3.0 * drag / (0.2 * L * frequency), begin=0.1)
+    added = Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1)
     if nominal.density is None:
-        mass = Replace(("cross_section.mass_per_length",), "multiple")
-        density = Number(mass.parameters[0], "kg/m", float(nominal.mass_per_length), 0.1, 1e-9, 1e6, True)
+        lines = numbers_at(nominal, "cross_section.mass_per_length", 0.1, logarithmic=True)
+        along = PossibleEffect(
+            "mass along the rod", lines, Replace(("cross_section.mass_per_length",), "multiple")
+        )
     else:
-        mass = Replace(("density",))
-        density = Number("density", "kg/m3", float(nominal.density), 0.1, 1.0, 1e5, True)
-    ribs = [(k, mass) for k, mass in masses if mass > 0.0]
-    known = tuple(Number(f"loads[{k}].mass", "kg", mass, 0.3, 0.0, 1e4, True) for k, mass in ribs)
+        along = PossibleEffect("mass along the rod", numbers_at(nominal, "density", 0.1, logarithmic=True))
     effects = [
-        Effect(
-            "damping", "Kelvin-Voigt damping of bending and twisting", (viscous,),
-            Replace(("bending_damping",)), basic=True,
-        ),
-        Effect(
-            "creep", "relaxation of the material: a Maxwell branch beside its stiffness", creep,
-            Replace(("relaxation.stiffness", "relaxation.time")), _relaxing,
-        ),
-        Effect(
-            "linear drag", "drag in proportion to velocity", (fluid,), Replace(("linear_drag",), "diagonal"),
-            _draggable, usual=True,
-        ),
-        Effect(
-            "square drag", "drag in proportion to the square of velocity", (square,),
-            Replace(("drag",), "diagonal"),
-        ),
-        Effect(
-            "tip mass", "mass at the tip beyond what is known", (tip,),
-            Replace((f"loads.{len(nominal.loads)}.mass",)), _with_tip_mass,
-        ),
-        Effect("mass along the rod", "density of the rod", (density,), mass),
-    ]  # fmt: skip
-    if known:
-        change = Replace(tuple(f"loads.{k}.mass" for k, _ in ribs))
-        effects.append(Effect("rib masses", "masses on the rod that are known", known, change))
-    return effects
+        PossibleEffect("damping", (viscous,), basic=True),
+        PossibleEffect("creep", creep, part=_relaxing),
+        PossibleEffect("linear drag", linear, part=_draggable, usual=True),
+        PossibleEffect("square drag", square),
+        PossibleEffect("tip mass", (added,), tip, _with_tip_mass),
+        along,
+    ]
+    ribs = [f"loads.{k}.mass" for k, mass in masses if mass > 0.0]
+    known = [it for path in ribs for it in numbers_at(nominal, path, 0.3, logarithmic=True)]
+    return [*effects, PossibleEffect("rib masses", tuple(known))] if known else effects
 
 
 # parts that effects change, where a robot lacks them

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.identification.posterior import Posterior
-from knode_cosserat.identification.search import Search
+from knode_cosserat.identification.search import ParameterSearch
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
 from knode_cosserat.learning.residual import Nothing
@@ -21,7 +21,7 @@ MOST_INFLATED = 30.0
 
 
 def sampled(
-    search: Search, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior,
+    search: ParameterSearch, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior,
     held_out: Sequence[Float[np.ndarray, "rows e"]], trained: Any,
 ) -> Ensemble | None:  # fmt: skip
     """Return samples of the robots that agree with the data, and can follow their controls; None if none can.

@@ -9,7 +9,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import itertools
-import time
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple, Self
 
@@ -18,14 +17,18 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._files.writing import package_version
-from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import States
 from knode_cosserat.identification.experiments import Experiment
-from knode_cosserat.identification.information import ROBUST, Problem, dispersion, huber, normal_equations
+from knode_cosserat.identification.information import (
+    ROBUST,
+    NormalEquations,
+    dispersion,
+    huber,
+    normal_equations,
+)
+from knode_cosserat.identification.journal import Journal, SearchError
 from knode_cosserat.identification.misfit import Misfit, Rollout
-from knode_cosserat.learning.training.checkpoint import CheckpointError, Checkpoints, hashed
-
-clock = time.monotonic
+from knode_cosserat.learning.training.checkpoint import hashed
 
 #: parts of the longest motion over which preliminary searches go; with all rows at once, a search from a poor
 #: nominal robot may fail
@@ -54,18 +57,10 @@ UNSEEN = 0.8
 #: a row is not used if it moves by more lengths than this for each standard deviation of the priors: such a
 #: motion is unstable there, and derivatives say nothing
 LARGEST = 10.0
-
-
-class OutOfTimeError(KnodeCosseratError):
-    """The time of an identification is over."""
-
-    code = "out-of-time"
-
-
-class SearchError(KnodeCosseratError, RuntimeError):
-    """A search cannot go on; one line says why."""
-
-    code = "search"
+#: lags in rows, and the correlation above which a remainder is not noise
+LAGS, ALIKE = range(3, 11), 0.3
+#: scales below so many times the solver's errors are not examined
+NEAR = 10.0
 
 
 #: coordinates of the normal equations at the end of a search
@@ -83,13 +78,13 @@ ALL = Subset()
 
 
 @dataclasses.dataclass(frozen=True)
-class Point:
+class SearchEnd:
     """End of a search: coordinates, scales of the differences, and the normal equations there."""
 
     x: Float[np.ndarray, " n"]
     #: by experiment and field; of poses in m
     scale: Float[np.ndarray, "R G"]
-    problem: Problem
+    problem: NormalEquations
     free: Bool[np.ndarray, " n"]
     #: precision of each coordinate's prior
     prior: Float[np.ndarray, " n"]
@@ -102,16 +97,11 @@ class Point:
     @classmethod
     def of(cls, facts: dict[str, Any]) -> Self:
         """Return the point with these attributes: the inverse of `facts`."""
-        return cls(**{**facts, "problem": Problem(**facts["problem"])})
-
-    @property
-    def cost(self) -> float:
-        """Robust cost with the prior."""
-        return float(self.problem.cost.sum() + np.sum(self.prior * self.x**2))
+        return cls(**{**facts, "problem": NormalEquations(**facts["problem"])})
 
     def scattered(self, ratio: float) -> Self:
         """Return it with differences of a larger variance, which count less."""
-        return dataclasses.replace(self, problem=Problem(*(part / ratio for part in self.problem)))
+        return dataclasses.replace(self, problem=NormalEquations(*(part / ratio for part in self.problem)))
 
     def covariance(self) -> Float[np.ndarray, "n n"]:
         """Return the covariance of the coordinates, of the prior where nothing is known or searched."""
@@ -122,34 +112,31 @@ class Point:
         return full
 
 
-class Search:
+class ParameterSearch:
     """Searches coordinates of a model from recordings.
 
     Args:
         misfit: the recordings and the model.
-        tell: called with a line of progress.
-        prior: precision of each coordinate's prior, about zero; by default 1.
-        deadline: time of `clock` after which nothing is solved.
-        journal: keeps the ends of finished searches, so that an interrupted identification resumes.
+        journal: course of the identification.
+        prior: precision of each coordinate's prior, about zero; by default that of the model.
     """
 
     def __init__(
-        self, misfit: Misfit, tell: Callable[[str], None] = lambda line: None,
-        prior: Float[np.ndarray, " n"] | None = None, journal: Checkpoints | None = None,
-        deadline: float = np.inf,
-    ):  # fmt: skip
-        self.misfit, self.tell, self.journal, self.deadline = misfit, tell, journal, deadline
-        #: the end of the last search in all recordings
-        self.last: Point | None = None
+        self,
+        misfit: Misfit,
+        journal: Journal | None = None,
+        prior: Float[np.ndarray, " n"] | None = None,
+    ):
+        self.misfit, self.journal = misfit, journal or Journal()
         self.prior = np.asarray(misfit.model.prior if prior is None else prior)
         #: True if no number has a prior: the equations are taken to be exact, and noise to be white
         self.exact = not np.any(self.prior)
-        self._identity = "" if journal is None else self._hash()
         self.length = float(np.asarray(misfit.model.nominal.length))
         self.low, self.high = misfit.model.bounds
-        self.least = [self._least_scale(data) for data in misfit.data]
+        self._least = {data: self._least_scale(data) for data in misfit.data}
 
-    def _hash(self) -> str:
+    @functools.cached_property
+    def _identity(self) -> str:
         """Return a hash of everything that a search depends on: model, recordings, settings, this package."""
         model = self.misfit.model
         words = [package_version(), repr(model.numbers), repr(model.names)]
@@ -182,7 +169,7 @@ class Search:
 
     def from_far(
         self, free: Bool[np.ndarray, " n"], skipped: int = 0, effort: tuple[int, float] | None = None
-    ) -> Point:
+    ) -> SearchEnd:
         """Return the end of a search from the nominal robot, over horizons that grow, without the first ones.
 
         `effort` is that of the last search, as in `run`.
@@ -200,19 +187,19 @@ class Search:
         wound = {"reel", "motor"} & {*self.misfit.model.nominal.control_layout.names}
         return bool(self.misfit.data[0].static or wound)
 
-    def _beyond_kinks(self, point: Point) -> Point:
+    def _beyond_kinks(self, point: SearchEnd) -> SearchEnd:
         """Return the best end of searches that begin at other values of numbers that were not seen.
 
         A tendon that is slack in the model, but not in the robot, hides the numbers that it depends on.
         """
         unseen = point.free & (self.prior * np.diag(point.covariance()) > UNSEEN)
-        rollouts, units = self.solved(point.x), self.units(point.scale)
+        rollouts = self.solved(point.x)
         for k, step in itertools.product(np.flatnonzero(unseen), (-1.0, 1.0)):
             x = np.clip(point.x + step * (np.arange(len(point.x)) == k), self.low, self.high)
             moved = self.solved(x)
             if rollouts is None or moved is None:
                 continue
-            changed = zip(moved, rollouts, units, strict=True)
+            changed = zip(moved, rollouts, self.units(point.scale, rollouts), strict=True)
             if all(np.nanmax(np.abs(new.values - old.values) / unit) < 1.0 for new, old, unit in changed):
                 continue
             try:
@@ -220,7 +207,7 @@ class Search:
             except SearchError:
                 continue
             if np.sum(np.log(found.scale)) < np.sum(np.log(point.scale)):
-                point, rollouts, units = found, self.solved(found.x), self.units(found.scale)
+                point, rollouts = found, self.solved(found.x)
         return point
 
     def over(
@@ -249,7 +236,7 @@ class Search:
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset = ALL,
         effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None,
         equations: Equations = "free", near: Float[np.ndarray, " n"] | None = None,
-    ) -> Point:  # fmt: skip
+    ) -> SearchEnd:  # fmt: skip
         """Return the end of a search (Levenberg-Marquardt) from a point.
 
         Args:
@@ -267,32 +254,60 @@ class Search:
         options = (subset.rows, subset.which and tuple(subset.which), effort, scale is None, equations)
         begins = (np.zeros(0) if it is None else it for it in (scale, near))
         solve = functools.partial(self._searched, x, free, subset, effort, scale, equations, near)
-        point = self._resumed(solve, repr(options), x, free, *begins) if self.journal else solve()
+        facts = self.journal.finished(
+            lambda: solve().facts(), self._identity, repr(options), x, free, *begins
+        )
+        point = SearchEnd.of(facts)
         if subset.which is None:
-            self.last = point
+            self.journal.last = self, point
         return point
 
-    def _resumed(self, solve: Callable[[], Point], *begun: Any) -> Point:
-        """Return the end of a search that began so, from the journal if it is there."""
-        assert self.journal is not None
-        key = hashed(self._identity, *begun)
-        try:
-            kept = self.journal.load(key)
-        except CheckpointError:  # a damaged file counts as missing
-            kept = None
-        if kept is None:
+    def first_explaining(self, *searches: Callable[[], SearchEnd]) -> SearchEnd:
+        """Return the end of the first search that explains the data, or of the best search.
+
+        Raises:
+            SearchError: all searches failed.
+        """
+        points, error = list[SearchEnd](), None
+        for search in searches:
             try:
-                kept = solve().facts()
-            except SearchError as error:
-                kept = {"failed": str(error)}
-            self.journal.save(key, kept)
-        if "failed" in kept:
-            raise SearchError(kept["failed"])
-        return Point.of(kept)
+                points.append(search())
+            except SearchError as failed:
+                self.journal.tell(f"the search failed: {failed}")
+                error = failed
+                continue
+            if (points[-1].converged or not self.exact) and not self.unexplained(points[-1].x):
+                return points[-1]
+        if error and not points:
+            raise error
+        return min(points, key=lambda it: (self.exact and not it.converged, float(np.sum(np.log(it.scale)))))
+
+    def unexplained(self, x: Float[np.ndarray, " n"]) -> tuple[str, ...]:
+        """Return the fields whose remaining differences are not noise: rows are correlated at large lags."""
+        fields: dict[str, None] = {}
+        for rollout in self.misfit.whole(x):
+            if rollout is None or rollout.data.static:
+                continue
+            data, [scale] = rollout.data, self.scales_of([rollout])
+            known = np.isfinite(rollout.values[1:])
+            values = np.where(known, rollout.values[1:], 0.0)
+            for field, name in enumerate(data.fields):
+                if scale[field] <= NEAR * self._least[data][field]:
+                    continue
+                rows, seen = values[:, data.groups == field], known[:, data.groups == field]
+                for lag in LAGS:
+                    one, other = rows[:-lag], rows[lag:]
+                    size = np.sum(one**2 + other**2) / 2.0
+                    count = max(int(np.sum(seen[lag:])), 1)
+                    if np.abs(np.sum(one * other)) > max(ALIKE, 5.0 / np.sqrt(count)) * size:
+                        several = len(self.misfit.data) > 1 and data.readings
+                        fields[f"{name} in {data.name}" if several else name] = None
+                        break
+        return tuple(fields)
 
     def without(
-        self, point: Point, k: int, effort: tuple[int, float], equations: Equations = "free"
-    ) -> Point | None:
+        self, point: SearchEnd, k: int, effort: tuple[int, float], equations: Equations = "free"
+    ) -> SearchEnd | None:
         """Return the end of a search from a point without recording k; None if it fails.
 
         A single recording is not left out.
@@ -307,8 +322,8 @@ class Search:
         self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset,
         effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None, equations: Equations,
         near: Float[np.ndarray, " n"] | None,
-    ) -> Point:  # fmt: skip
-        (most, fall), which = effort, subset.which
+    ) -> SearchEnd:  # fmt: skip
+        most, fall = effort
         begun = None if near is None else self.solved(near, subset)
         rollouts = self.solved(x, subset, begun and [it.offset for it in begun])
         if rollouts is None:
@@ -318,7 +333,7 @@ class Search:
         #: true if nothing finer is to be known of these rollouts
         fine = begun is None or rough
         while remaining > 0 and not converged:
-            sizes, known = self.scales_of(rollouts, which) if scale is None else scale, fine
+            sizes, known = self.scales_of(rollouts) if scale is None else scale, fine
             descent = _Descent(self, subset, x, free, columns, rollouts, sizes)
             budget = remaining if self.exact or scale is not None else min(PASS, remaining)
             used, ended = descent.run(budget, fall, rough)
@@ -327,43 +342,42 @@ class Search:
             if not fine and (ended or remaining <= 0):
                 fine = True
                 if subset.rows is None:
-                    rollouts = self.misfit.refined(rollouts, x, which)
-            after = self.scales_of(rollouts, which)
+                    rollouts = self.misfit.refined(rollouts, x)
+            after = self.scales_of(rollouts)
             horizon = "all rows" if subset.rows is None else f"{subset.rows} rows"
             text = ", ".join(f"{1e3 * size:.2f}" for size in after[:, 0])
-            self.tell(f"{horizon}, {most - remaining} evaluations: {text} mm")
+            self.journal.tell(f"{horizon}, {most - remaining} evaluations: {text} mm")
             settled = scale is not None or np.all(np.abs(after - sizes) <= SETTLED * sizes)
             converged = bool(ended and (rough or (settled and (known or self.exact))))
-        sizes = self.scales_of(rollouts, which) if scale is None else scale
+        sizes = self.scales_of(rollouts) if scale is None else scale
         if rough:
             empty = (np.zeros((0, *[len(x)] * dimensions)) for dimensions in (0, 0, 1, 2))
-            return Point(x, sizes, Problem(*empty), free, self.prior, converged)
-        units = self.units(sizes, which)
+            return SearchEnd(x, sizes, NormalEquations(*empty), free, self.prior, converged)
+        units = self.units(sizes, rollouts)
         self.misfit.differentiated(rollouts, columns)
         rollouts = [it.only(used) for it, used in zip(rollouts, self.used(rollouts, columns), strict=True)]
         thinned = self.thinned()
         if not self.exact:
-            data = [self.misfit.data[k] for k in (range(len(self.misfit.data)) if which is None else which)]
-            thinned = dispersion(rollouts, units, [0.0 if it.static else it.dt for it in data], free)
+            spacing = [0.0 if it.data.static else it.data.dt for it in rollouts]
+            thinned = dispersion(rollouts, units, spacing, free)
         problem = normal_equations(rollouts, units, thinned, columns)
-        return Point(x, sizes, problem, free, self.prior, converged)
+        return SearchEnd(x, sizes, problem, free, self.prior, converged)
 
-    def scales_of(self, rollouts: Sequence[Rollout], which: Sequence[int] | None = None) -> np.ndarray:
-        """Return the usual size (R, G) of the differences by experiment and field.
+    def scales_of(self, rollouts: Sequence[Rollout]) -> Float[np.ndarray, "R G"]:
+        """Return the usual size of the differences by experiment and field.
 
         Each experiment is weighted by its residual, so one that cannot be explained does not spoil others.
         """
-        chosen = range(len(self.misfit.data)) if which is None else which
-        scales = np.ones((len(rollouts), max(len(self.least[k]) for k in chosen)))
-        for row, rollout, k in zip(scales, rollouts, chosen, strict=True):
-            for field, least in enumerate(self.least[k]):
-                values = rollout.values[:, self.misfit.data[k].groups == field]
+        scales = np.ones((len(rollouts), max(len(it.data.fields) for it in rollouts)))
+        for row, rollout in zip(scales, rollouts, strict=True):
+            for field, least in enumerate(self._least[rollout.data]):
+                values = rollout.values[:, rollout.data.groups == field]
                 sizes = np.abs(values[np.isfinite(values)])
                 usual = 0.0
                 if len(sizes):
                     usual = max(1.4826 * float(np.median(sizes)), OF_ALL * float(np.sqrt(np.mean(sizes**2))))
                 row[field] = max(usual, least)
-        if self.exact and len({self.misfit.data[k].fields for k in chosen}) == 1:
+        if self.exact and len({it.data.fields for it in rollouts}) == 1:
             # white noise of one sensor; separate weights would drift where the model is wrong
             scales[:] = np.sqrt(np.mean(scales**2, axis=0))
         return scales
@@ -379,10 +393,9 @@ class Search:
             found.append(known)
         return found
 
-    def units(self, scale: np.ndarray, which: Sequence[int] | None = None) -> list[np.ndarray]:
+    def units(self, scale: Float[np.ndarray, "R G"], rollouts: Sequence[Rollout]) -> list[np.ndarray]:
         """Return the unit (e,) of every number of a difference."""
-        chosen = range(len(self.misfit.data)) if which is None else which
-        return [sizes[self.misfit.data[k].groups] for sizes, k in zip(scale, chosen, strict=True)]
+        return [sizes[it.data.groups] for sizes, it in zip(scale, rollouts, strict=True)]
 
     def solved(
         self, x: np.ndarray, subset: Subset = ALL, offsets: Sequence[Any] | None = None
@@ -392,8 +405,7 @@ class Search:
         Raises:
             OutOfTimeError: the deadline is over.
         """
-        if clock() > self.deadline:
-            raise OutOfTimeError
+        self.journal.require_time()
         if offsets is None and subset.rows is None:
             rollouts = self.misfit.whole(x, subset.which)
         else:
@@ -408,7 +420,7 @@ class _Descent:
     The derivatives are those at the begin; where numbers have priors, each step updates them (Broyden 1965).
     """
 
-    search: Search
+    search: ParameterSearch
     subset: Subset
     x: Float[np.ndarray, " n"]
     free: Bool[np.ndarray, " n"]
@@ -420,7 +432,7 @@ class _Descent:
     def __post_init__(self) -> None:
         search, free = self.search, self.free
         self.begin, self.low, self.high = self.x, search.low[free], search.high[free]
-        self.units, self.thinned = search.units(self.sizes, self.subset.which), np.sqrt(search.thinned())
+        self.units, self.thinned = search.units(self.sizes, self.rollouts), np.sqrt(search.thinned())
         search.misfit.differentiated(self.rollouts, self.columns)
         self.known = search.used(self.rollouts, free)
         #: the derivatives, and where they belong

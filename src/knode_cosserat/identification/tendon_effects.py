@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.estimation.parameters import Effect, Number, Replace
+from knode_cosserat.estimation.parameters import Number, PossibleEffect, numbers_at
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
@@ -14,10 +14,12 @@ from knode_cosserat.rods.tendons import EarlyAnchors, LoadCells, RibSpacing, Ten
 
 #: place of the last rib before the tip, if the robot states none
 LAST_RIB = 8.0 / 9.0
+#: range of numbers that only their priors bound
+UNBOUNDED = {"low": -np.inf, "high": np.inf}
 
 
 @register(order=1)
-def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of tendons; a robot with reels has only those that it states."""
     pulled = nominal.drive != "reel"
     return [
@@ -28,61 +30,39 @@ def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
     ]
 
 
-def _numbers(label: str, unit: str, values: Any, *limits: Any, **options: Any) -> tuple[Number, ...]:
-    """Return one number for each value."""
-    return tuple(
-        Number(f"{label}[{k}]", unit, float(value), *limits, **options) for k, value in enumerate(values)
-    )
-
-
-def _place_effects(nominal: RoutedTendonRobot) -> list[Effect]:
+def _place_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     offset = Number("tendon_offset", "m", float(nominal.tendon_offset) or 1e-3, 0.1, 1e-5, 1.0, True)
+    twisted = nominal.replace(tendon_twist=nominal.tendon_twist or 0.0)
     return [
-        Effect(
-            "tendon offset", "distance of the tendons from the axis", (offset,), Replace(("tendon_offset",)),
-            usual=True,
+        PossibleEffect("tendon offset", (offset,), usual=True),
+        PossibleEffect("tendon angles", numbers_at(nominal, "tendon_angles", 0.06, **UNBOUNDED)),
+        PossibleEffect(
+            "tendon twist",
+            numbers_at(twisted, "tendon_twist", 0.06, **UNBOUNDED),
+            part=lambda robot: robot.replace(tendon_twist=robot.tendon_twist or 0.0),
         ),
-        Effect(
-            "tendon angles", "angles of the tendons about the rod",
-            _numbers("tendon_angles", "rad", np.asarray(nominal.tendon_angles), 0.06),
-            Replace(("tendon_angles",), "vector"),
-        ),
-        Effect(
-            "tendon twist", "turn of ribs, and the tendons in them, about the rod from base to tip",
-            (Number("tendon_twist", "rad", float(nominal.tendon_twist or 0.0), 0.06),),
-            Replace(("tendon_twist",)), lambda robot: robot.replace(tendon_twist=robot.tendon_twist or 0.0),
-        ),
-    ]  # fmt: skip
+    ]
 
 
-def _load_cell_effects(nominal: RoutedTendonRobot, tension: float) -> list[Effect]:
-    cells = _with_cells(nominal).load_cells
+def _load_cell_effects(nominal: RoutedTendonRobot, tension: float) -> list[PossibleEffect]:
+    cells = _with_cells(nominal)
+    gain = numbers_at(cells, "load_cells.gain", 0.05, low=0.1, high=10.0, logarithmic=True)
     # of a usual size: a few samples of 20 to 50 Hz
-    late = Number("load_cells.latency", "s", float(cells.latency), 0.02, -0.2, 0.2)
+    late = numbers_at(cells, "load_cells.latency", 0.02, low=-0.2, high=0.2)
+    share = numbers_at(_anchored(nominal), "anchors.share", 0.5, nominal=1.0, low=0.0, high=1.0, begin=-0.3)
     return [
-        Effect(
-            "load cell gains", "ratio of each tendon's tension to the reading of its load cell",
-            _numbers("load_cells.gain", "", cells.gain, 0.05, 0.1, 10.0, True),
-            Replace(("load_cells.gain",), "vector"), _with_cells,
+        PossibleEffect("load cell gains", gain, part=_with_cells),
+        PossibleEffect(
+            "load cell offsets",
+            numbers_at(cells, "load_cells.offset", 0.03 * tension, **UNBOUNDED),
+            part=_with_cells,
         ),
-        Effect(
-            "load cell offsets", "tension of each tendon at a reading of zero",
-            _numbers("load_cells.offset", "N", cells.offset, 0.03 * tension),
-            Replace(("load_cells.offset",), "vector"), _with_cells,
-        ),
-        Effect(
-            "early anchors", "tendons that are anchored at the last rib before the tip",
-            _numbers("anchors.share", "", np.ones(nominal.tendon_count), 0.5, 0.0, 1.0, begin=-0.3),
-            Replace(("anchors.share",), "vector"), _anchored,
-        ),
-        Effect(
-            "latency", "delay of the load cells' readings behind the poses", (late,),
-            Replace(("load_cells.latency",)), _with_cells, of_recordings=True,
-        ),
-    ]  # fmt: skip
+        PossibleEffect("early anchors", share, part=_anchored),
+        PossibleEffect("latency", late, part=_with_cells, of_recordings=True),
+    ]
 
 
-def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[Effect]:
+def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[PossibleEffect]:
     L, stated = float(nominal.length), nominal.rib_spacing
     if nominal.drive == "reel" and stated is None:
         return []
@@ -96,58 +76,40 @@ def _rib_effects(nominal: RoutedTendonRobot, bodies: tuple[float, ...]) -> list[
     def ribbed(robot: Any) -> Any:
         return robot.replace(rib_spacing=ribs)
 
-    softening = Number(
-        "rib_spacing.softening", "m2", float(ribs.softening), (0.2 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3
-    )
-    share = Number("rib_spacing.share", "", float(ribs.share), 0.5, 0.0, 10.0, begin=0.5)
+    usual = (0.2 * L) ** 2 / 12.0
+    softening = numbers_at(ribbed(nominal), "rib_spacing.softening", usual, high=L**2, begin=0.3)
+    share = numbers_at(ribbed(nominal), "rib_spacing.share", 0.5, begin=0.5)
     effects = [
-        Effect(
-            "rib spacing", "softer bending under tension, because tendons are straight between ribs",
-            (softening,), Replace(("rib_spacing.softening",)), ribbed,
-        ),
-        Effect(
-            "rib spans", "softer bending under tension between ribs, or bodies, of known places", (share,),
-            Replace(("rib_spacing.share",)), ribbed,
-        ),
-    ]  # fmt: skip
+        PossibleEffect("rib spacing", softening, part=ribbed),
+        PossibleEffect("rib spans", share, part=ribbed),
+    ]
     return effects if ribs.at is not None else effects[:1]
 
 
-def _friction_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[Effect]:
+def _friction_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return friction, and its loss where tensions are measured."""
-    L, known = float(nominal.length), nominal.friction or TendonFriction()
-    wobble, curvature, at_rest = map(float, (known.wobble, known.curvature, known.at_rest))
-    reach = float(known.reach) if wobble or curvature else 0.06 / L
+    L, rubbing = float(nominal.length), _rubbing(nominal)
+    known = rubbing.friction
+    reach = float(known.reach) if float(known.wobble) or float(known.curvature) else 0.06 / L
     # above the usual tension: a robot that shakes at rest has no friction to identify
     shaking = 0.5 * (usual.tension * nominal.tendon_count + usual.highest)
     width = max(0.5 * (usual.highest - shaking), 0.05 * usual.highest)
     friction = (
-        Number("friction.wobble", "1/m", wobble, 0.2 / L, 0.0, 100.0, begin=0.5),
-        Number("friction.reach", "1/m", reach, 1.0, 1e-4, 100.0, True, shape=True),
-        Number("friction.at_rest", "", at_rest, 1.0, -1.0, 1.0, begin=0.3, shape=True),
+        *numbers_at(rubbing, "friction.wobble", 0.2 / L, begin=0.5),
+        *numbers_at(rubbing, "friction.reach", 1.0, nominal=reach, logarithmic=True, shape=True),
+        *numbers_at(rubbing, "friction.at_rest", 1.0, begin=0.3, shape=True),
     )
+    curvature = numbers_at(rubbing, "friction.curvature", 0.1, begin=0.3)
     vibration = (
         Number("vibration.tension", "N", shaking, width, 0.0, 1e6, shape=True),
         Number("vibration.rate", "1/(N s)", 0.0, 0.5, 0.0, 1e3, begin=0.5),
         Number("vibration.softening", "m2", 0.0, (0.1 * L) ** 2 / 12.0, 0.0, L**2, begin=0.3),
     )
     effects = [
-        Effect(
-            "friction", "friction of the tendons by their length, with its hysteresis", friction,
-            Replace(("friction.wobble", "friction.reach", "friction.at_rest")), _rubbing, usual=True,
-        ),
-        Effect(
-            "friction by curvature", "friction of the tendons by the angle they turn",
-            (Number("friction.curvature", "1/rad", curvature, 0.1, 0.0, 10.0, begin=0.3),),
-            Replace(("friction.curvature",)), _rubbing, needs=("friction",), usual=True,
-        ),
-        Effect(
-            "vibration", "loss of friction where high tensions make the robot shake", vibration,
-            Replace(("vibration.tension", "vibration.rate", "vibration.softening")),
-            lambda robot: robot.replace(vibration=robot.vibration or Vibration(tension=1e6, rate=0.0)),
-            needs=("friction",), usual=True,
-        ),
-    ]  # fmt: skip
+        PossibleEffect("friction", friction, part=_rubbing, usual=True),
+        PossibleEffect("friction by curvature", curvature, part=_rubbing, needs=("friction",), usual=True),
+        PossibleEffect("vibration", vibration, part=_vibrating, needs=("friction",), usual=True),
+    ]
     return effects if nominal.drive != "reel" else effects[:2]
 
 
@@ -169,3 +131,7 @@ def _anchored(robot: Any) -> Any:
 
 def _rubbing(robot: Any) -> Any:
     return robot.replace(friction=robot.friction or TendonFriction())
+
+
+def _vibrating(robot: Any) -> Any:
+    return robot.replace(vibration=robot.vibration or Vibration(tension=1e6, rate=0.0))

@@ -23,7 +23,7 @@ from knode_cosserat.trajectory import Trajectory
 
 #: amplitudes of the recordings' tensions about their initial ones
 AMPLITUDES = (1.0, 1.5)
-#: random tensions: seconds, and for how long each is held
+#: random tensions: seconds of a trial, and for how long each is held
 SECONDS, HELD = 5.0, 0.4
 #: share of rows whose grid may be too coarse
 FEW = 0.01
@@ -49,7 +49,9 @@ def failed_trial(
         for amplitude in AMPLITUDES
         for it in data
     ]  # fmt: skip
-    for k, (words, like, tension) in enumerate([*trials, ("random tensions", data[0], _random(data))]):
+    for k, (words, like, tension) in enumerate(
+        [*trials, ("random tensions", data[0], random_controls(data, SECONDS))]
+    ):
         try:
             still, motion = moved(robot, tension, like, space)
         except SimulationError as error:
@@ -89,11 +91,15 @@ def trained_range(robot: System, like: System, motions: Sequence[Trajectory]) ->
     )
 
 
-def _random(data: Sequence[Experiment]) -> Float[np.ndarray, "T c"]:
-    low = np.min([it.control.min(axis=0) for it in data], axis=0)
-    high = np.max([it.control.max(axis=0) for it in data], axis=0)
-    dt = data[0].dt
-    count, hold = max(round(SECONDS / dt), 1), max(round(HELD / dt), 1)
+def control_range(data: Sequence[Experiment]) -> Float[np.ndarray, "2 c"]:
+    """Return the lowest and the highest controls of all experiments."""
+    return np.array([end([end(it.control, axis=0) for it in data], axis=0) for end in (np.min, np.max)])
+
+
+def random_controls(data: Sequence[Experiment], seconds: float) -> Float[np.ndarray, "T c"]:
+    """Return random controls within the range of the experiments, each held for a while."""
+    (low, high), dt = control_range(data), data[0].dt
+    count, hold = max(round(seconds / dt), 1), max(round(HELD / dt), 1)
     drawn = np.random.default_rng(0).uniform(low, high, (-(-count // hold), len(low)))
     return np.repeat(drawn, hold, axis=0)[:count]
 
