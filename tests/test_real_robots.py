@@ -70,7 +70,8 @@ def test_three_cables_are_read():
 def test_three_cables_are_predicted():
     unused = cables("held_out.csv")
     robots = [kc.load_robot(CABLES / f"{name}.yaml") for name in ("nominal", "identified")]
-    nominal, found = (evaluate(robot, unused).tip_rmse for robot in robots)
+    # the scheme in which the file was identified, on its 8 nodes
+    nominal, found = (evaluate(robot, unused, space="lobatto2").tip_rmse for robot in robots)
     assert found < LIMIT and found < 0.5 * nominal
 
 
