@@ -36,6 +36,7 @@ FULL = RecordingConfig(
     [
         FULL,
         RecordingConfig.paper_robot(),
+        RecordingConfig.asl_trunk(),
         FULL.replace(simulated=None, rest=None, base=BaseSource("/b", 0.1)),
     ],
 )

@@ -64,12 +64,6 @@ def test_rows_of_equilibria_are_as_they_are(tmp_path):
     np.testing.assert_allclose(found.tension[:, [1, 0]], np.radians(angles), atol=1e-12)
 
 
-def test_the_trunks_settings_come_back_from_their_file(tmp_path):
-    for config in (RecordingConfig.asl_trunk(), CONFIG):
-        config.save(tmp_path / "it.yaml")
-        assert RecordingConfig.load(tmp_path / "it.yaml") == config
-
-
 def test_bad_settings_and_files_are_said(tmp_path):
     with pytest.raises(RecordingError, match="position is"):
         TableSource(position=("x", "y", "z"))

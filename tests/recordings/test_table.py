@@ -184,8 +184,3 @@ def test_a_table_that_is_not_right_gives_one_line(table, text, words):
     assert message.startswith(f"{path}: ")
     assert words in message
     assert "\n" not in message
-
-
-def test_a_missing_table_gives_one_line(tmp_path):
-    with pytest.raises(RecordingError, match=r"nowhere\.csv: no such file$"):
-        load_recording(tmp_path / "nowhere.csv")

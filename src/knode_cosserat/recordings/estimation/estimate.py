@@ -14,7 +14,7 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.recordings.estimation import balance, curvature, kinematics
 from knode_cosserat.recordings.estimation.balance import KnownRows, packed_fields
 from knode_cosserat.recordings.estimation.curvature import CapturedPoses
-from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.findings import RecordingError, naming
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.recordings.streams import Body
@@ -76,14 +76,8 @@ def estimate_states(
             too few bodies or no orientations; or the method or a time is not allowed.
     """
     check_arguments(estimate_states, locals(), RecordingError)
-    parts = _parts(recording, robot, method, (dt, start, end))
-    if len(parts) > 1:
-        times = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in parts)
-        raise RecordingError(
-            f"{parts[0].rows.source}: the recording is in {len(parts)} parts ({times}); choose one by start "
-            "and end, or take all of them by estimate_parts"
-        )
-    return _estimated(parts[0], robot, method)
+    (states,) = _estimated_parts(recording, robot, method, (dt, start, end), is_one=True)
+    return states
 
 
 def estimate_parts(
@@ -100,30 +94,39 @@ def estimate_parts(
         RecordingError: as in `estimate_states`, except that several parts are allowed.
     """
     check_arguments(estimate_parts, locals(), RecordingError)
-    parts = _parts(recording, robot, method, (dt, start, end))
-    return [_estimated(part, robot, method) for part in parts]
+    return _estimated_parts(recording, robot, method, (dt, start, end), is_one=False)
 
 
 #: time from row to row, and times of the first and of the last row (s)
 _Times = tuple[float, float | None, float | None]
 
 
-def _parts(recording: Recording | Measurements, robot: System, method: str, times: _Times) -> list[_Part]:
-    """Return the parts with enough rows for an estimation.
+def _estimated_parts(
+    recording: Recording | Measurements, robot: System, method: str, times: _Times, *, is_one: bool
+) -> list[Trajectory]:
+    """Return the states of all parts; with `is_one` there may be no other part.
 
     Raises:
         RecordingError: an argument is not allowed, the recording does not fit the robot, or has too few data.
     """
     balance.require_rod(robot)
-    parts = _pieces(recording, robot, times)
-    for part in parts:
-        ratio = _stretch(part, robot)
-        if not 1.0 / UNLIKE < ratio < UNLIKE:
+    rows = _rows(recording, times)
+    with naming(rows.source):
+        parts = _parts(recording, rows, robot, times[0])
+        for part in parts:
+            ratio = _stretch(part, robot)
+            if not 1.0 / UNLIKE < ratio < UNLIKE:
+                raise RecordingError(
+                    f"its rod is {ratio * float(robot.length):.3f} m long and the robot "
+                    f"{float(robot.length):.3f} m; allowed is up to {UNLIKE:g} times that, or a half"
+                )
+        if is_one and len(parts) > 1:
+            listed = ", ".join(f"{part.rows.time[0]:g} to {part.rows.time[-1]:g} s" for part in parts)
             raise RecordingError(
-                f"{part.rows.source}: its rod is {ratio * float(robot.length):.3f} m long and the robot "
-                f"{float(robot.length):.3f} m; allowed is up to {UNLIKE:g} times that, or a half"
+                f"the recording is in {len(parts)} parts ({listed}); choose one by start and end, or take "
+                "all of them by estimate_parts"
             )
-    return parts
+        return [_estimated(part, robot, method) for part in parts]
 
 
 def _stretch(part: _Part, robot: System) -> float:
@@ -144,7 +147,7 @@ def _estimated(part: _Part, robot: System, method: str) -> Trajectory:
         y, z = _best(part, robot, control)
     rows = len(part.rows.time)
     if not (np.isfinite(y).all() and np.isfinite(z).all()):
-        raise RecordingError(f"{part.rows.source}: the robot's equations gave states that are not finite")
+        raise RecordingError("the robot's equations gave states that are not finite")
     return Trajectory(
         system=robot,
         settings=settings,
@@ -197,9 +200,7 @@ def _paper_states(
     rows = part.rows
     used = rows.fractions > 0.0
     if not np.isfinite(rows.quaternion[:, used]).all():
-        raise RecordingError(
-            f"{rows.source}: a body has no orientation; the paper's method needs that of every body"
-        )
+        raise RecordingError("a body has no orientation; the paper's method needs that of every body")
     y0 = np.asarray(robot.rest(jnp.zeros(()))[0], dtype=float)
     p0, h0 = y0[robot.y_layout.slice("p")], y0[robot.y_layout.slice("h")]
     count = len(rows.time)
@@ -254,28 +255,28 @@ class _Part:
     fractions: Float[np.ndarray, " M"]
 
 
-def _pieces(recording: Recording | Measurements, robot: System, times: _Times) -> list[_Part]:
+def _rows(recording: Recording | Measurements, times: _Times) -> Measurements:
+    """Return the rows to estimate. Raises `RecordingError` if measurements have another time step."""
     dt, start, end = times
     if isinstance(recording, Recording):
-        rows = recording.sampled(dt, start, end)
-    elif isinstance(recording, Measurements):
-        rows = recording
-        if start is not None or end is not None:
-            rows = rows.between(-np.inf if start is None else start, np.inf if end is None else end + 1e-9)
-        if abs(rows.dt - dt) > 1e-6 * dt:
-            raise RecordingError(
-                f"{rows.source}: its rows are {rows.dt:g} s apart and dt is {dt:g} s; allowed is the same"
-            )
-    else:
+        return recording.sampled(dt, start, end)
+    rows = recording
+    if start is not None or end is not None:
+        rows = rows.between(-np.inf if start is None else start, np.inf if end is None else end + 1e-9)
+    if abs(rows.dt - dt) > 1e-6 * dt:
         raise RecordingError(
-            f"recording is a {type(recording).__name__}; allowed is a Recording or Measurements"
+            f"{rows.source}: its rows are {rows.dt:g} s apart and dt is {dt:g} s; allowed is the same"
         )
+    return rows
+
+
+def _parts(recording: Recording | Measurements, rows: Measurements, robot: System, dt: float) -> list[_Part]:
+    """Return the parts with enough rows for an estimation. Raises `RecordingError` without any."""
     _check(rows, robot)
     pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
     if not pieces:
         raise RecordingError(
-            f"{rows.source}: no {FEWEST_ROWS} rows of {dt:g} s one after the other "
-            "with all positions and tensions"
+            f"no {FEWEST_ROWS} rows of {dt:g} s one after the other with all positions and tensions"
         )
     used = rows.fractions > 0.0
     parts = []
@@ -293,18 +294,18 @@ def _check(rows: Measurements, robot: System) -> None:
     tendons = rows.tension.shape[1]
     if tendons != robot.control_layout.size:
         raise RecordingError(
-            f"{rows.source}: the recording has {tendons} tendons and the robot {robot.control_layout.size} "
+            f"the recording has {tendons} tendons and the robot {robot.control_layout.size} "
             "controls; allowed is the same number"
         )
     away = rows.fractions > 0.0
     if away.sum() < FEWEST_BODIES:
         raise RecordingError(
-            f"{rows.source}: {int(away.sum())} bodies on the rod away from its clamped end; "
+            f"{int(away.sum())} bodies on the rod away from its clamped end; "
             f"required is {FEWEST_BODIES} or more"
         )
     if not np.isfinite(rows.quaternion[:, away]).all(axis=2).any():
         raise RecordingError(
-            f"{rows.source}: no body has orientations; required for states is one or more (see the "
+            "no body has orientations; required for states is one or more (see the "
             "recording's findings, the markers' `rotation` and `rest` in its configuration)"
         )
 
