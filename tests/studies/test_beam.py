@@ -105,22 +105,6 @@ def test_bad_recordings_are_named_in_one_line(tmp_path):
         read_beam(changed(tmp_path, lambda lines: [lines[0], *lines[:0:-1]]))
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("nowhere",), "no recordings found"),
-        ((FOLDER, "--train", "beam_load99"), "there is no recording 'beam_load99'"),
-        ((FOLDER, "--load", "beam_run3"), "--load must be NAME=GRAMS"),
-        ((FOLDER, "--load", "beam_run3=30"), "there is no recording 'beam_run3'"),
-    ],
-)
-@matplotlib
-def test_bad_arguments_are_answered_in_one_line(tmp_path, monkeypatch, arguments, words):
-    monkeypatch.chdir(tmp_path)
-    result = run_study("beam", *arguments, "--out", "o")
-    assert result.exit_code == 2 and result.stderr.count("\n") == 1 and words in result.stderr
-
-
 def test_the_default_training_recordings(recordings):
     assert beam.training_names(recordings) == ["beam_gravity_V2_b", "beam_load52_V2_a"]
 

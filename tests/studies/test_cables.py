@@ -7,10 +7,8 @@ import pickle
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from knode_cosserat.solvers.simulate import simulate
-from studies.__main__ import app
 from studies.cables import frames, study
 from studies.cables.correction import learned_correction
 from studies.cables.identification import SearchStage, identify_cable
@@ -276,13 +274,6 @@ def test_a_motion_without_prediction_is_named_and_left_out(rollouts, motions, mo
     assert "- 0, best: frame 7: no solution found" in text and "left out of the means" in text
     mean = np.mean([each["mean_abs_error"] for each in cells[2::3] if "failed" not in each])
     assert f"{1e3 * mean:.2f} (1 failed)" in text
-
-
-@matplotlib
-def test_a_folder_without_cables_is_told_in_one_line(tmp_path):
-    result = CliRunner().invoke(app, ["cables", str(tmp_path), "--out", str(tmp_path / "out")])
-    assert result.exit_code == 2 and result.stderr.count("\n") == 1
-    assert "no cables there" in result.stderr
 
 
 @pytest.mark.campaign

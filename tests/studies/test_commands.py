@@ -10,6 +10,7 @@ import pytest
 from tests.commands import ROBOT, run_study
 
 ROOT = Path(__file__).parents[2]
+BEAM = ROOT / "tests" / "files" / "beam"
 NAMES = (
     "simulation", "control", "environments", "hardware", "imperfections", "data", "estimation", "recordings",
     "beam", "cables", "virtual-robots", "loop",
@@ -23,6 +24,12 @@ BAD = [
     (("imperfections", "--out", "o", "--only", "damping,rust"), "'rust' is unknown"),
     (("data", "--out", "o", "--methods", "paper, no knowledge,magic"), "'magic' is unknown"),
     (("simulation", "--out", "o", "--workers", "2", "--dask", "a:1"), "give one of them"),
+    (("recordings", "gone", "--out", "o"), "no such folder"),
+    (("cables", ".", "--out", "o"), "no cables there"),
+    (("beam", "nowhere", "--out", "o"), "no recordings found"),
+    (("beam", BEAM, "--out", "o", "--train", "beam_load99"), "there is no recording 'beam_load99'"),
+    (("beam", BEAM, "--out", "o", "--load", "beam_run3"), "--load must be NAME=GRAMS"),
+    (("beam", BEAM, "--out", "o", "--load", "beam_run3=30"), "there is no recording 'beam_run3'"),
     (("loop", ROBOT, "--plant", f"elastica:{ROBOT},rust=1", "--reference", "circle"), "has 'rust=1'"),
 ]
 

@@ -9,21 +9,20 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import typer.testing
 
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import load_model
 from studies import methods, simulation
-from studies.__main__ import app
 from studies.report import PAPER_MEASURES, spreads
 from studies.simulation import cells_of, rerun
+from tests.commands import run_study
 
 KEYS = {"imperfection", "control", "method", "seed", "tip_dtw", "pose_mse", "rotation_rmse"}
 TABLES = ("table1.json", "table1.csv", "table1.md")
 
 
 def study(*arguments):
-    return typer.testing.CliRunner().invoke(app, ["simulation", *map(str, arguments)])
+    return run_study("simulation", *arguments)
 
 
 def contents(out):
