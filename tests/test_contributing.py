@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification import effects, reel_effects, rod_effects, tendon_effects
-from knode_cosserat.identification.effects import Effect, along_axes, register
+from knode_cosserat.identification import Effect, effects, reel_effects, register, rod_effects, tendon_effects
+from knode_cosserat.identification.effects import along_axes
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = re.findall(
