@@ -2,8 +2,8 @@
 
 import pytest
 
+from knode_cosserat import KnodeCosseratError
 from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError
-from knode_cosserat.errors import KnodeCosseratError
 
 
 class Readers(dict):

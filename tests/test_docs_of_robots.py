@@ -4,7 +4,7 @@ import re
 from pathlib import Path
 
 import knode_cosserat as kc
-from knode_cosserat.rods import ends, loads, routing, section, surroundings
+from knode_cosserat.robots import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.robot_file import KINDS, parse_robot
 

@@ -12,9 +12,10 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.engine.program import EngineError
-from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification import evaluate
+from knode_cosserat.learning import Residual
 from knode_cosserat.learning.passive import passive
-from knode_cosserat.learning.residual import Nothing, Residual, network
+from knode_cosserat.learning.residual import Nothing, network
 from knode_cosserat.learning.structured.residual import CURVED, LINEAR, Structured, expansion
 from knode_cosserat.rods.parameters import value_at
 from knode_cosserat.rods.wrapped import nominal_model

@@ -15,12 +15,12 @@ import pytest
 import typer.testing
 
 import knode_cosserat as kc
+from knode_cosserat import view
 from knode_cosserat._files.writing import ABANDONED, replacing
 from knode_cosserat._files.yaml_text import MOST_CHARACTERS, YAMLTextError, mapping_of
 from knode_cosserat._numbers import real_array
 from knode_cosserat.cli import app
 from knode_cosserat.cli.output import printable
-from knode_cosserat.viewer.pages import view
 from tools.attack import attacked, good_files
 
 ROBOT = kc.load_robot("delrin-tendon-robot")

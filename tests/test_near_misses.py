@@ -16,7 +16,7 @@ import pandas as pd
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.control.loop import LoopLog
+from knode_cosserat.control import LoopLog
 from knode_cosserat.engine.machine_code import MachineCode
 from knode_cosserat.learning.residual import Nothing
 from tests.trajectories import synthetic

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification import evaluate
 from knode_cosserat.recordings import RecordingConfig
 
 EXAMPLES = Path(__file__).parents[1] / "examples"

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 import yaml
 
-from knode_cosserat.rods import ends, loads, routing, section, surroundings
+from knode_cosserat.robots import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
-from knode_cosserat.schemes.time import BDFAlpha
+from knode_cosserat.solvers import BDFAlpha
 from tools.site import api, changelog, examples, robot_file, source
 
 ROOT = Path(__file__).parents[1]

@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat import TrajectoryFileError
 from knode_cosserat.io.container import _LAST_LINE
-from knode_cosserat.rods.parameters import parameter
+from knode_cosserat.robots import parameter
 from knode_cosserat.schemes.history import SolverState, StateHistory
 from knode_cosserat.schemes.time import TimeScheme
-from knode_cosserat.trajectory import TrajectoryFileError
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 PAPER = kc.solvers.Settings()

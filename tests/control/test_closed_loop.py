@@ -30,7 +30,7 @@ from knode_cosserat.control.references import ReferenceFormatError
 from knode_cosserat.control.tip_feedback import PID, KinematicController
 from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPosition
 from knode_cosserat.estimation.online import split_record
-from knode_cosserat.identification.evaluate import evaluate
+from knode_cosserat.identification import evaluate
 from knode_cosserat.learning.residual import Nothing
 
 pytestmark = pytest.mark.slow

@@ -21,8 +21,7 @@ from knode_cosserat.estimation import (
 )
 from knode_cosserat.estimation.outputs import Several
 from knode_cosserat.estimation.parameters import adapted_model
-from knode_cosserat.rods.aspects import Drawing
-from knode_cosserat.rods.loads import AttachedMass, PointWrench
+from knode_cosserat.robots import Drawing, loads
 from knode_cosserat.solvers import Stepper
 
 pytestmark = pytest.mark.slow
@@ -87,7 +86,7 @@ def test_an_error_of_orientation_is_a_rotation_vector(still):
 
 
 def test_coordinates_of_parameters_are_zero_at_their_values_and_bounded():
-    robot = ROBOT.replace(loads=(AttachedMass(mass=0.0),))
+    robot = ROBOT.replace(loads=(loads.AttachedMass(mass=0.0),))
     adapted, _ = adapted_model(robot, ["youngs_modulus", "bending_damping", Adapted("loads.0.mass", 0.03)])
     assert adapted.size == 3 and adapted.labels == ("youngs_modulus", "bending_damping", "loads.0.mass")
     same = adapted.robot(np.zeros(3))
@@ -182,7 +181,7 @@ def test_the_boundary_observer_converges_to_a_loaded_robot(still):
 
 def test_an_unknown_force_at_the_tip_is_found():
     """From the noisy position of the tip alone, within 10 % after six seconds of movement."""
-    model, force = ROBOT.replace(loads=(PointWrench(),)), np.array([0.06, -0.04, 0.05])
+    model, force = ROBOT.replace(loads=(loads.PointWrench(),)), np.array([0.06, -0.04, 0.05])
     truth = Stepper(model.replace(**{"loads.0.force": force}), DT)
     observer = KalmanObserver(model, DT, TipPosition(), adapt=[Adapted("loads.0.force", 0.1)])
     rng = np.random.default_rng(0)

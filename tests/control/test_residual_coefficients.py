@@ -6,9 +6,9 @@ import pytest
 from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
+from knode_cosserat import KNODE
 from knode_cosserat.estimation import Adapted, KalmanObserver, TipPosition
 from knode_cosserat.estimation.parameters import adapted_model
-from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.passive import passive
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers import Stepper

@@ -20,7 +20,7 @@ from knode_cosserat.control import (
 from knode_cosserat.control.commands import Status
 from knode_cosserat.control.loop import distance_out_of_reach
 from knode_cosserat.estimation import KalmanObserver, TipPosition
-from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.robots import Drawing
 
 #: a soft rod that is clamped sideways and sags by a twentieth of its length
 SAGGING = kc.robots.SlenderRod(

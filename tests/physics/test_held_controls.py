@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 import knode_cosserat as kc
 from knode_cosserat.schemes.history import StepCoefficients, history_of
-from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.solvers import Settings
 from knode_cosserat.solvers.damping import LongStepWarning
 
 # an oscillator, whose motion under held and under linear controls is known

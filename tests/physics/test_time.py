@@ -8,7 +8,7 @@ from hypothesis import given
 import knode_cosserat as kc
 from benchmarks import closed_forms
 from knode_cosserat.schemes.history import StepCoefficients
-from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.solvers import Settings
 
 SCHEMES = {
     "bdf1": kc.solvers.BDF1(),

@@ -7,12 +7,11 @@ import pytest
 from scipy.integrate import solve_bvp
 
 import knode_cosserat as kc
-from knode_cosserat.robots import Assembly, ParameterError, RigidBody, SlenderRod
+from knode_cosserat.robots import Assembly, RigidBody, SlenderRod
 from knode_cosserat.rods.assembly import NeighbourContact
-from knode_cosserat.rods.ends import Clamped, Driven, Free, Pinned, Sliding
+from knode_cosserat.rods.ends import Clamped, Driven, Pinned
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench
 from knode_cosserat.rods.parts import eased
-from knode_cosserat.rods.robot_file import format_robot, parse_robot
 from knode_cosserat.solvers.simulate import check_limits
 
 L, RADIUS, E, DENSITY = 0.3, 4e-3, 2e9, 1000.0
@@ -281,11 +280,8 @@ def test_gradients_and_batches_are_those_of_single_assemblies():
         np.testing.assert_allclose(row, kc.simulate(robot, control, 0.02).tip_position, atol=1e-9)
 
 
-def test_a_file_gives_the_gripper_back():
+def test_the_gripper_has_names_for_its_controls_and_rods():
     robot = kc.load_robot("three-finger-gripper")
-    again = parse_robot(format_robot(robot), "here")
-    assert jax.tree.structure(again) == jax.tree.structure(robot)
-    assert all(map(np.array_equal, jax.tree.leaves(again), jax.tree.leaves(robot)))
     assert kc.controls.labels(robot.control_layout)[2:] == [
         "arm_tension_3", "thumb_tension", "index_tension", "middle_tension"
     ]  # fmt: skip
@@ -302,41 +298,6 @@ def test_bodies_and_rods_are_at_rest_where_they_are_joined():
     hanging = rod("a", base_end=on("hook"), tip_end=Clamped(position=(1.0, 0.0, 0.0)))
     robot = assembly(hanging, bodies=[RigidBody(name="hook")])
     np.testing.assert_allclose(robot.rest(0.0)[0][-19:-16], [1.0, 0.0, -L], atol=1e-12)
-
-
-ARM, HAND = rod("arm"), RigidBody(name="hand")
-WRONG = {
-    "rods is \\[\\]; allowed is one or more": lambda: Assembly(),
-    "a rod or a body has no name": lambda: Assembly(rods=(ARM,), bodies=(RigidBody(),)),
-    "2 of the rods and bodies have the name 'arm'": lambda: Assembly(rods=(ARM, ARM)),
-    "arm.tip_end.body is 'hnad'; allowed is hand; did you mean hand": lambda: Assembly(
-        rods=(ARM.replace(tip_end=on("hnad")),), bodies=(HAND,)
-    ),
-    "the body 'hand' holds no rod": lambda: Assembly(rods=(ARM,), bodies=(HAND,)),
-    "no rod joins arm to the ground": lambda: Assembly(
-        rods=(ARM.replace(base_end=on("hand")),), bodies=(HAND,)
-    ),
-    "arm.base_end is free; allowed is an end that is held": lambda: Assembly(
-        rods=(ARM.replace(base_end=Free()),)
-    ),
-    "arm has a spinning frame": lambda: Assembly(
-        rods=(ARM.replace(effects=(kc.robots.SpinningFrame(1.0),)),)
-    ),
-    "arm has a gravity of its own": lambda: Assembly(rods=(ARM.replace(gravity=(0.0, 0.0, 1.0)),)),
-    "a contact is of 'arm' and 'leg'; allowed is two of arm": lambda: Assembly(
-        rods=(ARM,), contacts=(NeighbourContact(first="arm", second="leg"),)
-    ),
-    "an end on a body cannot slide": lambda: on("hand", Sliding),
-    "an end is held by the body 'hand'": lambda: ARM.replace(base_end=on("hand")).rest(0.0),
-    "name is 'a b'; allowed is a name of letters": lambda: rod("a b"),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("words", WRONG)
-def test_what_is_wrong_is_named_in_one_line(words):
-    with pytest.raises(ParameterError, match=words) as raised:
-        WRONG[words]()
-    assert "\n" not in str(raised.value)
 
 
 def test_a_tendon_of_a_rod_that_would_push_is_told():

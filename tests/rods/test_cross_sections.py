@@ -1,7 +1,5 @@
 """Cross-sections: stiffness against integrals and tables, rods against closed forms of beams."""
 
-import re
-
 import jax
 import jax.numpy as jnp
 import jsonschema
@@ -14,11 +12,11 @@ from knode_cosserat._files.yaml_text import mapping_of
 from knode_cosserat.cli.summaries import derived, parameters
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.rod_effects import _with_axes, _with_table
-from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.learning import NetworkOptions
 from knode_cosserat.learning.residual import network
-from knode_cosserat.rods.aspects import Observed
+from knode_cosserat.robots import Observed, robot_schema
 from knode_cosserat.rods.loads import DistributedWrench, PointWrench
-from knode_cosserat.rods.robot_file import RobotFileError, format_robot, parse_robot, robot_schema
+from knode_cosserat.rods.robot_file import format_robot, parse_robot
 from knode_cosserat.rods.section import (
     EllipticSection,
     HollowSection,
@@ -431,64 +429,3 @@ def test_files_come_back_equal(form):
         assert jax.tree.structure(again) == jax.tree.structure(robot) and format_robot(again) == text
         assert f"kind: {form}" in text
         jsonschema.Draft202012Validator(robot_schema()).validate(mapping_of(text, ""))
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"radius": 0.01}, "radius and a cross_section are given; allowed is one of them"),
-        ({"cross_section": None}, "radius is missing; required is radius, or a cross_section"),
-        ({"density": None}, "density is missing; required is density, or a tabulated cross_section"),
-        ({"youngs_modulus": None}, "youngs_modulus is missing; required is youngs_modulus, or a tabulated"),
-        ({"cross_section": TABLE}, "density and a tabulated cross_section are given; allowed is one of them"),
-        (
-            {"tip_radius": 0.01},
-            "tip_radius is given with a rectangular cross_section; allowed is .* Use sect",
-        ),
-        ({"cross_section.width": -1.0}, "RectangularSection: width must be between 1e-06 and 1 m"),
-        ({"cross_section": 3.0}, "cross_section holds a float; allowed is a crosssection"),
-    ],
-)
-def test_what_does_not_go_together_is_refused_in_one_line(changes, words):
-    with pytest.raises(kc.robots.ParameterError, match=words) as caught:
-        rod(STRIP).replace(**changes)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (
-            "hollow, radius: 0.01, inner_radius: 0.01",
-            "inner_radius is 0.01; allowed is less than radius, 0.01",
-        ),
-        ("hollow, radius: 0.01", "the key 'inner_radius' is missing"),
-        (
-            "oval, radius: 0.01",
-            "cross_section.kind is 'oval'; allowed is elliptic, hollow, rectangular, tabulated",
-        ),
-        ("elliptic, semi_axis_x: 5, semi_axis_y: 1", r"Did you mean 0.005 \(5 mm\)"),
-    ],
-)
-def test_sections_of_files_are_refused_in_one_line(text, words):
-    lines = [
-        "format: 2",
-        "kind: slender-rod",
-        "parameters:",
-        "  length: 0.5",
-        "  density: 1000",
-        "  youngs_modulus: 1e9",
-    ]
-    with pytest.raises(RobotFileError, match=words) as caught:
-        parse_robot("\n".join([*lines, f"  cross_section: {{kind: {text}}}", ""]), "mine.yaml")
-    assert "\n" not in str(caught.value) and re.match("mine.yaml: ", str(caught.value))
-
-
-def test_tables_that_do_not_fit_are_refused():
-    good = {"torsional_stiffness": [1.0], "axial_stiffness": [1.0], "mass_per_length": [1.0]}
-    with pytest.raises(
-        kc.robots.ParameterError, match="bending_stiffness has 2 values; allowed is 1, or one"
-    ):
-        TabulatedSection(bending_stiffness=[1.0, 2.0], **good)
-    with pytest.raises(kc.robots.ParameterError, match=r"at is \[0.5, 0.2\]; allowed is places in order"):
-        TabulatedSection(at=(0.5, 0.2), bending_stiffness=[1.0, 2.0], **good)

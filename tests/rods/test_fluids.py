@@ -13,7 +13,6 @@ from knode_cosserat.rods.ends import Driven, Free
 from knode_cosserat.rods.fluids import Fluid, Tail
 from knode_cosserat.rods.loads import Motion
 from knode_cosserat.rods.parts import RodPoint
-from knode_cosserat.rods.robot_file import RobotFileError, format_robot, parse_robot
 from knode_cosserat.rotation import quaternion_of, rotation_matrix
 
 L, RADIUS, E, DENSITY, WATER = 1.0, 0.001, 1e9, 1500.0, 1000.0
@@ -275,28 +274,3 @@ def test_its_numbers_are_identified(arm):
     found = kc.identify(guess, [truth], parameters=names)
     for name, exact in zip(names, (1.1, 1.0), strict=True):
         assert found[name].value == pytest.approx(exact, rel=1e-4)
-
-
-def test_robot_files_hold_a_fluid():
-    rod = wet(fluid=Fluid(stream=STREAM, added_mass=0.9)).replace(
-        loads=(Fluid(stream=STREAM), Tail(span=0.02))
-    )
-    text = format_robot(rod)
-    assert "{kind: fluid, stream: [0.3, -0.2, 0.5]}" in text and "{kind: tail, span: 0.02}" in text
-    assert repr(parse_robot(text, "here").loads) == repr(rod.loads)
-
-
-@pytest.mark.parametrize(
-    ("load", "words"),
-    [
-        ("{kind: fluid, density: -1}", "loads.0.density must be between 0 and 25000 kg/m3 (got -1)"),
-        ("{kind: fluid, drag: -1}", "loads.0.drag must be between 0 and 100 (got -1)"),
-        ("{kind: fluid, stream: 1}", "loads.0.stream must be three numbers, each between -100 and 100 m/s"),
-        ("{kind: fluid, begin: 0.5}", "loads.0: the key 'begin' is unknown; allowed is density, stream"),
-    ],
-)
-def test_wrong_fluids_are_refused_in_one_line(load, words):
-    text = format_robot(wet().replace(loads=()))
-    with pytest.raises(RobotFileError) as caught:
-        parse_robot(text.replace("format: 1", "format: 2") + f"  loads: [{load}]\n", "mine.yaml")
-    assert f"mine.yaml: {words}" in str(caught.value) and "\n" not in str(caught.value)

@@ -12,13 +12,10 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.learning import NetworkOptions
 from knode_cosserat.learning.residual import network
-from knode_cosserat.rods.ends import Clamped, Driven, Pinned, Pose, Universal, velocities
-from knode_cosserat.rods.frame import SpinningFrame
-from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Motion, PointWrench
+from knode_cosserat.robots import SpinningFrame, ends, loads, surroundings
 from knode_cosserat.rods.parts import RodPoint
-from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rotation import quaternion_of, quaternion_product, rotation_matrix
 from knode_cosserat.statics.stability import checked_equilibrium
 
@@ -37,11 +34,11 @@ def motion_of(pose, t):
     """The motion of a moving pose at a time, by differentiating it."""
 
     def rates(t):
-        return velocities(*jax.jvp(pose, (t,), (1.0,)))
+        return ends.velocities(*jax.jvp(pose, (t,), (1.0,)))
 
     (q, w), (q_t, w_t) = jax.jvp(rates, (t,), (1.0,))
     p, h = pose(t)
-    return Motion(p, rotation_matrix(h), q, w, q_t, w_t)
+    return loads.Motion(p, rotation_matrix(h), q, w, q_t, w_t)
 
 
 @settings(max_examples=20, deadline=None)
@@ -54,7 +51,7 @@ def test_the_absolute_motion_is_that_of_the_turned_pose(seed, t):
 
     def seen(t):
         powers = jnp.stack([1.0, t, t * t])
-        return Pose(paths @ powers, quaternion_of(turns @ powers))
+        return ends.Pose(paths @ powers, quaternion_of(turns @ powers))
 
     def on_the_ground(t):
         p, h = seen(t)
@@ -62,7 +59,7 @@ def test_the_absolute_motion_is_that_of_the_turned_pose(seed, t):
             turn = quaternion_of(t * frame.spin)
             p = frame.point + rotation_matrix(turn) @ (p - frame.point)
             h = quaternion_product(turn, h)
-        return Pose(p, h)
+        return ends.Pose(p, h)
 
     robot = rod(*frames)
     point = RodPoint(robot, 0.0, t, None, None)
@@ -124,7 +121,7 @@ def whirl(k, rate, GA):
 def modes_of_a_shaft(rate, GA, nodes=21):
     shaft = rod(
         SpinningFrame(rate), radius=RADIUS, density=DENSITY, youngs_modulus=E, nodes=nodes,
-        base_end=Pinned(), tip_end=Universal(), shear_stiffness=[GA, GA, E * A],
+        base_end=ends.Pinned(), tip_end=ends.Universal(), shear_stiffness=[GA, GA, E * A],
     )  # fmt: skip
     return kc.statics.modes(kc.equilibrium(shaft, NONE), count=40)
 
@@ -199,13 +196,13 @@ LADEN = {
     "length": 0.4, "radius": 0.004, "density": 1200.0, "youngs_modulus": 2e7, "bending_damping": 2e-4,
     "linear_drag": 0.02, "drag": 0.01, "gravity": [1.0, 0.0, -9.81],
     "loads": (
-        AttachedMass(mass=0.004, offset=[0.01, 0.0, 0.005], inertia=[1e-6, 2e-6, 1e-6]),
-        AttachedMass(mass=0.003, at=0.5, offset=[0.0, 0.01, 0.0]),
-        PointWrench(force=[0.02, 0.0, 0.0], at=0.7),
-        DistributedWrench(force=[0.0, 0.03, 0.0], follows=True),
+        loads.AttachedMass(mass=0.004, offset=[0.01, 0.0, 0.005], inertia=[1e-6, 2e-6, 1e-6]),
+        loads.AttachedMass(mass=0.003, at=0.5, offset=[0.0, 0.01, 0.0]),
+        loads.PointWrench(force=[0.02, 0.0, 0.0], at=0.7),
+        loads.DistributedWrench(force=[0.0, 0.03, 0.0], follows=True),
     ),
     "surroundings": (
-        Plane(
+        surroundings.Plane(
             point=[0, 0, -0.05], normal=[0.1, 0, 1.0], stiffness=200.0, friction=0.3, slip=0.05, damping=1.0
         ),
     ),
@@ -235,10 +232,12 @@ def test_a_rod_in_the_frame_moves_as_one_with_a_turning_base():
     for nodes in (11, 21):
         seen = rod(
             SpinningFrame(RATE, point=POINT), **LADEN, nodes=nodes,
-            base_end=Clamped(position=PLACE, orientation=TILT),
+            base_end=ends.Clamped(position=PLACE, orientation=TILT),
         )  # fmt: skip
         driven = rod(
-            **LADEN, nodes=nodes, base_end=Driven(axes=("x", "y", "rz"), position=PLACE, orientation=TILT)
+            **LADEN,
+            nodes=nodes,
+            base_end=ends.Driven(axes=("x", "y", "rz"), position=PLACE, orientation=TILT),
         )
         one = kc.simulate(seen, np.zeros((STEPS, 0)), TIME / STEPS, space="lobatto4", initial="unstressed")
         other = kc.simulate(driven, control, TIME / STEPS, space="lobatto4", initial=carried(driven))
@@ -257,7 +256,7 @@ def test_without_damping_energy_less_spin_times_angular_momentum_is_constant():
     for nodes in (21, 41):
         robot = rod(
             SpinningFrame(15.0), nodes=nodes,
-            base_end=Clamped(orientation=[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]),
+            base_end=ends.Clamped(orientation=[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]),
         )  # fmt: skip
         # let go from its shape under a weight along the axis
         bent = kc.equilibrium(robot.replace(gravity=[0.0, 0.0, -9.81]), NONE, space="lobatto4")

@@ -7,18 +7,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.learning import NetworkOptions
 from knode_cosserat.learning.residual import network
-from knode_cosserat.rods.ends import Driven, Pinned
+from knode_cosserat.robots import Insertion, Stretch
+from knode_cosserat.rods.ends import Driven
 from knode_cosserat.rods.fluids import Fluid
-from knode_cosserat.rods.frame import SpinningFrame
-from knode_cosserat.rods.insertion import Insertion
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, PointWrench
 from knode_cosserat.rods.magnets import Magnet, UniformField
-from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.routing import Helical, Straight, Tapered
-from knode_cosserat.rods.section import Stretch, TabulatedSection
+from knode_cosserat.rods.section import TabulatedSection
 from knode_cosserat.solvers.damping import UndampedWarning
 
 L, RADIUS, DENSITY = 0.5, 0.005, 1000.0
@@ -319,22 +316,6 @@ def test_a_straight_rod_takes_its_momentum_from_the_hole():
 
 
 # what it excludes
-
-
-@pytest.mark.parametrize(
-    ("changes", "match"),
-    [
-        ({"base_end": Pinned()}, "clamped or driven base_end"),
-        ({"loads": (AttachedMass(mass=0.1, at=0.5),)}, "load0 at a place within the rod; allowed are point"),
-        ({"effects": (*FED, Relaxation(stiffness=0.5, time=1.0))}, "parts without internal variables"),
-        ({"effects": (*FED, SpinningFrame(1.0))}, "a spinning-frame before it"),
-        ({"effects": (Insertion(retraction=0.5),)}, "less than the robot's length"),
-    ],
-)
-def test_parts_at_places_of_the_material_are_refused_in_one_line(changes, match):
-    with pytest.raises(ParameterError, match=match) as caught:
-        rod(**changes)
-    assert "\n" not in str(caught.value)
 
 
 def test_the_control_has_the_limits_of_the_hole():

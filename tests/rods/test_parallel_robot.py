@@ -265,17 +265,6 @@ def test_the_actuators_move_as_they_are_told():
 
 
 @pytest.mark.campaign
-def test_a_batch_is_as_its_robots_one_by_one():
-    controls = np.stack([smooth(0, 20), smooth(1, 20)])
-    robots = [ROBOT, ROBOT.replace(youngs_modulus=1.8e11)]
-    both = kc.simulate(robots, controls, DT)
-    for k, robot in enumerate(robots):
-        alone = kc.simulate(robot, controls[k], DT)
-        np.testing.assert_allclose(both.position[k], alone.position, atol=1e-8)
-        np.testing.assert_allclose(both[k].tip_position, robot.platform_position(alone.y), atol=1e-8)
-
-
-@pytest.mark.campaign
 def test_large_displacements_are_recovered():
     """Too far for Newton's method from rest: the stable elimination and load continuation get there."""
     found, y = still(ROBOT, [0.2, -0.2] * 3)
@@ -301,16 +290,3 @@ def test_a_wrong_modulus_is_learned_from_one_trajectory():
 
 
 # files, and bad input
-
-
-def test_a_file_gives_the_robot_back(tmp_path):
-    kc.save_robot(ROBOT, tmp_path / "robot.yaml")
-    again = kc.load_robot(tmp_path / "robot.yaml")
-    assert jax.tree.structure(again) == jax.tree.structure(ROBOT)
-    for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(ROBOT), strict=True):
-        np.testing.assert_array_equal(one, other)
-
-
-def test_every_leg_needs_both_of_its_joints():
-    with pytest.raises(kc.robots.ParameterError, match="there are 5 base_angles and 6 platform_angles"):
-        ROBOT.replace(base_angles=EVEN[:5])

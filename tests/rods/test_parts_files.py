@@ -15,15 +15,14 @@ import yaml
 from hypothesis import given, settings
 
 import knode_cosserat as kc
-from knode_cosserat.learning.config import NetworkOptions
+from knode_cosserat.learning import NetworkOptions
 from knode_cosserat.learning.residual import network
+from knode_cosserat.robots import RobotFileError, SlenderRod, SpinningFrame
 from knode_cosserat.rods.ends import Driven, End
-from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench, Load, PointWrench
 from knode_cosserat.rods.parameters import Choice, kinds_of, parameters_of, stated_of
 from knode_cosserat.rods.parts import Part
-from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
-from knode_cosserat.rods.rod import SlenderRod
+from knode_cosserat.rods.robot_file import KINDS, format_robot, parse_robot
 from knode_cosserat.rods.routing import FunctionRouting, Routing
 from knode_cosserat.rods.section import SectionChange
 from knode_cosserat.rods.strands import strand_of
@@ -187,6 +186,23 @@ HEAD = (
          "loads.0.follows is 'maybe'; allowed is false, true"),
         ("loads: [{kind: point-wrench, force: [1, 2]}]",
          "loads.0.force must be three numbers, each .*(got [1, 2])"),
+        ("loads: [{kind: fluid, density: -1}]", "loads.0.density must be between 0 and 25000 kg/m3 (got -1)"),
+        ("loads: [{kind: fluid, stream: 1}]",
+         "loads.0.stream must be three numbers, each between -100 and 100 m/s"),
+        ("loads: [{kind: magnet, field: {kind: dipol}}]",
+         "loads.0.field.kind is 'dipol'; allowed is dipole, uniform; did you mean dipole?"),
+        ("loads: [{kind: magnet, field: {kind: dipole, moment: [0, 0, 1]}}]",
+         "loads.0.field: the key 'position' is missing"),
+        ("loads: [{kind: magnet, field: {kind: uniform, flux_density: [0, 0, 1.0e+9]}}]",
+         "loads.0.field.flux_density must be three numbers, each between -100 and 100 T"),
+        ("loads: [{kind: magnet, field: 3}]",
+         "loads.0.field is 3; allowed is a mapping with a kind: dipole, uniform"),
+        ("cross_section: {kind: hollow, radius: 0.01}", "cross_section: the key 'inner_radius' is missing"),
+        ("cross_section: {kind: hollow, radius: 0.01, inner_radius: 0.01}",
+         ".*inner_radius is 0.01; allowed is less than radius, 0.01"),
+        ("cross_section: {kind: oval, radius: 0.01}",
+         "cross_section.kind is 'oval'; allowed is elliptic, hollow, rectangular, tabulated"),
+        ("cross_section: {kind: elliptic, semi_axis_x: 5, semi_axis_y: 1}", ".*Did you mean 0.005 (5 mm)"),
         ("base_end: {kind: driven, axes: [[x]]}", "base_end.axes is [['x']]; allowed is a list of different"),
         ("base_end: clamped",
          "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned"),

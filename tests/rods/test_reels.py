@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.robots import ParameterError
 from knode_cosserat.rods.tendons import Reels
 
 PAIRS = Reels(motors=(1, -1, 2, -2), radius=(0.02, 0.03), zero=(0.1, 0.0), taken_in=(1e-3, 1e-3, 0.0, 2e-3))
@@ -53,24 +53,6 @@ def test_reels_come_back_from_a_file(tmp_path):
     for name in ("motors", "radius", "zero", "taken_in"):
         np.testing.assert_array_equal(getattr(again.reels, name), getattr(PAIRS, name))
     assert again.reels.compliance is None
-
-
-@pytest.mark.parametrize(
-    ("given", "message"),
-    [
-        ({"motors": (1, 3), "radius": (0.1,)}, "one whole number for each tendon"),
-        ({"motors": (1, -1)}, "radius is missing"),
-        ({"motors": (1, -1), "radius": (0.1, 0.2)}, "radius has 2 numbers; allowed is 1, one for each motor"),
-        (
-            {"motors": (1, 2, 3), "radius": (0.1,) * 6},
-            r"6 numbers.*motors, \[1, 2, 3\], has one number for each ten",
-        ),
-        ({"motors": (1, 2), "taken_in": (0.0,)}, "taken_in has 1 numbers; allowed is 2, one for each tendon"),
-    ],
-)
-def test_what_does_not_fit_together_is_said(given, message):
-    with pytest.raises(ParameterError, match=message):
-        Reels(**given)
 
 
 def test_reels_fit_the_robot():

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.relaxation import Relaxation
+from knode_cosserat.robots import Relaxation
 from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.schemes.semi_discrete import History, Point
 

@@ -12,19 +12,11 @@ import yaml
 from hypothesis import given, settings
 
 import knode_cosserat as kc
+from knode_cosserat import catalog, load_robot, save_robot
 from knode_cosserat.cli.arguments import modified
+from knode_cosserat.robots import Observed, RobotFileError, TendonRobot, parameter
 from knode_cosserat.rods import robot_file
-from knode_cosserat.rods.aspects import Observed
-from knode_cosserat.rods.parameters import parameter
-from knode_cosserat.rods.robot_file import (
-    RobotFileError,
-    catalog,
-    format_robot,
-    load_robot,
-    parse_robot,
-    save_robot,
-)
-from knode_cosserat.rods.tendon_robots import TendonRobot
+from knode_cosserat.rods.robot_file import format_robot, parse_robot
 
 PAPER = "delrin-tendon-robot"
 HEAD = "format: 1\nkind: tendon-robot\n"
@@ -76,7 +68,9 @@ def test_the_catalog(name):
     description = catalog()[name]
     assert description
     assert "\n" not in description
-    assert_equal(load_robot(name), load_robot(Path(robot_file.__file__).parent / "catalog" / f"{name}.yaml"))
+    robot = load_robot(name)
+    assert_equal(robot, load_robot(Path(robot_file.__file__).parent / "catalog" / f"{name}.yaml"))
+    assert_equal(robot, parse_robot(format_robot(robot), "here"))
 
 
 def test_every_number_in_the_catalog_has_its_unit_beside_it():

@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 import knode_cosserat as kc
 from knode_cosserat._files.yaml_text import mapping_of
 from knode_cosserat.recordings.virtual import virtual_robot
-from knode_cosserat.rods.robot_file import KINDS, RobotFileError, format_robot, parse_robot
+from knode_cosserat.robots import RobotFileError
+from knode_cosserat.rods.robot_file import KINDS, format_robot, parse_robot
 
 ROOT = Path(__file__).parents[2]
 SCHEMA = kc.robots.robot_schema()

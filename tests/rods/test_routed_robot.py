@@ -8,33 +8,19 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
+from knode_cosserat import Result
 from knode_cosserat.recordings.virtual import virtual_robot
-from knode_cosserat.rods.robot_file import format_robot, parse_robot
-from knode_cosserat.rods.section import Sleeve
-from knode_cosserat.rods.tendons import TendonFriction, Vibration
-from knode_cosserat.schemes.result import Result
+from knode_cosserat.robots import section, tendons
 
 KNOWLEDGE = kc.load_robot("delrin-tendon-robot")
 NO_LOADS = {"gravity": [0.0, 0.0, 0.0], "drag": 0.0}
 RUBBING = {
-    "friction": TendonFriction(wobble=0.6, curvature=0.1, reach=0.1), "bending_damping": 2e-3
+    "friction": tendons.TendonFriction(wobble=0.6, curvature=0.1, reach=0.1), "bending_damping": 2e-3
 }  # fmt: skip
 
 
 def moved(robot, steps=60, dt=0.025, control="sine:1.0", **options):
     return kc.simulate(robot, kc.controls.parse(control, steps, dt), dt, **options)
-
-
-@pytest.mark.parametrize("empty", [(), []])
-def test_a_robot_without_tendons_is_refused(empty):
-    with pytest.raises(
-        kc.robots.ParameterError, match=r"^routing is \[\]; allowed is one or more, one for each tendon"
-    ):
-        kc.robots.RoutedTendonRobot.like(KNOWLEDGE, routing=empty)
-    text = format_robot(kc.robots.RoutedTendonRobot.like(KNOWLEDGE)).replace("format: 1", "format: 2")
-    with pytest.raises(kc.robots.RobotFileError, match=r"^mine.yaml: routing is \[\]; allowed is") as caught:
-        parse_robot(text + "  routing: []\n", "mine.yaml")
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.slow
@@ -71,7 +57,7 @@ def test_tendons_pull_the_rod_to_their_side_like_the_crude_model():
 
 @pytest.mark.slow
 def test_a_quarter_turn_of_the_tendons_is_a_quarter_turn_of_the_robot():
-    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(section.Sleeve(stiffening=1.0),))
     control = kc.controls.parse("random:3", 200, 0.025)
     one, other = kc.simulate(robot, control, 0.025), kc.simulate(robot, np.roll(control, 1, axis=1), 0.025)
     turned = Rotation.from_euler("z", 90, degrees=True).apply(one.position.reshape(-1, 3))
@@ -109,7 +95,7 @@ def test_friction_is_the_same_however_fine_the_time_steps_are():
 @pytest.mark.slow
 def test_friction_stays_between_none_and_all_and_opposes_motion():
     # of the same parts as above, for the same program
-    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(section.Sleeve(stiffening=1.0),))
     along = moved(robot, 200, control="random:1")
     f = np.asarray(along.z)[..., 6:10]
     assert np.all(np.abs(f) <= 1.0) and np.abs(f).max() > 0.5
@@ -128,7 +114,7 @@ def test_friction_stays_between_none_and_all_and_opposes_motion():
 @pytest.mark.campaign
 def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
     robot = kc.robots.RoutedTendonRobot.like(
-        KNOWLEDGE, **RUBBING, vibration=Vibration(tension=20.0, rate=1.0, softening=1e-3)
+        KNOWLEDGE, **RUBBING, vibration=tendons.Vibration(tension=20.0, rate=1.0, softening=1e-3)
     )
     total = np.concatenate([np.full(20, 16.0), np.full(20, 24.0), np.full(20, 18.0)])
     along = kc.simulate(robot, np.repeat(total[:, None] / 4, 4, axis=1), 0.05)
@@ -139,7 +125,7 @@ def test_vibration_frees_the_tendons_and_stays_until_tension_falls():
 
 @pytest.mark.campaign
 def test_derivatives_are_those_of_the_solution():
-    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(Sleeve(stiffening=1.0),))
+    robot = kc.robots.RoutedTendonRobot.like(KNOWLEDGE, **RUBBING, sections=(section.Sleeve(stiffening=1.0),))
     control = kc.controls.parse("sine:0.7", 30, 0.05)
 
     def tip(wobble, reach):
@@ -169,7 +155,7 @@ def test_the_batch_does_what_each_robot_does():
 @pytest.mark.campaign
 def test_strong_pulls_and_much_friction_are_solved_or_reported():
     robot = kc.robots.RoutedTendonRobot.like(
-        KNOWLEDGE, friction=TendonFriction(wobble=1.0, reach=0.03), bending_damping=2e-3
+        KNOWLEDGE, friction=tendons.TendonFriction(wobble=1.0, reach=0.03), bending_damping=2e-3
     )
     for seed in range(4):
         control = 3.0 * kc.controls.parse(f"random:{seed}", 60, 0.05)

@@ -9,8 +9,8 @@ import pytest
 from scipy.integrate import quad, solve_ivp
 
 import knode_cosserat as kc
-from knode_cosserat.rods import section as sections
-from knode_cosserat.rods.loads import PointWrench
+from knode_cosserat.robots import loads
+from knode_cosserat.robots import section as sections
 from knode_cosserat.rotation import rotation_matrix
 
 L, RADIUS, E = 0.4, 0.006, 1e7
@@ -28,7 +28,7 @@ CHANGED = kc.robots.SlenderRod(
             stiffness_gain=0.0, curvature_gain=[0.0, 0.0, 0.0],
         ),
     ),
-    loads=(PointWrench(at=1.0),),
+    loads=(loads.PointWrench(at=1.0),),
 )  # fmt: skip
 
 

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 
-from knode_cosserat.rods.loads import Motion
-from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.surroundings import Cylinder, Plane, Sphere
+from knode_cosserat.robots import loads, surroundings
 
 vectors = st.lists(st.floats(-2.0, 2.0), min_size=3, max_size=3).map(np.array)
 directions = vectors.filter(lambda v: np.linalg.norm(v) > 0.1)
@@ -19,33 +17,24 @@ directions = vectors.filter(lambda v: np.linalg.norm(v) > 0.1)
 @given(vectors, vectors, directions)
 def test_the_distance_from_a_plane(p, point, normal):
     away, along = normal / np.linalg.norm(normal), np.linalg.svd(normal[None])[2][1]
-    distance, out = Plane(point=point, normal=normal).distance(p)
+    distance, out = surroundings.Plane(point=point, normal=normal).distance(p)
     foot = p - float(distance) * np.asarray(out)
     np.testing.assert_allclose(out, away, atol=1e-12)
     assert np.dot(foot - point, normal) == pytest.approx(0.0, abs=1e-9)
     # of any length, and through any of its points
-    same = Plane(point=point + along, normal=7.0 * normal).distance(p)[0]
+    same = surroundings.Plane(point=point + along, normal=7.0 * normal).distance(p)[0]
     assert float(same) == pytest.approx(float(distance), abs=1e-9)
 
 
 @pytest.mark.parametrize("length", [2e-9, 1e-5, 1e3])
 def test_a_direction_is_of_any_length(length):
     normal = length * np.array([0.6, 0.0, 0.8])
-    distance, out = Plane(normal=normal).distance(np.array([0.0, 0.0, 1.0]))
+    distance, out = surroundings.Plane(normal=normal).distance(np.array([0.0, 0.0, 1.0]))
     np.testing.assert_allclose(out, [0.6, 0.0, 0.8], rtol=1e-15)
     assert float(distance) == pytest.approx(0.8, rel=1e-15)
-    assert float(Cylinder(axis=normal).distance(np.array([0.0, 0.0, 1.0]))[0]) == pytest.approx(0.5)
-
-
-@pytest.mark.parametrize("given", [[0, 0, 0], [0, 1e-12, 0], [1e-9, 0, 0], [1e-200, 0, 0]])
-@pytest.mark.parametrize(("cls", "name"), [(Plane, "normal"), (Cylinder, "axis")])
-def test_but_of_some(cls, name, given):
-    with pytest.raises(
-        ParameterError, match=rf"^{cls.__name__}: {name} must be a direction, .*above 1e-09\), "
-    ):
-        cls(**{name: given})
-    with pytest.raises(ParameterError, match=rf"^{cls.__name__}: {name} must be a direction, .*got 'up'"):
-        cls(**{name: "up"})
+    assert float(surroundings.Cylinder(axis=normal).distance(np.array([0.0, 0.0, 1.0]))[0]) == pytest.approx(
+        0.5
+    )
 
 
 @settings(max_examples=50, deadline=None)
@@ -54,7 +43,7 @@ def test_the_distance_from_a_sphere(p, center, radius, inside):
     length = np.linalg.norm(p - center)
     if length < 1e-3:
         return
-    distance, out = Sphere(center=center, radius=radius, inside=inside).distance(p)
+    distance, out = surroundings.Sphere(center=center, radius=radius, inside=inside).distance(p)
     sign = -1.0 if inside else 1.0
     assert float(distance) == pytest.approx(sign * (length - radius), abs=1e-9)
     # on the surface, along the normal
@@ -70,7 +59,7 @@ def test_the_distance_from_a_cylinder(p, point, axis, radius, inside, shift):
     to_axis = np.linalg.norm(np.cross(p - point, unit))
     if to_axis < 1e-3:
         return
-    pipe = Cylinder(point=point, axis=axis, radius=radius, inside=inside)
+    pipe = surroundings.Cylinder(point=point, axis=axis, radius=radius, inside=inside)
     distance, out = pipe.distance(p)
     sign = -1.0 if inside else 1.0
     assert float(distance) == pytest.approx(sign * (to_axis - radius), abs=1e-9)
@@ -79,16 +68,16 @@ def test_the_distance_from_a_cylinder(p, point, axis, radius, inside, shift):
     assert float(pipe.distance(p + shift * unit)[0]) == pytest.approx(float(distance), abs=1e-9)
 
 
-MOVING = Motion(*map(jnp.asarray, (
+MOVING = loads.Motion(*map(jnp.asarray, (
     [0.05, 0.02, 0.1035], np.eye(3), [0.02, -0.01, -0.03], [0.3, 0.1, 0.2], np.zeros(3), np.zeros(3)
 )))  # fmt: skip
 OBSTACLES = [
     each(stiffness=1e4, smoothing=1e-3, damping=2.0, friction=0.4, slip=1e-2, **where)
     for each, where in (
-        (Plane, {"point": [0.0, 0.0, 0.1]}),
-        (Sphere, {"radius": 0.115}),
-        (Sphere, {"radius": 0.118, "inside": True}),
-        (Cylinder, {"radius": 0.102}),
+        (surroundings.Plane, {"point": [0.0, 0.0, 0.1]}),
+        (surroundings.Sphere, {"radius": 0.115}),
+        (surroundings.Sphere, {"radius": 0.118, "inside": True}),
+        (surroundings.Cylinder, {"radius": 0.102}),
     )
 ]
 
@@ -116,7 +105,7 @@ def test_the_force_of_contact_is_smooth(obstacle, depth):
 
 
 def test_the_force_is_a_spring_and_friction_is_coulombs():
-    plane = Plane(stiffness=1e4, smoothing=1e-5, friction=0.5, slip=1e-4)
+    plane = surroundings.Plane(stiffness=1e4, smoothing=1e-5, friction=0.5, slip=1e-4)
     still = MOVING._replace(p=jnp.array([0.0, 0.0, 0.004]), q=jnp.zeros(3), w=jnp.zeros(3))
     force, _ = plane.wrench(still, 0.005)
     np.testing.assert_allclose(force, [0.0, 0.0, 10.0], rtol=1e-9)
@@ -132,7 +121,7 @@ def test_the_force_is_a_spring_and_friction_is_coulombs():
 
 
 def test_what_comes_faster_is_pushed_harder_and_what_leaves_is_not_held():
-    plane = Plane(stiffness=1e4, smoothing=1e-5, damping=2.0)
+    plane = surroundings.Plane(stiffness=1e4, smoothing=1e-5, damping=2.0)
     at = MOVING._replace(p=jnp.array([0.0, 0.0, 0.004]), w=jnp.zeros(3))
     force = [
         float(plane.wrench(at._replace(q=jnp.array([0.0, 0.0, v])), 0.005)[0][2]) for v in (-0.1, 0.1, 2.0)

@@ -8,15 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import root
 
 import knode_cosserat as kc
-from knode_cosserat.rods.routing import (
-    FunctionRouting,
-    Helical,
-    Polynomial,
-    RoutedPaths,
-    Straight,
-    Tapered,
-    routes,
-)
+from knode_cosserat.robots import routing
 from knode_cosserat.rods.tendon_law import TendonLaw, tendon_strains
 from tests.rods import rucker_webster as oracle
 
@@ -41,14 +33,14 @@ SOFT = oracle.Rod(
 
 def shape(rod, routings, tensions, tolerance=1e-11):
     """[p, R, v, u] at the tip by the package's law: n and m carry rod and tendons, and have no jumps."""
-    anchored = np.array(RoutedPaths(routings, rod.length).ends)
+    anchored = np.array(routing.RoutedPaths(routings, rod.length).ends)
     stops = sorted({*(anchored * rod.length), rod.length})
 
     @jax.jit
     def rates(s, x, tension):
         R, m = x[3:12].reshape(3, 3), x[12:]
         n = rod.weight * (rod.length - s)
-        r, r_s = routes(routings, s / rod.length, rod.length)
+        r, r_s = routing.routes(routings, s / rod.length, rod.length)
         load = jnp.concatenate([R.T @ n + rod.Kse @ oracle.V_STAR, R.T @ m])
         v, u = tendon_strains(TendonLaw(rod.Kse, rod.Kbt, load, r, r_s, tension))
         R_s = jnp.stack([jnp.cross(row, u) for row in R])
@@ -85,14 +77,14 @@ def test_the_oracle_bends_a_rod_with_a_straight_tendon_to_a_circle(tension):
 QUARTERS = [k * np.pi / 2 for k in range(4)]
 CASES = {
     "straight": (
-        [Straight(0.02 * np.cos(a), 0.02 * np.sin(a)) for a in QUARTERS],
+        [routing.Straight(0.02 * np.cos(a), 0.02 * np.sin(a)) for a in QUARTERS],
         lambda T: [
             oracle.polynomial([0.02 * np.cos(a)], [0.02 * np.sin(a)], L, t)
             for a, t in zip(QUARTERS, T, strict=True)
         ],
     ),
     "tapered": (
-        [Tapered(0.02, 0.008, a) for a in QUARTERS],
+        [routing.Tapered(0.02, 0.008, a) for a in QUARTERS],
         lambda T: [
             oracle.polynomial(
                 [0.02 * np.cos(a), -0.012 * np.cos(a)], [0.02 * np.sin(a), -0.012 * np.sin(a)], L, t
@@ -101,15 +93,15 @@ CASES = {
         ],
     ),
     "helical": (
-        [Helical(0.02, a, 1.0) for a in QUARTERS],
+        [routing.Helical(0.02, a, 1.0) for a in QUARTERS],
         lambda T: [oracle.helix(0.02, a, 1.0, L, t) for a, t in zip(QUARTERS, T, strict=True)],
     ),
     "of all kinds, two end early": (
         [
-            Polynomial([0.01, 0.02, -0.03], [0.0, 0.015]),
-            Tapered(0.02, 0.01, np.pi / 2, end=0.4),
-            Helical(0.015, 3.0, -0.5, end=0.7),
-            FunctionRouting(lambda sigma: (0.004 + 0.01 * sigma**3, -0.02 + 0.0 * sigma)),
+            routing.Polynomial([0.01, 0.02, -0.03], [0.0, 0.015]),
+            routing.Tapered(0.02, 0.01, np.pi / 2, end=0.4),
+            routing.Helical(0.015, 3.0, -0.5, end=0.7),
+            routing.FunctionRouting(lambda sigma: (0.004 + 0.01 * sigma**3, -0.02 + 0.0 * sigma)),
         ],
         lambda T: [
             oracle.polynomial([0.01, 0.02, -0.03], [0.0, 0.015], L, T[0]),
@@ -137,7 +129,7 @@ def test_the_law_agrees_with_rucker_and_webster(case, tensions):
 @pytest.mark.slow
 def test_a_soft_rod_that_its_tendons_compress():
     tensions = np.array([4.0, 3.0, 3.5, 3.0])
-    routings = [Straight(0.006 * np.cos(a), 0.006 * np.sin(a)) for a in QUARTERS]
+    routings = [routing.Straight(0.006 * np.cos(a), 0.006 * np.sin(a)) for a in QUARTERS]
     paths = [
         oracle.polynomial([0.006 * np.cos(a)], [0.006 * np.sin(a)], 0.2, t)
         for a, t in zip(QUARTERS, tensions, strict=True)

@@ -11,8 +11,9 @@ from hypothesis import settings as given_settings
 import knode_cosserat as kc
 from knode_cosserat.schemes.grid import Grid, at_places, grid_of, taken
 from knode_cosserat.schemes.problem import StepProblem
-from knode_cosserat.schemes.settings import Settings, schemes
+from knode_cosserat.schemes.settings import schemes
 from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.solvers import Settings
 from knode_cosserat.solvers.rest import constant_history, rest_record
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}

@@ -13,8 +13,9 @@ from examples.hanging_string import HangingString
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.schemes.grid import at_places, grid_of
 from knode_cosserat.schemes.problem import StepProblem
-from knode_cosserat.schemes.settings import Settings, schemes
+from knode_cosserat.schemes.settings import schemes
 from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.solvers import Settings
 from knode_cosserat.solvers.initial import continued_state
 from knode_cosserat.solvers.replay import replay
 from knode_cosserat.solvers.rest import resting_history, still_records

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.robots import Drawing
 from knode_cosserat.solvers.places import Places, places_at, positions_at
 
 #: a third or two thirds of the way between two nodes, on each grid below

@@ -15,7 +15,7 @@ from knode_cosserat.rods.tendons import TendonFriction, Vibration
 from knode_cosserat.schemes.grid import at_places
 from knode_cosserat.schemes.history import advanced, history_of
 from knode_cosserat.schemes.problem import StepProblem
-from knode_cosserat.schemes.settings import Settings
+from knode_cosserat.solvers import Settings
 from knode_cosserat.solvers.rest import resting_history
 from tests.trajectories import HOPELESS, synthetic
 

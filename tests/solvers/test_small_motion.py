@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from scipy.special import ellipe, ellipk
 
 import knode_cosserat as kc
-from knode_cosserat.rods.tendons import TendonFriction
+from knode_cosserat.robots import tendons
 from knode_cosserat.schemes.result import Verdict
 
 r = kc.robots
@@ -190,7 +190,7 @@ def test_an_untested_equilibrium_says_why(tmp_path):
 
 def test_friction_has_a_reason():
     robot = kc.load_robot("delrin-routed-tendon-robot")
-    rubbing = robot.replace(friction=TendonFriction(wobble=0.6, reach=0.1))
+    rubbing = robot.replace(friction=tendons.TendonFriction(wobble=0.6, reach=0.1))
     found, _ = rest(rubbing, np.full(4, 5.0))
     assert found.verdict == "stability not tested: friction has no linearisation at rest"
 

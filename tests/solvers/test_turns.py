@@ -6,7 +6,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.envs import TaskError
-from knode_cosserat.rods.assembly import Assembly, RigidBody
+from knode_cosserat.robots import Assembly, RigidBody
 from knode_cosserat.solvers.guess import largest_turns
 from knode_cosserat.solvers.run import refuse_far_turns
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.ends import Driven
+from knode_cosserat.robots import ends
 from knode_cosserat.statics import path
 
 L, RADIUS, E = 1.0, 2e-3, 1e9
@@ -15,7 +15,7 @@ def test_a_twisted_ring_stays_a_circle_and_has_no_limit_points():
     """It turns about its tangent without a force at any twist, below Michell's 2π√3 EI/GJ = 14.1 rad."""
     ring = kc.robots.SlenderRod(
         length=L, radius=RADIUS, density=1e3, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=21,
-        tip_end=Driven(position=[0.0, 0.0, 0.0], axes=("rz",)),
+        tip_end=ends.Driven(position=[0.0, 0.0, 0.0], axes=("rz",)),
     )  # fmt: skip
     s, r = 2.0 * np.pi * np.linspace(0.0, 1.0, 41), L / (2.0 * np.pi)
     circle = np.stack([r * (1.0 - np.cos(s)), 0.0 * s, r * np.sin(s)], axis=1)

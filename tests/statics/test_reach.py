@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import knode_cosserat as kc
 from knode_cosserat.learning.structured.residual import Structured
-from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.robots import Drawing
 from knode_cosserat.statics.reach import _same_shape, at_limits, rotation_between
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
