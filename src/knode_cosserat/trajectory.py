@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -28,7 +27,7 @@ from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, parameters_of, slots_of
 from knode_cosserat.rods.strands import strand_count
-from knode_cosserat.rods.system import ChosenNodes, System, is_traced, nodes_text
+from knode_cosserat.rods.system import ChosenNodes, System, array_module, is_traced, nodes_text
 from knode_cosserat.schemes.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
 from knode_cosserat.schemes.result import Result, ResultCodes, Verdict, VerdictCodes
 from knode_cosserat.schemes.settings import Settings
@@ -137,7 +136,7 @@ class Trajectory:
                 "rows between were left out, and controls may have changed there; take held_control of the "
                 "whole trajectory"
             )
-        numeric: Any = jnp if is_traced(self.control) else np
+        numeric = array_module(self.control)
         after = self.control[..., 1:, :]
         return numeric.concatenate([after, numeric.full_like(self.control[..., :1, :], numeric.nan)], axis=-2)
 

@@ -22,7 +22,7 @@ from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, SlenderRod
 from knode_cosserat.rods.section import CrossSection
 from knode_cosserat.rods.strands import Bundle, in_strands
-from knode_cosserat.rods.system import Discontinuities, Scales, System, is_traced
+from knode_cosserat.rods.system import Discontinuities, Scales, System, array_module
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 #: indices in a leg's y at which the fields after p begin
@@ -151,7 +151,7 @@ class ParallelRobot(Bundle):
 
     def legs(self, y: Float[Any, "*n y"]) -> list[Any]:
         """Return p, h, n, m, q and w (…, legs, size) of states y."""
-        numeric: Any = jnp if is_traced(y) else np
+        numeric = array_module(y)
         return numeric.split(in_strands(self, y), FIELDS, axis=-1)
 
     def leg_positions(self, y: Any) -> Any:
@@ -286,7 +286,7 @@ class _PlatformDrawing(Drawing, of=ParallelRobot):
 
     def positions(self, y: Any) -> Any:
         """Return the robot's axis (…, 3) in m, from states y (…, y); at the tip, the platform's centre."""
-        numeric: Any = jnp if is_traced((self.system, y)) else np
+        numeric = array_module((self.system, y))
         p, h, *_ = self.system.legs(y)
         w, x = h[..., :1], h[..., 1:]
         joints = numeric.asarray(self.system.joints)
@@ -300,7 +300,7 @@ class _PlatformDrawing(Drawing, of=ParallelRobot):
 
     def quaternions(self, y: Any) -> Any:
         """Return the legs' mean orientations (…, 4), scalar first; at the tip, the platform's."""
-        numeric: Any = jnp if is_traced((self.system, y)) else np
+        numeric = array_module((self.system, y))
         h = self.system.legs(y)[1]
         h = h / numeric.sqrt(numeric.sum(h * h, axis=-1, keepdims=True))
         same = numeric.sum(h * h[..., :1, :], axis=-1, keepdims=True) >= 0.0
@@ -332,7 +332,7 @@ class _PlatformObserved(Observed, of=ParallelRobot):
 
 
 def _on_circle(radius: Any, angles: Any) -> Float[Any, "legs 3"]:
-    numeric: Any = jnp if is_traced((radius, angles)) else np
+    numeric = array_module((radius, angles))
     radius = numeric.asarray(radius)[..., None]
     x, y = radius * numeric.cos(angles), radius * numeric.sin(angles)
     return numeric.stack([x, y, numeric.zeros(numeric.shape(angles))], axis=-1)

@@ -6,11 +6,8 @@ import abc
 import functools
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
-import numpy as np
-
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module
 
 
 @functools.singledispatch
@@ -34,7 +31,7 @@ def in_strands(system: System, packed: Any) -> Any:
 def of_rods(system: System, y: Any, name: str) -> Any:
     """Return a field of y of all strands, or rods of an assembly: (…, y) becomes (…, rods, size)."""
     strands, places = in_strands(system, y), strand_of(system).y_layout.ranges(name)
-    numeric: Any = jnp if is_traced(y) else np
+    numeric = array_module(y)
     return numeric.concatenate([strands[..., rows.start : rows.stop] for rows in places], axis=-2)
 
 

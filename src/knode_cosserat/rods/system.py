@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.law import InternalState, MaterialLaw, StressedLaw
@@ -192,3 +193,8 @@ def is_traced(tree: Any) -> bool:
     """True if any leaf is a JAX tracer: inside `jit`, `grad` or `vmap` values are not available."""
     # the instance check of JAX's abstract class takes ten times as long
     return any(jax.core.Tracer in type(leaf).__mro__ for leaf in jax.tree.leaves(tree))
+
+
+def array_module(tree: Any) -> Any:
+    """Return `jax.numpy` for arrays inside JAX's transformations, and `numpy` for others."""
+    return jnp if is_traced(tree) else np

@@ -9,7 +9,6 @@ from collections.abc import Iterable
 from typing import Any, ClassVar, Self
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -17,7 +16,7 @@ from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import ParameterError, parameter
 from knode_cosserat.rods.parts import Part
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module
 
 #: tolerance beyond a range, as a part of the largest range in its field. A mostly planar bend is then inside
 #: in spite of a trace of bending in the other plane. A model's own motion under the controls of its training
@@ -79,7 +78,7 @@ class TrainedRange(Part):
         z: Float[Any, "*batch T N z"],
     ) -> Bool[Any, "*batch T"]:  # fmt: skip
         """Return True for rows of a motion outside the range; the first control of several is ignored."""
-        numeric: Any = jnp if is_traced((time, control, z)) else np
+        numeric = array_module((time, control, z))
         strain = system.z_layout
         beyond = _beyond(strain, z, self.strain_low, self.strain_high)
         beyond |= _beyond(strain, _rates(time, z), self.rate_low, self.rate_high)
@@ -104,7 +103,7 @@ def trained_range(system: Any) -> TrainedRange | None:
 
 def _rates(time: Any, z: Any) -> Any:
     """Return the rates of change since the previous row (…, T, N, z); zero in the first row."""
-    numeric: Any = jnp if is_traced((time, z)) else np
+    numeric = array_module((time, z))
     steps = numeric.diff(numeric.asarray(time, dtype=float))[:, None, None]
     first = numeric.zeros_like(z[..., :1, :, :])
     return numeric.concatenate([first, numeric.diff(z, axis=-3) / steps], axis=-3)
@@ -126,7 +125,7 @@ def _beyond(layout: Layout, values: Any, low: Any, high: Any) -> Any:
         (layout.get(high - low, field.name).max(axis=-1, keepdims=True), field.size)
         for field in layout.fields
     ]
-    numeric: Any = jnp if is_traced((values, low)) else np
+    numeric = array_module((values, low))
     width = numeric.concatenate([numeric.repeat(width, size, axis=-1) for width, size in widths], axis=-1)
     slack = MARGIN * width + ROUNDING * numeric.maximum(numeric.abs(low), numeric.abs(high))
     return (values < low - slack) | (values > high + slack)

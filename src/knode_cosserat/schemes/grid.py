@@ -15,13 +15,12 @@ from __future__ import annotations
 import functools
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.section import INWARD
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module
 from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
 
 #: a discontinuity closer to a node than this part of a segment is placed on the node
@@ -180,7 +179,7 @@ def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]
 def inside(s: Any, low: Any, high: Any) -> Any:
     """Return s, moved a little into the piece from low to high if it is at its end."""
     margin = INWARD * (high - low)
-    return (jnp if is_traced(s) else np).clip(s, low + margin, high - margin)
+    return array_module(s).clip(s, low + margin, high - margin)
 
 
 def taken(values: Any, rows: np.ndarray) -> Any:
@@ -194,4 +193,4 @@ def taken(values: Any, rows: np.ndarray) -> Any:
 
 def _joined(parts: list[Any], axis: int = 0) -> Any:
     """Return arrays as one; by NumPy outside of JAX's transformations, where each shape would be compiled."""
-    return (jnp if is_traced(parts) else np).concatenate(parts, axis=axis)
+    return array_module(parts).concatenate(parts, axis=axis)

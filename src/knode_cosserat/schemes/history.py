@@ -11,11 +11,10 @@ import dataclasses
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from knode_cosserat.rods.system import System, is_traced, unknown_count
+from knode_cosserat.rods.system import System, array_module, unknown_count
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.problem import no_history
 from knode_cosserat.schemes.result import Result
@@ -105,7 +104,7 @@ def at_stages(system: System, settings: Settings, controls: Any, before: Any, su
     linear = moved | (settings.between == "linear")
     if settings.time is None or settings.stages == 1 or not linear.any():
         return controls
-    numeric: Any = jnp if is_traced((controls, before)) else np
+    numeric = array_module((controls, before))
     first = controls[..., :1, :]
     earlier = numeric.where(moved | (not sudden), before, first), controls[..., :-1, :]
     earlier = numeric.where(linear, numeric.concatenate(earlier, axis=-2), controls)
@@ -125,7 +124,7 @@ def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) ->
 
 def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
     """Return the history of the next step."""
-    numeric: Any = jnp if is_traced((past, records, rate, y)) else np
+    numeric = array_module((past, records, rate, y))
     records, y = numeric.stack([records, *past.records[:-1]]), numeric.concatenate([y[None], past.y[:-1]])
     return past._replace(records=records, rate=rate, y=y, weights=weights)
 
@@ -139,7 +138,7 @@ def repeated_record_history(
 ) -> StateHistory:
     """Return a history in which all earlier states equal one state, or of a batch of robots."""
     used, memory = used_places(system, settings.space), settings.memory
-    numeric: Any = jnp if is_traced((records, y, t0)) else np
+    numeric = array_module((records, y, t0))
     robots, size = records.shape[:-2], records.shape[-1]
     weights, t0 = numeric.asarray(EXTRAPOLATIONS[0]), numeric.asarray(t0, dtype=float)
     return StateHistory(
@@ -194,7 +193,7 @@ class StepRows(NamedTuple):
     def every_stage(self) -> tuple[Float[Any, "solves nodes x"], Float[Any, "solves k"]]:
         """Records and unknowns of all stages of all steps in turn, those of the rows among them."""
         pairs = (self.stages, self.records), (self.stage_unknowns, self.unknowns)
-        numeric: Any = jnp if is_traced(self) else np
+        numeric = array_module(self)
         joined = [numeric.concatenate([stages, last[:, None]], axis=1) for stages, last in pairs]
         records, unknowns = (part.reshape(-1, *part.shape[2:]) for part in joined)
         return records, unknowns
@@ -222,7 +221,7 @@ class StepCoefficients(NamedTuple):
 
     def at(self, t0: Any, i: Any) -> tuple[Any, Any]:
         """Return the coefficients of step i, and the times (s) at its end or at those of its stages."""
-        numeric: Any = jnp if is_traced((self, i)) else np
+        numeric = array_module((self, i))
         row = numeric.minimum(i, len(self.table) - 1)
         return numeric.asarray(self.table)[row], t0 + (i + self.ends) * self.dt
 

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module
 from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.schemes.grid import Grid, grid_of, taken
 from knode_cosserat.schemes.semi_discrete import History, Point, records_in_strands, unpacked_history
@@ -43,7 +43,7 @@ def row_of(
 ) -> Float[Any, "nodes x ..."]:
     """Return the row of a solved step: y on the near side of discontinuities, z and y_s on the far side."""
     nodes, ny = grid_of(system).nodes, system.y_layout.size
-    numeric: Any = jnp if is_traced((y, records)) else np
+    numeric = array_module((y, records))
     return numeric.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
 
 

@@ -16,7 +16,7 @@ from knode_cosserat.rods.ends import AXES, Clamped, Pinned, Pose, Universal
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import ALONG
 from knode_cosserat.rods.strands import strand_count
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.solvers.rest import rest_record
@@ -94,7 +94,7 @@ def largest_turns(system: System, changes: Any) -> Any:
 
     It is zero for one rod with an end that cannot hold its turns, such as a free tip.
     """
-    numeric: Any = jnp if is_traced(changes) else np
+    numeric = array_module(changes)
     angles = [numeric.sum(changes[..., columns] ** 2, axis=-1) ** 0.5 for columns in _turning(system)]
     return functools.reduce(numeric.maximum, angles, np.zeros(np.shape(changes)[:-1]))
 
@@ -117,7 +117,7 @@ def turns_within(system: System, controls: Any, before: Any) -> Any:
 
     `before` (..., c) precedes the first one. Controls at several stages of a step count as the last one.
     """
-    numeric: Any = jnp if is_traced((controls, before)) else np
+    numeric = array_module((controls, before))
     rows = controls[..., -system.control_layout.size :]
     earlier = numeric.concatenate([numeric.asarray(before)[..., None, :], rows[..., :-1, :]], axis=-2)
     return largest_turns(system, rows - earlier)

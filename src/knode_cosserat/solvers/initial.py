@@ -6,13 +6,12 @@ import dataclasses
 from typing import Any, Literal
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.strands import strand_count
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module, is_traced
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.history import EXTRAPOLATIONS, SolverState
@@ -110,7 +109,7 @@ def initial_state(
         record, history = rest_record(system), resting_history(system, made)
     found = record, SolverState(history), result
     if batch and not many:
-        numeric: Any = jnp if is_traced(found) else np
+        numeric = array_module(found)
         found = jax.tree.map(lambda x: numeric.broadcast_to(x, (batch, *np.shape(x))), found)
     shape = (batch, system.control_layout.size) if batch else (system.control_layout.size,)
     return InitialState(found[0], np.broadcast_to(control, shape).copy(), *found[1:])
@@ -144,7 +143,7 @@ def continued_state(system: System, initial: Trajectory, settings: Settings, dt:
     A trajectory on the same points and stages gives the solver's state, by its own or by a replay of its
     rows. Other rows are interpolated between nodes. An equilibrium, or a single row, is one state.
     """
-    numeric: Any = jnp if is_traced((system, initial)) else np
+    numeric = array_module((system, initial))
     record = numeric.concatenate([initial.y[-1], initial.z[-1]], axis=-1)
     control, t0 = initial.control[-1], initial.time[-1]
     state = _last_state(system, initial, settings, record)

@@ -17,7 +17,7 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import jax.numpy as jnp
 import numpy as np
 
-from knode_cosserat.rods.system import SEEN_TURN, ChosenNodes, System, is_traced
+from knode_cosserat.rods.system import SEEN_TURN, ChosenNodes, System, array_module, is_traced
 from knode_cosserat.schemes.grid import turn_of_segments
 from knode_cosserat.schemes.history import COARSE_SHARE, StepRows
 from knode_cosserat.schemes.result import Result, SimulationError, Verdict
@@ -172,7 +172,7 @@ def as_seen(system: System, result: Any, position_error: Any) -> tuple[Any, Any]
     """
     if turn_of_segments(system) <= SEEN_TURN:
         return result, position_error
-    numeric: Any = jnp if is_traced((result, position_error)) else np
+    numeric = array_module((result, position_error))
     result = numeric.where(result == int(Result.CONVERGED), int(Result.COARSE), result)
     return result, numeric.full(numeric.shape(position_error), numeric.nan)
 

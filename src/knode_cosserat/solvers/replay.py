@@ -9,12 +9,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module, is_traced
 from knode_cosserat.schemes.grid import at_places, grid_of
 from knode_cosserat.schemes.history import (
     EXTRAPOLATIONS,
@@ -186,5 +185,5 @@ def _along(
 def carried(system: System, space: SpaceScheme, change: Float[Any, "nodes x"]) -> Float[Any, "places more"]:
     """Return a change of y and z at the nodes as a change of the records at all places; y_s is unchanged."""
     width = no_history(system, space).shape[-1] - change.shape[1]
-    numeric: Any = jnp if is_traced(change) else np
+    numeric = array_module(change)
     return at_places(system, space, numeric.pad(change, ((0, 0), (0, width))))

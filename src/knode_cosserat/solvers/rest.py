@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.kept import kept
-from knode_cosserat.rods.system import System, is_traced
+from knode_cosserat.rods.system import System, array_module, is_traced
 from knode_cosserat.schemes.grid import at_places, grid_of
 from knode_cosserat.schemes.history import StateHistory, repeated_record_history
 from knode_cosserat.schemes.problem import Evaluated, StepProblem, row_of
@@ -102,7 +102,7 @@ def still_records(
 
     They are those of the state at rest if the row is an equilibrium. If not, they are interpolated.
     """
-    numeric: Any = jnp if is_traced((system, row, still)) else np
+    numeric = array_module((system, row, still))
     ny, own = system.y_layout.size, row_of(system, still.y, still.records)
     nodes = numeric.concatenate([row, own[:, row.shape[1] :]], axis=1)
     # the strains must also equal the equilibrium's: otherwise the state moves

@@ -25,7 +25,7 @@ from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
-from knode_cosserat.rods.system import SEEN_TURN, System, is_traced
+from knode_cosserat.rods.system import SEEN_TURN, System, array_module, is_traced
 from knode_cosserat.schemes.grid import grid_of, turn_of_segments
 from knode_cosserat.schemes.history import (
     COARSE_ANGLE,
@@ -185,7 +185,7 @@ def refuse_far_turns(system: System, results: Any, controls: Any, before: Any) -
 
     For runs without recovery; arguments as in `turns_within`.
     """
-    numeric: Any = jnp if is_traced((results, controls, before)) else np
+    numeric = array_module((results, controls, before))
     far = numeric.cumsum(turns_within(system, controls, before) > LARGEST_JUMP, axis=-1) > 0
     first = numeric.cumsum(far, axis=-1) == 1
     codes = numeric.where(first, int(Result.NO_CONVERGENCE), int(Result.NOT_REACHED))
@@ -348,7 +348,7 @@ def failure(rows: StepRows, causes: str | dict[int, str], times: Any) -> Simulat
 
 def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
     """Return a trajectory's arrays of rows, with NaN in unsolved rows."""
-    numeric: Any = jnp if is_traced(rows) else np
+    numeric = array_module(rows)
     ny, nz = system.y_layout.size, system.z_layout.size
     invalid = numeric.asarray(rows.result) < 0
     length = system.length[..., None] if np.ndim(system.length) else system.length

@@ -15,7 +15,7 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
-from knode_cosserat.rods.system import ChosenNodes, System, is_traced
+from knode_cosserat.rods.system import ChosenNodes, System, array_module, is_traced
 from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.history import StateHistory, StepRows, at_stages, no_rows
@@ -186,7 +186,7 @@ def marked(trajectory: Trajectory, initial: Any) -> Trajectory:
         time, control, z = time[:1], control[..., None, :], z[..., None, :, :]
     outside = trained.outside(system, time, control, z).reshape(trajectory.result.shape)
     if isinstance(initial, Trajectory) and initial.extrapolated is not None:
-        numeric: Any = jnp if is_traced(outside) else np
+        numeric = array_module(outside)
         first = numeric.arange(outside.shape[-1]) == 0
         outside = numeric.where(first, initial.extrapolated[-1], outside)
     return dataclasses.replace(trajectory, extrapolated=outside)
@@ -230,7 +230,7 @@ def stacked(robot: Any) -> tuple[System, int | None]:
         robots = on_grid(robots, ChosenNodes(nodes_of(robots)))
     if len({jax.tree.structure(one) for one in robots}) > 1:
         raise ValueError("the robots of a batch must be of one class, with the same nodes and options given")
-    numeric: Any = jnp if is_traced(robots) else np
+    numeric = array_module(robots)
     return jax.tree.map(lambda *leaves: numeric.stack(leaves), *robots), len(robots)
 
 
@@ -403,7 +403,7 @@ def _trajectory(system: System, run: Any, every: StepRows, history: Any) -> Traj
     """Return the trajectory of the initial row and those of the steps."""
     at_start, task, controls = run
     settings, dt = task.settings, task.dt
-    numeric: Any = jnp if is_traced((at_start.record, every)) else np
+    numeric = array_module((at_start.record, every))
     axis = np.ndim(controls) - 2
     acted = controls[..., np.shape(controls)[-1] - system.control_layout.size :]
     acted = numeric.concatenate([numeric.expand_dims(at_start.control, axis), acted], axis)
