@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.ends import AXES, Driven
-from knode_cosserat.rods.loads import Body, Motion, SpreadLoad
+from knode_cosserat.rods.loads import BodyInertia, Motion, SpreadLoad
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.parts import Wrench
 from knode_cosserat.rods.rod import SlenderRod
@@ -89,7 +89,7 @@ class EccentricMass(SpreadLoad):
         """Return what moving the centre of mass to the place adds."""
         offset = jnp.asarray(self.offset)
         inertia = self.mass * (jnp.sum(offset**2) * jnp.eye(3) - offset[:, None] * offset)
-        return Body(0.0, self.mass * offset, inertia).wrench(motion, np.array([0.0, 0.0, -GRAVITY]))
+        return BodyInertia(0.0, self.mass * offset, inertia).wrench(motion, np.array([0.0, 0.0, -GRAVITY]))
 
 
 class Grips(NamedTuple):

@@ -37,14 +37,14 @@ def test_a_twisted_ring_stays_a_circle_and_has_no_limit_points():
 def test_an_interrupted_path_is_kept(monkeypatch):
     """Each point that was found is an equilibrium; nothing is said of their stability."""
     robot = kc.load_robot("delrin-tendon-robot").replace(nodes=5)
-    advance = path._Walk.advance
+    advance = path._PathPoints.advance
 
     def advance_thrice(walk):
         if len(walk.parts) > 3:
             raise KeyboardInterrupt
         return advance(walk)
 
-    monkeypatch.setattr(path._Walk, "advance", advance_thrice)
+    monkeypatch.setattr(path._PathPoints, "advance", advance_thrice)
     with pytest.raises(KeyboardInterrupt) as caught:
         kc.statics.equilibrium_path(robot, [0.0] * 4, [4.0, 0.0, 0.0, 2.0], progress=True)
     found = caught.value.best

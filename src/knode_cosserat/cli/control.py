@@ -49,7 +49,7 @@ Method = Annotated[
 ]
 
 
-class _Task(NamedTuple):
+class _TaskOptions(NamedTuple):
     """Reference of the tip, and the controlled robot.
 
     Options:
@@ -77,7 +77,7 @@ class _Task(NamedTuple):
         return kcc.SimulatedPlant(model if self.plant is None else load_system(self.plant), dt, sensor)
 
 
-class _Method(NamedTuple):
+class _ControlMethod(NamedTuple):
     """Controller and limits.
 
     Options:
@@ -119,7 +119,7 @@ class _Method(NamedTuple):
         return ControlLimits(low, high, self.rate, lag=self.lag)
 
 
-class _Output(NamedTuple):
+class _LoopFiles(NamedTuple):
     """Files and output of a closed loop.
 
     Options:
@@ -158,7 +158,9 @@ class _Viewer(NamedTuple):
 
 
 @app.command()
-def control(nominal: Nominal, task: _Task, method: _Method, output: _Output, viewer: _Viewer) -> None:
+def control(
+    nominal: Nominal, task: _TaskOptions, method: _ControlMethod, output: _LoopFiles, viewer: _Viewer
+) -> None:
     """Control the tip of a robot in closed loop, and report the tracking error.
 
     ROBOT is the model that predicts. The controlled robot is simulated; it may be another one (--plant), so

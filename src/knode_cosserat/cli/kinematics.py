@@ -53,7 +53,7 @@ class _Limits(NamedTuple):
 FARTHEST = 10.0
 
 
-class _Target(NamedTuple):
+class _TipTarget(NamedTuple):
     """Target of the tip.
 
     Options:
@@ -87,7 +87,7 @@ class _Target(NamedTuple):
 
 @app.command()
 def reach(
-    model: Model, target: _Target, limits: _Limits, space: Space = "lobatto2", as_json: Json = False
+    model: Model, target: _TipTarget, limits: _Limits, space: Space = "lobatto2", as_json: Json = False
 ) -> None:
     """Compute controls that move the tip to a pose at rest.
 
@@ -189,7 +189,7 @@ def modes(
     write_output(as_json, facts, repr(found).splitlines(), picture=picture)
 
 
-class _Samples(NamedTuple):
+class _SampleFiles(NamedTuple):
     """Sampled equilibria and their files.
 
     Options:
@@ -206,7 +206,7 @@ class _Samples(NamedTuple):
 
 @app.command()
 def workspace(
-    model: Model, samples: _Samples, limits: _Limits, report: Report, space: Space = "lobatto2"
+    model: Model, samples: _SampleFiles, limits: _Limits, report: Report, space: Space = "lobatto2"
 ) -> None:
     """Sample the tip poses that a robot reaches at rest.
 

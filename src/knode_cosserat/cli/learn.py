@@ -49,7 +49,7 @@ class _Data(NamedTuple):
     held_out: list[Path] | None = None
 
 
-class _Method(NamedTuple):
+class _FitMethod(NamedTuple):
     """Method of learning.
 
     Options:
@@ -95,7 +95,7 @@ class _Method(NamedTuple):
         return dataclasses.replace(config, segments=segments)
 
 
-class _Files(NamedTuple):
+class _FitFiles(NamedTuple):
     """Files of a fit.
 
     Options:
@@ -111,7 +111,7 @@ class _Files(NamedTuple):
 
 
 @app.command()
-def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: Report) -> None:
+def fit(nominal: Nominal, data: _Data, method: _FitMethod, files: _FitFiles, report: Report) -> None:
     """Learn a residual model from trajectories.
 
     The residual is the difference between the robot's physics and the trajectories. Trajectories have full
@@ -192,7 +192,7 @@ def fit(nominal: Nominal, data: _Data, method: _Method, files: _Files, report: R
 FINELY = 0.0125
 
 
-class _Search(NamedTuple):
+class _SearchOptions(NamedTuple):
     """Search, and its files.
 
     Options:
@@ -213,7 +213,7 @@ class _Search(NamedTuple):
 def identify(
     nominal: Nominal,
     recordings: Annotated[list[Path], argument("RECORDING", f"Recordings ({', '.join(read_suffixes())}).")],
-    search: _Search,
+    search: _SearchOptions,
     sampling: Sampling,
     report: Report,
 ) -> None:

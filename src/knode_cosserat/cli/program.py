@@ -41,7 +41,7 @@ VECTOR_OPTIONS = frozenset([
 _NAMED_OPTIONS = frozenset(["--control"])
 
 
-class Program(TyperGroup):
+class CommandGroup(TyperGroup):
     """Group of all commands. Errors and warnings are printed in one line on stderr."""
 
     #: name of the program in its help texts
@@ -88,7 +88,7 @@ class Program(TyperGroup):
         sys.exit(status or 0)
 
 
-class _Command(TyperCommand):
+class _VectorCommand(TyperCommand):
     """Command whose vector options accept separate words."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
@@ -108,7 +108,7 @@ class _App(typer.Typer):
                 settings["epilog"] = examples(*stated["Examples"])
             command = _ungrouped(function)
             command.__doc__ = "\n".join(stated["Description"])
-            return typer.Typer.command(self, *arguments, **{"cls": _Command, **settings})(command)
+            return typer.Typer.command(self, *arguments, **{"cls": _VectorCommand, **settings})(command)
 
         return register
 
@@ -236,7 +236,7 @@ def command_group(**options: Any) -> typer.Typer:
     )
 
 
-app = command_group(cls=Program, add_completion=True)
+app = command_group(cls=CommandGroup, add_completion=True)
 
 
 def main(application: typer.Typer = app) -> None:

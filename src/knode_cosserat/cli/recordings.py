@@ -145,7 +145,7 @@ def _number_text(value: Any, factor: float, form: str) -> str:
 # a virtual robot
 
 
-class _Motion(NamedTuple):
+class _MotionOptions(NamedTuple):
     """Motion of a virtual robot, and its noise.
 
     Options:
@@ -162,7 +162,7 @@ class _Motion(NamedTuple):
     swap: float | None = None
 
 
-class _Files(NamedTuple):
+class _RecordingFiles(NamedTuple):
     """Files of a recording and of the truth.
 
     Options:
@@ -176,8 +176,8 @@ class _Files(NamedTuple):
 
 @app.command()
 def record_virtual(
-    motion: _Motion,
-    files: _Files,
+    motion: _MotionOptions,
+    files: _RecordingFiles,
     imperfections: Annotated[
         int | None,
         option(

@@ -42,7 +42,7 @@ COARSE = (
 )
 
 
-class _Run(NamedTuple):
+class _SimulationOptions(NamedTuple):
     """Controls and numerical settings of a simulation.
 
     Options:
@@ -70,7 +70,7 @@ class _Run(NamedTuple):
 @app.command()
 def simulate(
     model: Model,
-    run: _Run,
+    run: _SimulationOptions,
     out: Annotated[Path, NetCDF],
     report: Report,
     figure: Annotated[Path | None, Picture] = None,

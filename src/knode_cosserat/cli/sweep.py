@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from knode_cosserat.sweeps import Sweep
 
 
-class _Cases(NamedTuple):
+class _CaseOptions(NamedTuple):
     """Cases of a sweep.
 
     Options:
@@ -131,7 +131,7 @@ def _submitit_executor(folder: Path, cluster: str, parameters: dict[str, Any]) -
 
 @app.command()
 def sweep(
-    cases: _Cases,
+    cases: _CaseOptions,
     machines: _Machines,
     out: Path,
     report: Report,

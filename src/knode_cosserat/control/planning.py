@@ -211,7 +211,7 @@ class Tracking:
 # predictions
 
 
-class Prediction(NamedTuple):
+class PredictedOutputs(NamedTuple):
     """Outputs of a predicted motion and their derivatives."""
 
     #: error of the tracked output from the reference
@@ -354,7 +354,7 @@ class PlanController(Controller):
     def predicted(
         self, plan: Float[np.ndarray, "knots c"], wanted: Float[np.ndarray, "T p"],
         limited: tuple[Output, ...] = (),
-    ) -> Prediction | None:  # fmt: skip
+    ) -> PredictedOutputs | None:  # fmt: skip
         """Return the prediction of a plan from the estimated state; None if it is not solved.
 
         It is linearised by the plan's numbers and by the directions in which the state is uncertain.
@@ -380,7 +380,7 @@ class PlanController(Controller):
         error, slopes, value, slope, path = map(np.asarray, outputs)
         # without the derivatives by the acting controls
         n, first = plan.size, len(by_plan)
-        return Prediction(error, slopes[:n], slopes[first:], value, slope[:n], slope[first:], path)
+        return PredictedOutputs(error, slopes[:n], slopes[first:], value, slope[:n], slope[first:], path)
 
     def wanted(self, time: float, reference: Reference) -> Float[np.ndarray, "T p"]:
         """Return the reference at the ends of the predicted steps, the first of which begins at `time` (s).

@@ -19,8 +19,8 @@ from jaxtyping import Float
 
 from knode_cosserat.control import qp
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
-from knode_cosserat.control.planning import Knots, PlanController, Prediction, Weights
-from knode_cosserat.control.realtime import SHARE, Choice, Size, chosen, seconds_in_period
+from knode_cosserat.control.planning import Knots, PlanController, PredictedOutputs, Weights
+from knode_cosserat.control.realtime import SHARE, ChosenSize, Size, chosen, seconds_in_period
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -80,7 +80,7 @@ class PredictiveController(PlanController):
         qp.require_daqp()
         self.soft = tuple(soft)
         #: the choice by the time of the computations; None if the sizes were given
-        self.choice: Choice | None = None
+        self.choice: ChosenSize | None = None
         if realtime:
             if (horizon, knots, stride) != (20, 8, 1):
                 raise ValueError(
@@ -115,7 +115,7 @@ class PredictiveController(PlanController):
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
         """Forget the plan; the control acts now. The observer keeps its state."""
         super().reset(control)
-        self._prediction: Prediction | None = None
+        self._prediction: PredictedOutputs | None = None
 
     # the two phases
 

@@ -51,7 +51,7 @@ class Size(NamedTuple):
         )
 
 
-class Choice(NamedTuple):
+class ChosenSize(NamedTuple):
     """Size of a prediction that was chosen for a period, and the measured time of one period's work."""
 
     size: Size
@@ -85,7 +85,7 @@ def candidates(dt: float) -> list[Size]:
 
 def chosen(
     seconds_of: Callable[[Size], float], dt: float, share: float, sizes: Sequence[Size] | None = None
-) -> Choice:
+) -> ChosenSize:
     """Return the first of some sizes, in falling order of their time, that takes the share of a period.
 
     Args:
@@ -112,7 +112,7 @@ def chosen(
             first = middle + 1
     if first not in times:
         times[first] = seconds_of(sizes[first])
-    found = Choice(sizes[first], dt, times[first])
+    found = ChosenSize(sizes[first], dt, times[first])
     if found.seconds > share * dt:
         raise RealtimeError(
             f"no prediction fits into {100.0 * share:g} % of the period of {1e3 * dt:g} ms; the fastest is "

@@ -146,7 +146,7 @@ class Index:
         return function.addresses[key]
 
 
-class Variable:
+class StackVariable:
     """A value that changes in loops: memory on the stack, which LLVM turns into registers."""
 
     def __init__(self, function: Function, value: Value):
@@ -199,7 +199,7 @@ class Module:
             self._elementary.add(name)
             f = Function(self, name, ["x"], False, lanes)
             x = f.arguments[0]
-            found = Variable(f, elementary.FUNCTIONS[operation](f, x))
+            found = StackVariable(f, elementary.FUNCTIONS[operation](f, x))
             if operation in elementary.OF_ANGLES:
                 with f.if_(f.any(f.apply("abs", x) > elementary.LARGEST_ANGLE)):
                     found.set(f.call_library(operation, [x]))
@@ -311,9 +311,9 @@ class Function:
         self._stack.append(f"  {name} = alloca {kind}")
         return name
 
-    def variable(self, value: Value) -> Variable:
+    def variable(self, value: Value) -> StackVariable:
         """Return a value that changes in loops."""
-        return Variable(self, value)
+        return StackVariable(self, value)
 
     def address(self, name: str) -> Value:
         """Return an address as a value."""
@@ -325,7 +325,7 @@ class Function:
         """Return a constant, or the value itself."""
         if isinstance(value, Value):
             return value
-        if isinstance(value, Variable):
+        if isinstance(value, StackVariable):
             return value.get()
         if kind == "i1" or isinstance(value, bool):
             return Value(self, "true" if value else "false", "i1")
@@ -525,7 +525,7 @@ class Function:
     @contextlib.contextmanager
     def loop(self, count: Any, start: Any = 0, step: int = 1) -> Iterator[Index]:
         """Write a loop over start, start + step, … below (or, for a negative step, not below) count."""
-        index = Variable(self, self.value(start, "i64"))
+        index = StackVariable(self, self.value(start, "i64"))
         names = [self._fresh(part) for part in ("head", "body", "end")]
         count = self.value(count, "i64")
         self.emit(f"br label %{names[0]}")
@@ -634,7 +634,7 @@ class Function:
         state = []
         for start, kind in zip(loop.initial, loop.kinds, strict=True):
             value = self.value(values[start], "i1" if kind == "b" else "double")
-            state.append(Variable(self, self.splat(value, lanes)))
+            state.append(StackVariable(self, self.splat(value, lanes)))
         found: dict[int, Value] = {}
         running: list[Value] = []
 

@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, StackVariable, Value
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array
@@ -47,7 +47,7 @@ ACCEPTABLE = [field.name for field in dataclasses.fields(NewtonOptions)].index("
 NONE, OLD, NEW, FRESH, KEPT = map(float, range(5))
 
 
-class Point(NamedTuple):
+class Unknowns(NamedTuple):
     """Unknowns of a step, or a change of them: y at all points, and the unknowns at the bases."""
 
     y: Array
@@ -76,8 +76,8 @@ class Core(EliminationCode):
         ny, nz, k, numbers, a = e.ny, e.nz, e.k, e.numbers, self._array
         # Newton's method: its options, the iterate and its correction, a trial point and the correction there
         self.options = a(len(dataclasses.fields(NewtonOptions)))
-        self.iterate, self.step = Point(self.y, self.unknowns), Point(self.dy, self.step_unknowns)
-        self.trial, self.direction, self.better = (Point(a(ny, "ends"), a(k)) for _ in range(3))
+        self.iterate, self.step = Unknowns(self.y, self.unknowns), Unknowns(self.dy, self.step_unknowns)
+        self.trial, self.direction, self.better = (Unknowns(a(ny, "ends"), a(k)) for _ in range(3))
         # the motion: records of earlier states and their rate, states for the first guess, errors of records
         memory = range(settings.memory)
         self.records, self.rate = [a(numbers, "count") for _ in memory], a(numbers, "count")
@@ -215,7 +215,7 @@ class Core(EliminationCode):
         return self._now.apply("max", *self._norms(self.r, self._count("pieces")), self._tip_norm())
 
     def _write_point(
-        self, target: Point, formula: Callable[..., Any], *sources: Point, weight: Value | None = None
+        self, target: Unknowns, formula: Callable[..., Any], *sources: Unknowns, weight: Value | None = None
     ) -> None:
         """Write a formula of a weight, if there is one, and of points, number by number, to a point."""
         wide, plain = ([], []) if weight is None else ([self._spread(weight)], [weight])
@@ -303,7 +303,7 @@ class Core(EliminationCode):
                 self._put(self._get(self.tip, i) - self._get(self.tip_rest, i), self.tip, i)
             return self._residual_norm()
 
-        left, turns = self._variable(math.inf), Variable(f, f.value(0.0))
+        left, turns = self._variable(math.inf), StackVariable(f, f.value(0.0))
         residual = self._variable(0.0)
         residual.set(write_residual())
 
@@ -356,7 +356,7 @@ class Core(EliminationCode):
             def change(i: int) -> Value:
                 return self._wide(self.better.y, i, j) - self._wide(self.y, i, j)
 
-            def largest(found: Variable, value: Value) -> None:
+            def largest(found: StackVariable, value: Value) -> None:
                 value = self._before(self._count("points"), j, value)
                 found.set(f.apply("max", found.get(), value))
                 total.set(total.get() + value)
@@ -535,7 +535,7 @@ class Core(EliminationCode):
                     self._put(math.nan, self.outcome, k)
                 for array in arrays:
                     self._write_each(array, "used", lambda: math.nan)
-        step, nodes = Variable(f, f.value(0, "i64")), self._count("nodes")
+        step, nodes = StackVariable(f, f.value(0, "i64")), self._count("nodes")
 
         def is_active() -> Value:
             return (step.get() < steps) & f.any(self._get(self.outcome, ALIVE) > 0.0)

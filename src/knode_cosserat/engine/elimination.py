@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Index, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, StackVariable, Value
 from knode_cosserat.engine.equations import Elimination, Equations
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.rod import RodCode
@@ -422,7 +422,7 @@ class EliminationCode(RodCode):
         `slopes` and `rates` are functions at a place. The first corrections for each point have new factors.
         """
         f, ny = self._now, self.equations.ny
-        left, turns = Variable(f, f.value(math.inf)), Variable(f, f.value(0, "i64"))
+        left, turns = StackVariable(f, f.value(math.inf)), StackVariable(f, f.value(0, "i64"))
         with f.while_(lambda: (left.get() > FILLED) & (turns.get() < most * FILLING)):
             turn = f.result(f"srem i64 {turns.get().name}, {FILLING}", "i64")
             with f.if_(turn < RENEWALS):
@@ -455,7 +455,7 @@ class EliminationCode(RodCode):
             start, added, end = (self.w, j), (self.added, j), (self.w, j + 1)
             f.call(self.advance, memory, *(self._pointer(*each) for each in (start, added, end)), j.value)
 
-        tips = [Variable(f, each) for each in self._column(self.tip, k)]
+        tips = [StackVariable(f, each) for each in self._column(self.tip, k)]
         with f.loop(self.strands) as strand:
             base = strand.value * self._count("points of strand")
             with f.loop(count) as g:
@@ -496,7 +496,7 @@ class EliminationCode(RodCode):
 
         with f.loop(self.strands) as strand:
             base = strand.value * self._count("points of strand")
-            alpha = [Variable(f, each) for each in self._column(self.alpha, own, 0, strand)]
+            alpha = [StackVariable(f, each) for each in self._column(self.alpha, own, 0, strand)]
             correct(base + (count * size + 1), base + self._count("points of strand"))
             with f.loop(0, count - 1, -1) as g:
                 end = base + (g.value + 1) * size

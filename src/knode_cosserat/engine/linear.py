@@ -27,7 +27,7 @@ class Columns:
         return self.base.name
 
 
-class Number(NamedTuple):
+class Component(NamedTuple):
     """Component i of an array at place j; without an array, a number of one straight piece of a map."""
 
     array: Array | Columns | None
@@ -42,15 +42,15 @@ class Number(NamedTuple):
         return own, i, j if isinstance(j, int) else j.key
 
 
-Coefficient = Number | Value | float
+Coefficient = Component | Value | float
 
 
 @dataclasses.dataclass(frozen=True)
 class Add:
     """Add a product to a number, or subtract it if it is negative."""
 
-    target: Number
-    source: Number
+    target: Component
+    source: Component
     coefficient: Coefficient = 1.0
     is_negative: bool = False
 
@@ -63,7 +63,7 @@ class Add:
 class Scale:
     """Multiply a number; without a coefficient, set it to zero."""
 
-    target: Number
+    target: Component
     coefficient: Coefficient | None = None
 
     def transpose(self) -> Scale:
@@ -75,8 +75,8 @@ class Scale:
 class Show:
     """Copy a number to one that no other operation reads or writes."""
 
-    target: Number
-    source: Number
+    target: Component
+    source: Component
 
     def transpose(self) -> Add:
         """Return the transposed operation."""
@@ -84,7 +84,7 @@ class Show:
 
 
 @dataclasses.dataclass(frozen=True)
-class Loop:
+class PlaceLoop:
     """Operations at each place from `start` to below `stop`, in this order or, if it descends, in reverse."""
 
     start: Any
@@ -94,14 +94,14 @@ class Loop:
 
 
 Straight = Add | Scale | Show
-Operation = Straight | Loop
+Operation = Straight | PlaceLoop
 
 
 def write(memory: Memory, operations: Sequence[Operation], lanes: int, transposed: bool) -> None:
     """Write the code of a map, with as many vectors side by side as there are lanes."""
     sums = _Sums(memory, lanes)
     for operation in reversed(operations) if transposed else operations:
-        if not isinstance(operation, Loop):
+        if not isinstance(operation, PlaceLoop):
             sums.add(operation.transpose() if transposed else operation)
             continue
         sums.write_all()
@@ -177,12 +177,12 @@ class _Sums:
             return -product if operation.is_negative else product
         return value - product if operation.is_negative else value + product
 
-    def _get(self, number: Number) -> Value | None:
+    def _get(self, number: Component) -> Value | None:
         if number.array is None:
             return self._values.get(number.key)
         return self._memory._get(*number, self._lanes)
 
     def _times(self, coefficient: Coefficient, value: Value) -> Value:
-        if isinstance(coefficient, Number):
+        if isinstance(coefficient, Component):
             coefficient = self._memory._get(*coefficient, 1)
         return value if coefficient == 1.0 else coefficient * value

@@ -13,7 +13,7 @@ import numpy as np
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.counts import counts_of
 from knode_cosserat.engine.linear_step import LinearStep
-from knode_cosserat.engine.motions import Motions, Shape, coefficients_of
+from knode_cosserat.engine.motions import Motions, StaticState, coefficients_of
 from knode_cosserat.engine.pattern import Pattern, compiled, masks_of, packed
 from knode_cosserat.engine.tangents import CotangentCore, TangentCore
 from knode_cosserat.rods.system import System
@@ -79,7 +79,7 @@ def solve_steps(
     side in the lanes of vectors, each until a step fails (see `Motions.solve`); its rows may be given.
     """
     alone, is_static = np.ndim(controls) == 2, steps.settings.time is None
-    states = Shape(states) if is_static else states
+    states = StaticState(states) if is_static else states
     controls, states = jax.tree.map(lambda leaf: np.asarray(leaf)[None if alone else ...], (controls, states))
     motions = motions_of(system, steps, states)
     rows = rows if rows is None or not alone else StepRows(*(leaf[None] for leaf in rows))

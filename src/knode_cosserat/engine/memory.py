@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Index, Module, Stores, Value, Variable, vector_lanes
+from knode_cosserat.engine.codegen import Function, Index, Module, StackVariable, Stores, Value, vector_lanes
 from knode_cosserat.engine.counts import Counts, GridCounts
 
 
@@ -290,12 +290,12 @@ class Memory:
                 for value, at in zip(f.transpose(values), then, strict=False):
                     f.store(value, *at)
 
-    def _variable(self, value: Any) -> Variable:
+    def _variable(self, value: Any) -> StackVariable:
         """Return a plain variable."""
-        return Variable(self._now, self._now.splat(self._now.value(value), self.P))
+        return StackVariable(self._now, self._now.splat(self._now.value(value), self.P))
 
-    def _wide_variable(self, value: Any) -> Variable:
-        return Variable(self._now, self._now.splat(self._now.value(value), self.L))
+    def _wide_variable(self, value: Any) -> StackVariable:
+        return StackVariable(self._now, self._now.splat(self._now.value(value), self.L))
 
     def _write_each(self, target: Array, where: str, formula: Callable[..., Any], *sources: Array) -> None:
         """Write a formula of arrays, number by number, to an array at the places of a count."""

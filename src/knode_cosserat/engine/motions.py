@@ -20,7 +20,7 @@ BLOCK = 1 << 17
 CONVERGED, COARSE, NOT_SOLVED = int(Result.CONVERGED), int(Result.COARSE), int(Result.NO_CONVERGENCE)
 
 
-class Shape(NamedTuple):
+class StaticState(NamedTuple):
     """The state from which an equilibrium is solved."""
 
     y: Float[np.ndarray, "points y"]
@@ -36,7 +36,7 @@ class Motions:
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
         self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
         #: size of a state, and the arrays of its parts in it
-        self._packed_size, self._arrays = core.states[self._kind is Shape]
+        self._packed_size, self._arrays = core.states[self._kind is StaticState]
         self._shapes = [np.shape(values)[1:] for values in states]
         self._memory = core._empty_memory()
         options = dataclasses.astuple(steps.settings.newton)
@@ -51,7 +51,7 @@ class Motions:
     def _estimates(self) -> int:
         """Number of estimated errors; an equilibrium has none in time."""
         estimates = self.steps.settings.estimates
-        return min(estimates, 1) if self._kind is Shape else estimates
+        return min(estimates, 1) if self._kind is StaticState else estimates
 
     def set_parameters(self, values: np.ndarray) -> None:
         """Set the parameters (n,) of all robots, or (robots, n)."""

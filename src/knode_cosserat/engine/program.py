@@ -53,7 +53,7 @@ class EngineError(KnodeCosseratError, NotImplementedError):
 
 
 @dataclasses.dataclass(frozen=True)
-class _Loop:
+class _WhileLoop:
     """A `while` loop: `program` computes the condition and the next state from the state and the inputs.
 
     In `program` the level of inputs is 1, and the level of the state is 2.
@@ -112,7 +112,7 @@ def regular(positions: np.ndarray) -> Positions | None:
 
 
 @dataclasses.dataclass(eq=False)
-class _Rule:
+class _DerivativeRule:
     """Derivative rule of a JAX function: of `jax.custom_jvp`, or of a linear solver."""
 
     function: Callable[..., Any]
@@ -182,9 +182,9 @@ class Program:
         #: 0 of constants, given for inputs, and otherwise the largest of the arguments
         self.levels: list[int] = []
         #: loops by node
-        self.loops: dict[int, _Loop] = {}
+        self.loops: dict[int, _WhileLoop] = {}
         #: derivative rules of "hold" nodes, by node; None: the derivative is zero
-        self.rules: dict[int, _Rule | None] = {}
+        self.rules: dict[int, _DerivativeRule | None] = {}
         #: shapes of arrays; other nodes are scalars
         self.shapes: dict[int, tuple[int, ...]] = {}
         self._boolean: list[bool] = []
@@ -396,7 +396,7 @@ class Program:
         stopped = self.operations[a][0] == "hold" and self.rules[a] is None
         return a if stopped else self.hold(a, None)
 
-    def hold(self, node: int, rule: _Rule | None) -> int:
+    def hold(self, node: int, rule: _DerivativeRule | None) -> int:
         """Return a node of the same value whose derivative follows a rule; None: it is zero."""
         while (known := self._memo.get(("held", node))) is not None:
             if self.rules[known] is rule:
@@ -414,7 +414,7 @@ class Program:
         """Return the results of a function with a derivative rule; `values` evaluates it."""
         key = ("rule", name, *(x for each in arguments for x in (each.shape, each.tobytes())))
         if key not in self._memo:
-            rule = _Rule(function, shapes, arguments)
+            rule = _DerivativeRule(function, shapes, arguments)
             # before the results, because nodes are in the order of evaluation
             self._all_parts(arguments)
             for array in values():
@@ -423,7 +423,7 @@ class Program:
             self._memo[key] = rule.results
         return self._memo[key]
 
-    def loop(self, loop: _Loop) -> list[int]:
+    def loop(self, loop: _WhileLoop) -> list[int]:
         """Return the nodes of the final state of a loop."""
         arguments = [*(node for _, node in loop.inputs), *loop.initial]
         inner = loop.program
@@ -839,7 +839,7 @@ class Program:
         rule = self.rules[node]
         return () if rule is None else self._all_parts(rule.arguments)
 
-    def _by_rule(self, rule: _Rule, found: Tangents) -> None:
+    def _by_rule(self, rule: _DerivativeRule, found: Tangents) -> None:
         """Add the tangents of all results of a rule."""
         moving = {node: found[node] for node in self._all_parts(rule.arguments) if found.get(node)}
         results = self._all_parts(rule.results)
@@ -854,7 +854,7 @@ class Program:
                 if not self.is_constant(tangent, 0.0):
                     found[node][key] = tangent
 
-    def _product(self, rule: _Rule) -> tuple[list[int], _Product]:
+    def _product(self, rule: _DerivativeRule) -> tuple[list[int], _Product]:
         """Return the active arguments of a rule, and its results' tangents."""
         if rule.product is None:
             active, jaxpr = rule.trace()
@@ -893,7 +893,7 @@ class Program:
                 continue
             arguments = [self._nodes([new.get(each, each) for each in self.parts(array)], array.shape)
                          for array in rule.arguments]  # fmt: skip
-            copy = _Rule(rule.function, rule.shapes, arguments)
+            copy = _DerivativeRule(rule.function, rule.shapes, arguments)
             for array in rule.results:
                 parts = self.parts(array)
                 values = [self.operations[each][1] for each in parts]
@@ -926,7 +926,7 @@ class Program:
 
     def evaluate(self, closed_jaxpr: Any, arguments: Sequence[Nodes]) -> list[Nodes]:
         """Return the results of a jaxpr for arrays of nodes."""
-        return _Evaluation(self).closed(closed_jaxpr, arguments)
+        return _JaxprEvaluation(self).closed(closed_jaxpr, arguments)
 
 
 class _Component(NamedTuple):
@@ -1141,7 +1141,7 @@ def source_line(equations: Sequence[Any]) -> str:
     return "unknown line"
 
 
-class _Evaluation:
+class _JaxprEvaluation:
     """Evaluates jaxprs on the nodes of a program. Methods `_do_…` are of primitives."""
 
     def __init__(self, program: Program) -> None:
@@ -1716,7 +1716,7 @@ class _Evaluation:
         condition = inner.evaluate(e.params["cond_jaxpr"], [*fixed[:cond_nconsts], *state])[0]
         following = inner.evaluate(e.params["body_jaxpr"], [*fixed[cond_nconsts:], *state])
 
-        loop = _Loop(
+        loop = _WhileLoop(
             inner, [(name, node) for node, name in inputs.items()], _flat(state), _flat(arguments[count:]),
             _flat(following), int(condition), kinds, source_line(self.nested),
         )  # fmt: skip

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.engine.arrays import Stored
-from knode_cosserat.engine.codegen import Function, Index, Stores, Sums, Value, Variable
+from knode_cosserat.engine.codegen import Function, Index, StackVariable, Stores, Sums, Value
 from knode_cosserat.engine.counts import Counts
 from knode_cosserat.engine.equations import Equations
 from knode_cosserat.engine.memory import Array, Memory, aligned_zeros
@@ -454,7 +454,7 @@ class RodCode(Memory):
         """Return the largest component in natural units, and by further weights; infinite for NaN."""
         f, zero = self._now, self._now.splat(self._now.value(0.0), self.L)
         every = self.scale_y, *weights
-        found, finite = [Variable(f, zero) for _ in every], Variable(f, zero)
+        found, finite = [StackVariable(f, zero) for _ in every], StackVariable(f, zero)
         with self._places(count) as j:
             largest, totals = [zero for _ in every], [zero, zero]
             for i in range(array.size):

@@ -26,7 +26,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from knode_cosserat.engine.codegen import Function, Module, Variable
+from knode_cosserat.engine.codegen import Function, Module, StackVariable
 from knode_cosserat.engine.counts import Counts
 from knode_cosserat.engine.equations import Elimination, Sizes
 from knode_cosserat.engine.machine_code import MachineCode, computer, store, stored
@@ -40,7 +40,7 @@ _GENERATED = frozenset(
     ("__init__", "__repr__", "__eq__", "__hash__", "__setattr__", "__delattr__", "__replace__")
 )
 #: what writes code, and is not needed to run it
-_WRITERS = Elimination, Function, Counts, Module, Variable
+_WRITERS = Elimination, Function, Counts, Module, StackVariable
 
 
 class UnknownError(KnodeCosseratError):

@@ -19,7 +19,7 @@ import numpy as np
 from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import TangentEquations
-from knode_cosserat.engine.linear import Add, Columns, Loop, Number, Operation, Scale, Show, write
+from knode_cosserat.engine.linear import Add, Columns, Component, Operation, PlaceLoop, Scale, Show, write
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.rods.system import System
@@ -146,7 +146,7 @@ class StepMap(EliminationCode):
         self.along = f = self._function("along")
         size, count = self.groups
 
-        advance = functools.partial(Loop, body=self._advance_columns)
+        advance = functools.partial(PlaceLoop, body=self._advance_columns)
         with f.loop(self.strands) as strand:
             base = strand.value * self._count("points of strand")
             with f.loop(count) as g:
@@ -172,7 +172,7 @@ class StepMap(EliminationCode):
         found = list[Operation]()
         for block in range(0, self.own, COLUMNS):
             start, end = (
-                [Number(self.X, self._of_X(i, block), point) for i in range(self.equations.ny)]
+                [Component(self.X, self._of_X(i, block), point) for i in range(self.equations.ny)]
                 for point in (j, j + 1)
             )
             found += [*map(Scale, end), *self._by_factors(start, end, j)]
@@ -209,11 +209,11 @@ class StepMap(EliminationCode):
         def by_data(name: str, places: Sequence[Any], j: Any) -> list[Operation]:
             return self._by_data(name, j, places, (weights, control))
 
-        found: list[Operation] = [Loop(0, self._count("used"), lambda j: by_data("rates", [j], j))]
+        found: list[Operation] = [PlaceLoop(0, self._count("used"), lambda j: by_data("rates", [j], j))]
         if self.rows["far"]:
-            found.append(Loop(0, self._count("pieces"), lambda j: by_data("far", [j], j)))
+            found.append(PlaceLoop(0, self._count("pieces"), lambda j: by_data("far", [j], j)))
         if self.equations.moves_lengths:
-            found.append(Loop(0, self._count("pieces"), lambda j: [Scale(Number(t.lengths, 0, j))]))
+            found.append(PlaceLoop(0, self._count("pieces"), lambda j: [Scale(Component(t.lengths, 0, j))]))
         return [*found, *by_data("tip", self.tips, 0), *by_data("base", self.bases, 0)]
 
     def _by_data(self, name: str, j: Any, places: Sequence[Any], data: Any) -> list[Operation]:
@@ -223,14 +223,14 @@ class StepMap(EliminationCode):
         if name == "rates" and self.settings.uses_rate:
             columns |= set(range(e.numbers))
         kept = t.history if self.settings.uses_rate else None
-        history = {c: Number(kept, c % e.numbers, places[c // e.numbers]) for c in sorted(columns)}
+        history = {c: Component(kept, c % e.numbers, places[c // e.numbers]) for c in sorted(columns)}
         found: list[Operation] = []
         for number in history.values():
             found.append(Scale(number))
             for part, weight in zip((*t.records, t.rate), weights, strict=False):
-                found.append(Add(number, Number(part, number.i, number.j), weight))
-        found += [Scale(Number(target, i, j)) for i in self.rows[name]]
-        controls = {c: Number(control, c) for c in range(e.nc)}
+                found.append(Add(number, Component(part, number.i, number.j), weight))
+        found += [Scale(Component(target, i, j)) for i in self.rows[name]]
+        controls = {c: Component(control, c) for c in range(e.nc)}
         for nonzeros, matrix, source in (
             (e.by_history[name], self.by_history[name], history),
             (e.by_control[name], self.by_control[name], controls),
@@ -246,23 +246,25 @@ class StepMap(EliminationCode):
         found = self._near_ends(t.rates) + self._correction()
         if self.far is not None:
             found.append(
-                Loop(0, self._count("points"), lambda j: _copies(self.equations.ny, (t.newest, j), (t.y, j)))
+                PlaceLoop(
+                    0, self._count("points"), lambda j: _copies(self.equations.ny, (t.newest, j), (t.y, j))
+                )
             )
         for k in self.near:
             near = t.y, self._place(f"near {k}")
             found += _copies(self.equations.ny, (t.newest, self._place("points") + k), near)
         if self.far is not None:
-            found.append(Loop(0, self._count("pieces"), self._add_jumps))
+            found.append(PlaceLoop(0, self._count("pieces"), self._add_jumps))
         if self.stages or self.equations.system.mixed:
-            found += [Loop(0, self._count("ends"), self._change_of_rates), *self._near_ends(t.change)]
+            found += [PlaceLoop(0, self._count("ends"), self._change_of_rates), *self._near_ends(t.change)]
             for k in range(len(self.stages)):
-                found.append(Loop(0, self._count("pieces"), functools.partial(self._solve_stage, k)))
+                found.append(PlaceLoop(0, self._count("pieces"), functools.partial(self._solve_stage, k)))
         if self.far is not None and self.rows["far"]:
-            found.append(Loop(0, self._count("pieces"), self._add_jumps_at_fixed_y))
-        found.append(Loop(0, self._count("used"), functools.partial(self._set_record, c0)))
-        found.append(Loop(0, self._count("nodes"), functools.partial(self._show, row)))
+            found.append(PlaceLoop(0, self._count("pieces"), self._add_jumps_at_fixed_y))
+        found.append(PlaceLoop(0, self._count("used"), functools.partial(self._set_record, c0)))
+        found.append(PlaceLoop(0, self._count("nodes"), functools.partial(self._show, row)))
         last = ((c % self.own, self._place(f"first alpha {c // self.own}")) for c in range(self.equations.k))
-        return found + [Show(Number(unknowns, c), Number(t.alpha, *at)) for c, at in enumerate(last)]
+        return found + [Show(Component(unknowns, c), Component(t.alpha, *at)) for c, at in enumerate(last)]
 
     def _near_ends(self, rates: Array) -> list[Operation]:
         """Copy rates to the ends of pieces, if they are not those at the start of the next piece."""
@@ -270,7 +272,7 @@ class StepMap(EliminationCode):
             return []
         t, ny = self.tangents, self.equations.ny
         found: list[Operation] = [
-            Loop(
+            PlaceLoop(
                 0,
                 self._count("pieces"),
                 lambda j: _copies(ny, (t.ends, j), (rates, j + 1), self._rows_of(rates)),
@@ -288,7 +290,7 @@ class StepMap(EliminationCode):
         return [i for i in sorted(rows) if i < e.ny]
 
     def _rates_over_piece(
-        self, weights: Sequence[float], target: Sequence[Number], rates: Array, j: Index
+        self, weights: Sequence[float], target: Sequence[Component], rates: Array, j: Index
     ) -> list[Operation]:
         """Add h times the weighted sum of a piece's rates."""
         h, found = self._get(self.h, 0, j), list[Operation]()
@@ -296,10 +298,10 @@ class StepMap(EliminationCode):
         for weight, (array, place) in zip(weights, places, strict=False):
             if weight:
                 own = h * weight
-                found += [Add(target[i], Number(array, i, place), own) for i in self._rows_of(rates)]
+                found += [Add(target[i], Component(array, i, place), own) for i in self._rows_of(rates)]
         return found
 
-    def _by_length(self, weights: Sequence[float], target: Sequence[Number], j: Index) -> list[Operation]:
+    def _by_length(self, weights: Sequence[float], target: Sequence[Component], j: Index) -> list[Operation]:
         """Add the weighted sum of a piece's rates times the tangent of its length."""
         found, places = list[Operation](), self._places_of((self.f, self.fe), j)
         if not self.equations.moves_lengths:
@@ -312,10 +314,12 @@ class StepMap(EliminationCode):
             ]
             if parts:
                 rate = functools.reduce(operator.add, parts)
-                found.append(Add(number, Number(self.tangents.lengths, 0, j), rate))
+                found.append(Add(number, Component(self.tangents.lengths, 0, j), rate))
         return found
 
-    def _slopes(self, target: tuple[Array, Any], source: Callable[[int], Number], j: Any) -> list[Operation]:
+    def _slopes(
+        self, target: tuple[Array, Any], source: Callable[[int], Component], j: Any
+    ) -> list[Operation]:
         """Add the product of the rates' derivatives at a place with numbers."""
         nonzeros = [(i, c, 0) for i, c in self.equations.pattern]
         return _products(nonzeros, (self.slope, j), target, source)
@@ -324,7 +328,7 @@ class StepMap(EliminationCode):
         """Add the part of rates at a piece's start by y behind a jump."""
         t, far = self.tangents, self.rows["far"]
         return [
-            Add(Number(t.rates, i, j), Number(t.far, c, j), Number(self.slope, n, j))
+            Add(Component(t.rates, i, j), Component(t.far, c, j), Component(self.slope, n, j))
             for n, (i, c) in enumerate(self.equations.pattern)
             if c in far
         ]
@@ -332,9 +336,9 @@ class StepMap(EliminationCode):
     def _at_fixed_ends(self, k: int, j: Index) -> list[Operation]:
         """Set y at a stage at fixed y, and add its part of the rates there."""
         t, stage, first, at = self.tangents, *self._stage(k, j)
-        own = [Number(t.between, i, at) for i in range(self.equations.ny)]
+        own = [Component(t.between, i, at) for i in range(self.equations.ny)]
         found: list[Operation] = [Scale(number) for number in own]
-        found += [Add(own[i], Number(t.far, i, j), 1.0 - stage.end) for i in self.rows["far"]]
+        found += [Add(own[i], Component(t.far, i, j), 1.0 - stage.end) for i in self.rows["far"]]
         found += self._by_length(stage.rates, own, j) + self._rates_over_piece(stage.rates, own, t.rates, j)
         return found + self._slopes((t.rates, first), own.__getitem__, first)
 
@@ -345,16 +349,16 @@ class StepMap(EliminationCode):
     def _advance(self, j: Index) -> list[Operation]:
         """Set w at the end of a piece: its defect at fixed y, and w at its start by the factors."""
         e, t, formula = self.equations, self.tangents, self.space.formula
-        end, found = [Number(t.w, i, j + 1) for i in range(e.ny)], self._moved(j)
+        end, found = [Component(t.w, i, j + 1) for i in range(e.ny)], self._moved(j)
         for k in range(len(self.stages)):
             found += self._at_fixed_ends(k, j)
         found += map(Scale, end)
-        found += [Add(end[i], Number(t.far, i, j)) for i in self.rows["far"]]
+        found += [Add(end[i], Component(t.far, i, j)) for i in self.rows["far"]]
         found += self._by_length(formula.weights, end, j)
         found += self._rates_over_piece(formula.weights, end, t.rates, j)
-        return found + self._by_factors([Number(t.w, i, j) for i in range(e.ny)], end, j)
+        return found + self._by_factors([Component(t.w, i, j) for i in range(e.ny)], end, j)
 
-    def _by_factors(self, start: Sequence[Number], end: Sequence[Number], j: Index) -> list[Operation]:
+    def _by_factors(self, start: Sequence[Component], end: Sequence[Component], j: Index) -> list[Operation]:
         """Add A times numbers at the start of a piece to those at its end, and apply B⁻¹ to the sum."""
         el, found = self.elimination, list[Operation]()
         stored = {int(node): n for n, node in enumerate(el.stored)}
@@ -362,10 +366,10 @@ class StepMap(EliminationCode):
         for i, c in zip(*np.nonzero(el.matrix != el.program.constant(0.0)), strict=True):
             entry: Any = el.program.values[int(el.matrix[i, c])]
             if (i, c) in entries:
-                entry = Number(self.entries, entries[i, c], j)
+                entry = Component(self.entries, entries[i, c], j)
             found.append(Add(end[i], start[c], entry))
         for i, c, node in el.substitution:
-            factor = Number(self.factor, stored[node], j) if node in stored else el.program.values[node]
+            factor = Component(self.factor, stored[node], j) if node in stored else el.program.values[node]
             found.append(Scale(end[i], factor) if i == c else Add(end[i], end[c], factor, is_negative=True))
         return found
 
@@ -375,37 +379,37 @@ class StepMap(EliminationCode):
         """Add the changes of y at a point by those of its unknowns."""
         return [
             Add(
-                Number(target, i, j), Number(source, c, group), Number(self.X, self._of_X(i, c), j),
+                Component(target, i, j), Component(source, c, group), Component(self.X, self._of_X(i, c), j),
                 is_negative,
             )
             for i, c in zip(*map(np.ndarray.tolist, np.nonzero(self.nonzero_X)), strict=True)
         ]  # fmt: skip
 
-    def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Number:
+    def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Component:
         """Return an entry of a matrix with rows in lanes."""
-        return Number(matrix, c * self._padded(rows) + i, j)
+        return Component(matrix, c * self._padded(rows) + i, j)
 
     def _correction(self) -> list[Operation]:
         """Return the map from the results at fixed y to y and the unknowns."""
         e, t, k, own = self.equations, self.tangents, self.equations.k, self.own
         found = _set(
             (
-                Number(t.w, i % e.ny, self.bases[i // e.ny]),
-                Number(t.base, i) if i in self.rows["base"] else None,
+                Component(t.w, i % e.ny, self.bases[i // e.ny]),
+                Component(t.base, i) if i in self.rows["base"] else None,
             )
             for i in range(t.base.size)
         )
-        found.append(Loop(0, self.strands, self._sweep_to_tip))
+        found.append(PlaceLoop(0, self.strands, self._sweep_to_tip))
         for i, c, _ in e.tip_slopes:
             strand, component = divmod(c, e.ny)
             entry = self._entry_at(self.M, k, i, component, strand)
-            found.append(Add(Number(t.tip, i), Number(t.w, component, self.tips[strand]), entry))
-        alpha = [Number(t.alpha, i % own, self._place(f"alpha {i // own}")) for i in range(k)]
+            found.append(Add(Component(t.tip, i), Component(t.w, component, self.tips[strand]), entry))
+        alpha = [Component(t.alpha, i % own, self._place(f"alpha {i // own}")) for i in range(k)]
         found += map(Scale, alpha)
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
-            found.append(Add(alpha[i], Number(t.tip, c), entry, is_negative=True))
-        return [*found, Loop(0, self.strands, self._sweep_to_base)]
+            found.append(Add(alpha[i], Component(t.tip, c), entry, is_negative=True))
+        return [*found, PlaceLoop(0, self.strands, self._sweep_to_base)]
 
     def _sweep_to_tip(self, strand: Index) -> list[Operation]:
         """Set w along a strand; after every few pieces the unknowns change."""
@@ -414,11 +418,14 @@ class StepMap(EliminationCode):
         def group(g: Index) -> list[Operation]:
             first = base + g.value * size
             last, at = self._now.index(first + size), self._now.index(strand.value * count + g.value)
-            pivots = ((Number(t.beta, c, at), Number(t.w, p, last)) for c, p in enumerate(self.pivots))
+            pivots = ((Component(t.beta, c, at), Component(t.w, p, last)) for c, p in enumerate(self.pivots))
             changed = self._by_unknowns(t.w, last, t.beta, at, is_negative=True)
-            return [Loop(first, last.value, self._advance), *_set(pivots), *changed]
+            return [PlaceLoop(first, last.value, self._advance), *_set(pivots), *changed]
 
-        return [Loop(0, count, group), Loop(base + count * size, base + self._count("tip 0"), self._advance)]
+        return [
+            PlaceLoop(0, count, group),
+            PlaceLoop(base + count * size, base + self._count("tip 0"), self._advance),
+        ]
 
     def _sweep_to_base(self, strand: Index) -> list[Operation]:
         """Set y along a strand from its tip, by the unknowns of each group of pieces."""
@@ -438,20 +445,20 @@ class StepMap(EliminationCode):
             # a strand has one more alpha
             alpha, change = (
                 f.index(group.value + strand.value),
-                [Number(t.beta, c, group) for c in range(own)],
+                [Component(t.beta, c, group) for c in range(own)],
             )
             found = solve(alpha + 1, end)
-            found += [Scale(Number(t.alpha, c, alpha)) for c in range(own)]
-            found += [Add(change[c], Number(t.alpha, c, alpha + 1), is_negative=True) for c in range(own)]
+            found += [Scale(Component(t.alpha, c, alpha)) for c in range(own)]
+            found += [Add(change[c], Component(t.alpha, c, alpha + 1), is_negative=True) for c in range(own)]
             for i, c in zip(*map(np.ndarray.tolist, np.nonzero(self.nonzero_T)), strict=True):
-                entry = Number(self.T, self._of_X(i, c), group)
-                found.append(Add(Number(t.alpha, i, alpha), change[c], entry, is_negative=True))
-            return [*found, Loop(start + 1, end.value, functools.partial(solve, alpha))]
+                entry = Component(self.T, self._of_X(i, c), group)
+                found.append(Add(Component(t.alpha, i, alpha), change[c], entry, is_negative=True))
+            return [*found, PlaceLoop(start + 1, end.value, functools.partial(solve, alpha))]
 
         stop = base.value + self._count("points of strand")
         return [
-            Loop(base.value + (count * size + 1), stop, functools.partial(solve, first + count)),
-            Loop(0, count, group_back, descends=True), *solve(first, base),
+            PlaceLoop(base.value + (count * size + 1), stop, functools.partial(solve, first + count)),
+            PlaceLoop(0, count, group_back, descends=True), *solve(first, base),
         ]  # fmt: skip
 
     # the new record
@@ -459,30 +466,30 @@ class StepMap(EliminationCode):
     def _add_jumps(self, j: Index) -> list[Operation]:
         """Add the changes of jumps by y."""
         t, nonzeros = self.tangents, [(i, c, 0) for i, c, _ in self.equations.jumping]
-        return _products(nonzeros, (self.jump, j), (t.newest, j), lambda c: Number(t.y, c, j))
+        return _products(nonzeros, (self.jump, j), (t.newest, j), lambda c: Component(t.y, c, j))
 
     def _add_jumps_at_fixed_y(self, j: Index) -> list[Operation]:
         """Add the changes of jumps at fixed y."""
         t = self.tangents
-        return [Add(Number(t.newest, i, j), Number(t.far, i, j)) for i in self.rows["far"]]
+        return [Add(Component(t.newest, i, j), Component(t.far, i, j)) for i in self.rows["far"]]
 
     def _change_of_rates(self, j: Index) -> list[Operation]:
         """Set the change of rates at ends of pieces by y."""
         t = self.tangents
-        found: list[Operation] = [Scale(Number(t.change, i, j)) for i in self._rows_of(t.change)]
-        return found + self._slopes((t.change, j), lambda c: Number(t.newest, c, j), j)
+        found: list[Operation] = [Scale(Component(t.change, i, j)) for i in self._rows_of(t.change)]
+        return found + self._slopes((t.change, j), lambda c: Component(t.newest, c, j), j)
 
     def _solve_stage(self, k: int, j: Index) -> list[Operation]:
         """Add the change of y at a stage, and set that of the rates there."""
         e, t, stage, first, at = self.equations, self.tangents, *self._stage(k, j)
-        own, found = [Number(None, i) for i in range(e.ny)], list[Operation]()
+        own, found = [Component(None, i) for i in range(e.ny)], list[Operation]()
         for i in range(e.ny):
-            found.append(Add(own[i], Number(t.newest, i, j), 1.0 - stage.end))
-            found.append(Add(own[i], Number(t.y, i, j + 1), stage.end))
+            found.append(Add(own[i], Component(t.newest, i, j), 1.0 - stage.end))
+            found.append(Add(own[i], Component(t.y, i, j + 1), stage.end))
         found += self._rates_over_piece(stage.rates, own, t.change, j)
-        found += [Scale(Number(t.change, i, first)) for i in self._rows_of(t.change)]
+        found += [Scale(Component(t.change, i, first)) for i in self._rows_of(t.change)]
         found += self._slopes((t.change, first), own.__getitem__, first)
-        found += [Add(Number(t.between, i, at), own[i]) for i in range(e.ny)]
+        found += [Add(Component(t.between, i, at), own[i]) for i in range(e.ny)]
         return found + _copies(e.ny, (t.newest, first), (t.between, at))
 
     def _set_record(self, c0: Value, j: Index) -> list[Operation]:
@@ -490,18 +497,18 @@ class StepMap(EliminationCode):
         e, t, rows = self.equations, self.tangents, self.rows["rates"]
         strains = [(e.ny + i, c, node) for i, c, node in e.z_by_y]
         found = _set(
-            (Number(t.newest, i, j), Number(t.rates, i, j) if i in rows else None)
+            (Component(t.newest, i, j), Component(t.rates, i, j) if i in rows else None)
             for i in range(e.ny, e.ny + e.nz)
         )
-        found += _products(strains, (self.z_by_y, j), (t.newest, j), lambda c: Number(t.newest, c, j))
+        found += _products(strains, (self.z_by_y, j), (t.newest, j), lambda c: Component(t.newest, c, j))
         for i in range(e.numbers - e.ny - e.nz):
-            rate = Number(t.newest, e.ny + e.nz + i, j)
+            rate = Component(t.newest, e.ny + e.nz + i, j)
             found.append(Scale(rate))
             for rates in (t.rates, t.change):
-                found += [Add(rate, Number(rates, i, j))] if i in self._rows_of(rates) else []
+                found += [Add(rate, Component(rates, i, j))] if i in self._rows_of(rates) else []
         if self.settings.uses_rate:
             found += _copies(e.numbers, (t.rate, j), (t.history, j))
-            found += [Add(Number(t.rate, i, j), Number(t.newest, i, j), c0) for i in range(e.numbers)]
+            found += [Add(Component(t.rate, i, j), Component(t.newest, i, j), c0) for i in range(e.numbers)]
         return found
 
     def _show(self, row: Columns, node: Index) -> list[Operation]:
@@ -510,19 +517,22 @@ class StepMap(EliminationCode):
         own = Columns(self._now.pointer(row.base, node.value * (row.width * self.packed.size)), row.width)
         return [
             Show(
-                Number(own, int(component)),
-                Number(t.y if i < self.equations.ny else t.newest, i, self._of_strand(q, point)),
+                Component(own, int(component)),
+                Component(t.y if i < self.equations.ny else t.newest, i, self._of_strand(q, point)),
             )
             for (q, i), component in np.ndenumerate(self.packed)
         ]
 
 
 def _products(
-    nonzeros: Nonzeros, matrix: tuple[Array, Any], target: tuple[Array, Any], source: Callable[[int], Number]
+    nonzeros: Nonzeros,
+    matrix: tuple[Array, Any],
+    target: tuple[Array, Any],
+    source: Callable[[int], Component],
 ) -> list[Operation]:
     """Add the product of a sparse matrix with numbers; matrix and result have an array and a place."""
     return [
-        Add(Number(target[0], i, target[1]), source(c), Number(matrix[0], n, matrix[1]))
+        Add(Component(target[0], i, target[1]), source(c), Component(matrix[0], n, matrix[1]))
         for n, (i, c, _) in enumerate(nonzeros)
     ]
 
@@ -532,12 +542,12 @@ def _copies(
 ) -> list[Operation]:
     """Copy components, by default all; target and source have an array and a place."""
     return _set(
-        (Number(target[0], i, target[1]), Number(source[0], i, source[1]))
+        (Component(target[0], i, target[1]), Component(source[0], i, source[1]))
         for i in (range(size) if rows is None else rows)
     )
 
 
-def _set(pairs: Iterable[tuple[Number, Number | None]]) -> list[Operation]:
+def _set(pairs: Iterable[tuple[Component, Component | None]]) -> list[Operation]:
     """Set the first number of each pair to the second, or to zero."""
     found = list[Operation]()
     for target, source in pairs:

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.engine.codegen import Index, Value, Variable
-from knode_cosserat.engine.linear import Add, Columns, Number, write
+from knode_cosserat.engine.codegen import Index, StackVariable, Value
+from knode_cosserat.engine.linear import Add, Columns, Component, write
 from knode_cosserat.engine.memory import Array, aligned_zeros
 from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.engine.step_map import COLUMNS, STATE, StepMap
@@ -193,7 +193,7 @@ class _TangentCode(StepMap):
         """Begin a run, in which the records of a state change places from step to step."""
         offsets = (self._now.value(each.offset, "i64") for each in self.lasting[:-1])
         #: where the records are, from the last one
-        self.turning = [Variable(self._now, each) for each in offsets]
+        self.turning = [StackVariable(self._now, each) for each in offsets]
 
     def _turn(self, last: int) -> None:
         """Change the places of records; `last` is the one that becomes the last."""
@@ -307,7 +307,7 @@ class TangentCore(_TangentCode):
             "weights", "directions", "n_directions"
         )
         f = self._now
-        at_tip = [Add(Number(t.tip, i), Number(self.added_tip, i)) for i in range(self.equations.k)]
+        at_tip = [Add(Component(t.tip, i), Component(self.added_tip, i)) for i in range(self.equations.k)]
         write(self, [*self._at_fixed_y(coefficients, control), *at_tip], COLUMNS, False)
         with f.loop(count) as d:
             own = f.pointer(directions, d.value * self.direction_size)

@@ -217,7 +217,7 @@ class OnlineModel:
     def rollout(
         self, belief: Belief, controls: Float[np.ndarray, "T c"], d_controls: Float[np.ndarray, "k T c"],
         columns: tuple[int, ...], stride: int = 1,
-    ) -> tuple[MovedRobot, Motion | None]:  # fmt: skip
+    ) -> tuple[MovedRobot, TangentMotion | None]:  # fmt: skip
         """Return the robot, and its motion with tangents of all rows; None if it was not solved.
 
         A tangent is that along a direction of the belief's spread, with the tangents of the controls beside
@@ -244,7 +244,7 @@ class OnlineModel:
         d_rows = d_rows[:, *np.divmod(columns, rows.records.shape[-1])]
         records, rate = (np.moveaxis(part, -1, 0) for part in last[2:])
         spread = Spread(records, rate, spread.parameters)
-        return moved, Motion(after, rows.records, d_rows, spread)
+        return moved, TangentMotion(after, rows.records, d_rows, spread)
 
     def predicted(
         self, belief: Belief, controls: Any, measured: Any, deviations: tuple[Any, Any], output: Output
@@ -287,7 +287,7 @@ def _numbers(robot: ParametrisedRobot, x: Any) -> tuple[Any, Any]:
     return numbers(x), jax.vmap(lambda d: jax.jvp(numbers, (x,), (d,))[1])(jnp.eye(robot.size))
 
 
-class Motion(NamedTuple):
+class TangentMotion(NamedTuple):
     """A simulated motion, and the tangents of its rows."""
 
     past: StateHistory

@@ -27,7 +27,7 @@ from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
 from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.io import container
 from knode_cosserat.io.container import ContainerError
-from knode_cosserat.learning.passive import Passive, Sizes
+from knode_cosserat.learning.passive import NaturalUnits, Passive
 from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.residual import Expansion, Load, Structured, Term
 from knode_cosserat.rods import robot_file
@@ -172,7 +172,7 @@ MOST_TEXT = 100_000
 CLASSES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
-        Network, Nothing, Passive, Sizes, Structured, Load, Expansion, Term, TrainedRange,
+        Network, Nothing, Passive, NaturalUnits, Structured, Load, Expansion, Term, TrainedRange,
     )
 }  # fmt: skip
 

@@ -58,7 +58,7 @@ PARTS = ("stiffness", "levers", "energy", "damping", "dissipation")
 POSITIVE = ("damping", "dissipation")
 
 
-class Sizes(NamedTuple):
+class NaturalUnits(NamedTuple):
     """Natural units of inputs and outputs: control, force (N), moment, velocity, and δ (N m² s)."""
 
     control: Any
@@ -85,7 +85,7 @@ class Passive(Residual):
     energy: Float[Any, "units 5"]
     damping: Float[Any, "3"]
     dissipation: Float[Any, " units"] | None
-    sizes: Sizes
+    sizes: NaturalUnits
     energy_weights: Float[Any, "units inputs"]
     damping_weights: Float[Any, "units inputs"] | None
 
@@ -203,7 +203,7 @@ def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0
     force, moment, velocity = (float(natural[layout.slice(name)][0]) for name in ("n", "m", "q"))
     length, count = float(knowledge.length), np.shape(controls)[1]
     damping = 2.0 * RATIO * moment * length**2 / (3.516 * velocity)
-    sizes = Sizes(float(np.nanmean(np.abs(controls))) or 1.0, force, moment, velocity, damping)
+    sizes = NaturalUnits(float(np.nanmean(np.abs(controls))) or 1.0, force, moment, velocity, damping)
     rng = np.random.default_rng(seed)
     return Passive(
         jnp.zeros((3, 3)), jnp.zeros((2, 2, count)), jnp.zeros((hidden, 5)), jnp.zeros(3), jnp.zeros(hidden),

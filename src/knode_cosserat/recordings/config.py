@@ -172,7 +172,7 @@ NAMES = Rule(
 )
 
 
-class _Settings(ValidatedSettings):
+class _RecordingSettings(ValidatedSettings):
     error = RecordingError
 
 
@@ -180,7 +180,7 @@ class _Settings(ValidatedSettings):
 
 
 @dataclasses.dataclass(frozen=True)
-class MarkerSource(_Settings):
+class MarkerSource(_RecordingSettings):
     """Body on the rod, tracked by motion capture.
 
     Attributes:
@@ -203,7 +203,7 @@ class MarkerSource(_Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class SensorSource(_Settings):
+class SensorSource(_RecordingSettings):
     """Sensor beside motion capture.
 
     Attributes:
@@ -238,14 +238,14 @@ class SensorSource(_Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class BaseSource(_Settings):
+class BaseSource(_RecordingSettings):
     """Body fixed to the base, `height` (m) above the rod's clamped end."""
 
     topic: Annotated[str, LINE]
     height: Annotated[float, number(-10.0, 10.0, "m")] = 0.0
 
 
-class _NumbersSource(_Settings):
+class _NumbersSource(_RecordingSettings):
     """Source with a topic, the order of its numbers, and names."""
 
     topic: str
@@ -356,7 +356,7 @@ class MotorSource(_NumbersSource):
 
 
 @dataclasses.dataclass(frozen=True)
-class TableSource(_Settings):
+class TableSource(_RecordingSettings):
     """Titles of a table's columns, where they differ from this package's convention.
 
     Attributes:
@@ -380,7 +380,7 @@ BODY_TITLES = _titles(3, 7)
 
 
 @dataclasses.dataclass(frozen=True)
-class ColumnMap(_Settings):
+class ColumnMap(_RecordingSettings):
     """Titles of a table's columns, one by one. In a table without titles they are the numbers from 1 on.
 
     Attributes:
@@ -432,7 +432,7 @@ class ColumnMap(_Settings):
 
 
 @dataclasses.dataclass(frozen=True)
-class RecordingConfig(_Settings):
+class RecordingConfig(_RecordingSettings):
     """Configuration of the topics of a bag, or the columns of a table.
 
     Parts may be mappings, as in a file: `RecordingConfig(markers=[{"name": "tip", "fraction": 1}], …)`.

@@ -75,7 +75,7 @@ _QUATERNIONS = (
 _ROWS = 20
 
 
-class _Body(NamedTuple):
+class _ProposedBody(NamedTuple):
     name: str
     topic: str
     #: (n, 3) positions in the recording's unit
@@ -119,12 +119,12 @@ def config_of_bag(bag: Bag) -> RecordingConfig:
         elif topic.type in TRANSFORMS and topic.name != STATIC:
             frames = [part.child_frame_id.strip("/") for message in messages for part in message.transforms]
             names |= {f"{topic.name}[{frame}]": frame for frame in frames}
-    bodies: list[_Body] = []
+    bodies: list[_ProposedBody] = []
     for name, word in names.items():
         stream = decoded(bag, MarkerSource(word, name, 1.0), "pose")
         if len(stream.values):
             is_new = word not in [body.name for body in bodies]
-            bodies.append(_Body(word if is_new else name, name, stream.values[:, :3]))
+            bodies.append(_ProposedBody(word if is_new else name, name, stream.values[:, :3]))
     if not bodies:
         topics = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in bag.topics.values()]
         raise RecordingError(f"no topic has poses; the bag has {', '.join(topics) or 'no topics'}")
@@ -168,7 +168,7 @@ def config_of_table(table: Table) -> RecordingConfig:
         bodies = []
         for name in table.bodies:
             places = [titles.index(title) for title in position_titles(name, "m")]
-            bodies.append(_Body(name, name, columns_of(table.numbers, places)))
+            bodies.append(_ProposedBody(name, name, columns_of(table.numbers, places)))
         others = [title for title in titles if not re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)]
         mapped, sources = _number_columns(table, [title for title in others if title != TIME], remarks)
         columns = ColumnMap.from_dict(mapped) if mapped else None
@@ -189,11 +189,11 @@ def config_of_table(table: Table) -> RecordingConfig:
     return _config(bodies, sources | settings, remarks)
 
 
-def _bodies(table: Table, titles: Sequence[str]) -> list[_Body]:
+def _bodies(table: Table, titles: Sequence[str]) -> list[_ProposedBody]:
     """Return the bodies whose coordinates have titles that differ in x, y and z, or 0, 1 and 2, only."""
     columns = list(map(str, table.numbers.columns))
     spelling = {title.lower(): title for title in reversed(titles)}
-    bodies: dict[str, _Body] = {}
+    bodies: dict[str, _ProposedBody] = {}
     for title in titles:
         for match in re.finditer("x|(?<=pos[_ .[])0", title.lower()):
             before, after = title[: match.start()], title[match.end() :]
@@ -208,7 +208,7 @@ def _bodies(table: Table, titles: Sequence[str]) -> list[_Body]:
             if name not in bodies:
                 position = columns_of(table.numbers, [columns.index(axis) for axis in axes])
                 turned = _quaternion(before, titles, len(bodies))
-                bodies[name] = _Body(name, name, position, (*axes, *turned))
+                bodies[name] = _ProposedBody(name, name, position, (*axes, *turned))
                 break
     if not bodies:
         raise RecordingError(
@@ -278,7 +278,7 @@ def _number_columns(
 # places on the rod
 
 
-def _config(bodies: Sequence[_Body], settings: dict[str, Any], remarks: list[str]) -> RecordingConfig:
+def _config(bodies: Sequence[_ProposedBody], settings: dict[str, Any], remarks: list[str]) -> RecordingConfig:
     """Return the configuration of bodies whose places are guessed from distances at the start.
 
     `settings` are those that are known: sources, columns, the unit of positions and the axis that points up.

@@ -25,7 +25,7 @@ from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.ends import AT_ORIGIN, Pose, velocities
 from knode_cosserat.rods.law import JointLaw
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.loads import Body, Motion
+from knode_cosserat.rods.loads import BodyInertia, Motion
 from knode_cosserat.rods.parameters import ParameterError, parameter, slot, text
 from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rods.rod import Y_LAYOUT, SlenderRod
@@ -356,7 +356,9 @@ class Assembly(System):
                 tips[name] += Wrench(-n, -m - cross(rod.pose(both[0]).p - frames[name].p, n))
         for body, own, own_t in zip(self.bodies, bodies, body_rates, strict=True):
             _, h, n, m, *_ = Y_LAYOUT.split(own)
-            moving = Body(body.mass, None, body.inertia).wrench(Motion.of(Y_LAYOUT, own, own_t), self.gravity)
+            moving = BodyInertia(body.mass, None, body.inertia).wrench(
+                Motion.of(Y_LAYOUT, own, own_t), self.gravity
+            )
             total = (
                 moving + tips[body.name] + Wrench(n, m) + Wrench(*map(jnp.asarray, (body.force, body.moment)))
             )

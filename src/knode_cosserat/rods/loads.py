@@ -50,7 +50,7 @@ class Motion(NamedTuple):
         return cls(p, rotation_matrix(h), q, w, layout.get(y_t, "q"), layout.get(y_t, "w"))
 
 
-class Body(NamedTuple):
+class BodyInertia(NamedTuple):
     """A rigid body by its moments about a point of the rod, material frame; bodies at one point add up.
 
     A moment that is zero is None: a body with only a mass, such as most ribs, needs no equations of rotation.
@@ -63,7 +63,7 @@ class Body(NamedTuple):
     inertia: Float[Any, "3 3"] | None
 
     @classmethod
-    def of(cls, bodies: list[tuple[Body, Any]]) -> Body:
+    def of(cls, bodies: list[tuple[BodyInertia, Any]]) -> BodyInertia:
         """Return the weighted sum of several bodies."""
         sums = []
         for moments in zip(*(body for body, _ in bodies), strict=True):
@@ -109,7 +109,7 @@ class PointLoad(Load):
         return (self.at,)
 
     @property
-    def body(self) -> Body | None:
+    def body(self) -> BodyInertia | None:
         """The load as a rigid body about the rod's axis, or None. Bodies at one place are summed."""
         return None
 
@@ -199,14 +199,14 @@ class AttachedMass(PointLoad):
     )  # fmt: skip
 
     @property
-    def body(self) -> Body:
+    def body(self) -> BodyInertia:
         """The rigid body about the rod's axis, in the material frame."""
         J = None if self.inertia is None else np.eye(3) * jnp.asarray(self.inertia)
         if self.offset is None:
-            return Body(self.mass, None, J)
+            return BodyInertia(self.mass, None, J)
         r = jnp.asarray(self.offset)
         off_axis = self.mass * (jnp.sum(r * r) * np.eye(3) - r[:, None] * r)
-        return Body(self.mass, self.mass * r, off_axis if J is None else J + off_axis)
+        return BodyInertia(self.mass, self.mass * r, off_axis if J is None else J + off_axis)
 
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
         """Return weight less inertial forces."""
@@ -224,5 +224,5 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
         total = total + Wrench(weight * wrench.force, weight * wrench.moment)
     if bodies:
         # summed before the wrench: their equations are compiled once for any number of bodies
-        total = total + Body.of(bodies).wrench(motion, gravity)
+        total = total + BodyInertia.of(bodies).wrench(motion, gravity)
     return total

@@ -74,7 +74,7 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
     if isinstance(law, MaterialLaw):
         return MaterialStep(law, layout, c0, hz, {}, length)
     if isinstance(law, tuple):
-        return LinearStep(LinearLaw(*law), c0, hz)
+        return DiscreteLinearLaw(LinearLaw(*law), c0, hz)
     return _StatedStrains(law)
 
 
@@ -109,7 +109,7 @@ class _StatedStrains:
 
 
 @dataclasses.dataclass(frozen=True)
-class LinearStep:
+class DiscreteLinearLaw:
     """C z + D z_t = f2 with z_t = c0 z + ʰz."""
 
     law: LinearLaw

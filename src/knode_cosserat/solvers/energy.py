@@ -55,7 +55,7 @@ def is_tested(system: System) -> bool:
     return True
 
 
-class _Shape(NamedTuple):
+class _Frames(NamedTuple):
     """Positions (m) and orientations of the points between elements, and SciPy's rotations."""
 
     p: Float[np.ndarray, "points 3"]
@@ -101,7 +101,7 @@ class RodEnergy:
         self.unit = float(np.asarray(rod.Kbt)[0, 0]) / self.length
         p, n, m, h = fields
         smooth_h = CubicSpline(known, h)
-        self.shape = _Shape(CubicSpline(known, p)(points), rotations(smooth_h(points)))
+        self.shape = _Frames(CubicSpline(known, p)(points), rotations(smooth_h(points)))
         R = rotations(smooth_h(middle)).as_matrix()
         # forces may jump at nodes
         n, m = (
@@ -211,12 +211,12 @@ class RodEnergy:
         c = self.length / np.pi * (1.0 if all(free) else 2.0)
         return bool(np.max(np.linalg.norm(m, axis=1)) * c + P * c * c < K)
 
-    def _moved(self, shape: _Shape, step: Float[np.ndarray, "points 6"]) -> _Shape:
+    def _moved(self, shape: _Frames, step: Float[np.ndarray, "points 6"]) -> _Frames:
         from scipy.spatial.transform import Rotation
 
-        return _Shape(shape.p + self.length * step[:, :3], Rotation.from_rotvec(step[:, 3:]) * shape.turned)
+        return _Frames(shape.p + self.length * step[:, :3], Rotation.from_rotvec(step[:, 3:]) * shape.turned)
 
-    def _energy(self, shape: _Shape) -> tuple[float, _Stress]:
+    def _energy(self, shape: _Frames) -> tuple[float, _Stress]:
         """Return the energy (J), and the stress of the elements."""
         from scipy.spatial.transform import Rotation
 

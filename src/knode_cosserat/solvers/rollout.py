@@ -22,7 +22,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 
 from knode_cosserat.engine.loops import at_all_stages, core_of, table_of, tangents_for
-from knode_cosserat.engine.motions import Motions, Shape
+from knode_cosserat.engine.motions import Motions, StaticState
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.engine.tangents import CotangentCore, SolvedSteps, TangentCore
@@ -140,7 +140,7 @@ def _core_of_solves(spec: Solves, *operands: Any) -> Any:
 def _solve(core: Any, spec: Solves, *arrays: np.ndarray) -> list[Any]:
     leaves, controls = arrays[: spec.leaves], arrays[spec.leaves]
     task, parameters = spec.task, np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1)
-    states: Any = (StateHistory if task.settings.time else Shape)(*arrays[spec.leaves + 1 :])
+    states: Any = (StateHistory if task.settings.time else StaticState)(*arrays[spec.leaves + 1 :])
     motions = Motions(core, parameters, states, task.coefficients)
     done, rows = motions.solve(controls, (0, task.steps))
     return [done, *motions.states, *rows]
@@ -334,7 +334,7 @@ def static_rollout(task: TimeIntegration, pattern: Pattern) -> Callable[[System,
 
     @jax.custom_jvp
     def run(system: System, controls: Any, y: Any) -> StepRows:
-        return _solved(Solves(task, pattern), system, controls, Shape(y))[2]
+        return _solved(Solves(task, pattern), system, controls, StaticState(y))[2]
 
     def tangent(primals: Any, tangents: Any) -> Any:
         rows, system = run(*primals), primals[0]

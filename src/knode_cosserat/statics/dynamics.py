@@ -41,7 +41,7 @@ FACTOR_ROUNDING, ROUNDING = 1e-13, 1e-8
 TOGETHER = 1e-6
 
 
-class _Modes(NamedTuple):
+class _ResolvedModes(NamedTuple):
     """Resolved modes of small motions about an equilibrium: the fastest growing first."""
 
     #: λ: growth rate and angular frequency (1/s); of a complex pair, the one with positive frequency
@@ -65,7 +65,7 @@ class _Modes(NamedTuple):
         return ~self.growing & (np.maximum(self.values.real, self.coarse.real) > self.rounding)
 
 
-def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Modes:
+def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _ResolvedModes:
     """Return the modes of small motions about an equilibrium y (nodes, y).
 
     Raises `ValueError`, with a reason, if they cannot be computed.
@@ -113,7 +113,7 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Mod
     found = [each[order] / time for each in (fine, uncertainty, rounding, other)]
     records = vectors.T[order].reshape(len(order), -1, history_size(own))
     motions = records[:, grid_of(own, Lobatto4()).nodes, : own.y_layout.size]
-    return _Modes(found[0], found[1], found[2], found[3], motions)
+    return _ResolvedModes(found[0], found[1], found[2], found[3], motions)
 
 
 def _step(system: System, guess: np.ndarray, control: np.ndarray) -> tuple[np.ndarray, float, LinearStep]:

@@ -112,7 +112,7 @@ def equilibrium_path(
         robot, first, space=settings.space, initial=initial, newton=newton, with_stability=False
     )
     robot = found.system
-    walk = _Walk(robot, settings, (first, last), np.asarray(found.y[0]))
+    walk = _PathPoints(robot, settings, (first, last), np.asarray(found.y[0]))
     directions: list[int] = []
 
     def path() -> EquilibriumPath:
@@ -141,7 +141,7 @@ def equilibrium_path(
     return path()
 
 
-class _Walk:
+class _PathPoints:
     """The points of a path that have been computed."""
 
     def __init__(self, system: System, settings: Settings, ends: tuple[Any, Any], nodes: np.ndarray):
@@ -203,7 +203,7 @@ def _linearised(system, settings, ends, y, part):  # type: ignore[no-untyped-def
     return found, by_part, problem.linearise(y), at_ends
 
 
-class _Elimination:
+class _PathElimination:
     """The linear equations of a correction, eliminated from base to tip.
 
     δy_0 = S δξ + base, δy_{j+1} = A δy_j + B δy_{j+1} + r_j and M δy_N = -tip. As in the engine, every
@@ -242,7 +242,7 @@ def _directions(
     error = float(np.maximum(np.max(np.abs(defects) / scale), np.max(np.abs(tip) / rows)))
     try:
         pivots = np.asarray(system.y_layout.indices(system.base_unknowns))
-        rod = _Elimination(*pieces, *at_ends, pivots=pivots)
+        rod = _PathElimination(*pieces, *at_ends, pivots=pivots)
         at_tip, columns = rod.M @ rod.X[-1], scale[rod.pivots]
         # of a neutral family, the smallest solutions
         inverse = np.linalg.pinv(at_tip * columns / rows[:, None], NEUTRAL)
@@ -279,7 +279,7 @@ def _corrected(
     return y, part, error, count, (follow / size, 1.0 / size)
 
 
-def _trajectory(system: System, settings: Settings, walk: _Walk) -> Trajectory:
+def _trajectory(system: System, settings: Settings, walk: _PathPoints) -> Trajectory:
     controls = walk.ends[0] + np.array(walk.parts)[:, None] * (walk.ends[1] - walk.ends[0])
     rows = [node_values(system, settings, control, y) for control, y in zip(controls, walk.y, strict=True)]
     y, z = (np.stack([np.asarray(row[k]) for row in rows]) for k in (0, 1))

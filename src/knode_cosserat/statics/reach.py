@@ -198,7 +198,7 @@ def inverse_kinematics(
     wanted, single = _checked_wanted(robot, pose, position, quaternion, (weights, tolerance))
 
     def solve(robot: System) -> Solved[InverseKinematics]:
-        search = _Search(robot, settings, pose, *limits)
+        search = _ReachSearch(robot, settings, pose, *limits)
         free = np.where(search.free, search.span, 1.0)
         last = np.where(search.free, 0.5, 0.0) if begin is None else (begin - limits[0]) / free
         rows, shape = [], None
@@ -231,7 +231,7 @@ def _whole(number: Any) -> bool:
 
 
 def _one(
-    search: _Search, wanted: _Wanted, begin: np.ndarray, shape: Response | None, starts: int
+    search: _ReachSearch, wanted: _Wanted, begin: np.ndarray, shape: Response | None, starts: int
 ) -> tuple[InverseKinematics, np.ndarray, Response | None]:
     """Solve for one pose, from `begin` and its equilibrium (None: from rest), then from other controls."""
     best: tuple[float, np.ndarray, Response, bool] | None = None
@@ -269,7 +269,7 @@ def _others(size: int, count: int, free: np.ndarray) -> np.ndarray:
 
 
 def _outcome(
-    search: _Search, wanted: _Wanted, u: np.ndarray, found: Response | None, result: Reach
+    search: _ReachSearch, wanted: _Wanted, u: np.ndarray, found: Response | None, result: Reach
 ) -> InverseKinematics:
     """Return the result for an equilibrium, or for none: NaN."""
     system, control = search.system, search.control(u)
@@ -295,7 +295,7 @@ def _outcome(
     )  # fmt: skip
 
 
-def _from_rest(search: _Search, control: np.ndarray, found: Response) -> bool:
+def _from_rest(search: _ReachSearch, control: np.ndarray, found: Response) -> bool:
     """True if the equilibrium found from the unloaded robot has the same shape."""
     try:
         cold = first_solved(search.system, search.settings, search.pose, control)
@@ -427,7 +427,7 @@ def at_limits(u: np.ndarray) -> np.ndarray:
     return np.where(u < AT_LIMIT, 0.0, np.where(u > 1.0 - AT_LIMIT, 1.0, u))
 
 
-class _Search:
+class _ReachSearch:
     """State of the searches of one call: the robot, the limits, and the number of equilibria computed."""
 
     def __init__(self, system: System, settings: Settings, pose: Pose, low: np.ndarray, high: np.ndarray):

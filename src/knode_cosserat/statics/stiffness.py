@@ -45,7 +45,7 @@ MET = 1e-11
 NEUTRAL = 1e-3
 
 
-class _Ends(NamedTuple):
+class _EndConditions(NamedTuple):
     """Linearised conditions at the two ends, in equilibrium."""
 
     #: y at the base and at the tip
@@ -68,7 +68,7 @@ class Pieces(NamedTuple):
     part: np.ndarray
     #: rates (per length of the rod) of the other fields of y under poses and stresses, natural units
     moved: Float[np.ndarray, " y"]
-    ends: _Ends
+    ends: _EndConditions
 
 
 # transformations between y and poses and stresses
@@ -184,9 +184,9 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
     bounds = (points.segment[:, None] + points.bounds) * length / (system.nodes - 1)
     found = np.asarray(still_state(system, Lobatto4(), control, np.asarray(y)).y)
 
-    def ends(y: np.ndarray) -> _Ends:
+    def ends(y: np.ndarray) -> _EndConditions:
         asked = _ends(system, jnp.asarray(y[0]), jnp.asarray(y[-1]), control, history)
-        return _Ends((y[0], y[-1]), *map(np.asarray, asked))
+        return _EndConditions((y[0], y[-1]), *map(np.asarray, asked))
 
     def integrated(y: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return F of the pieces, the gaps of y at the ends of the divided intervals, and other rates."""
@@ -225,7 +225,9 @@ def _at_points(system: System, y: np.ndarray, way: Any) -> np.ndarray:
     return np.asarray(jax.vmap(jax.vmap(lambda each: way(strand_of(system), each)))(own))
 
 
-def _correction(system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, ends: _Ends) -> np.ndarray:
+def _correction(
+    system: System, y: np.ndarray, F: np.ndarray, off: np.ndarray, ends: _EndConditions
+) -> np.ndarray:
     """Return the change of y at all points that closes the gaps; of several, the smallest."""
     strands, to, back = strand_count(system), _at_points(system, y, narrow), _at_points(system, y, wide)
     gaps = to[1:] @ in_strands(system, off)[..., None]

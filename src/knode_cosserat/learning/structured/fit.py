@@ -168,7 +168,7 @@ class _Regression:
         floors = _floors(layout, size)
         # nonlinear in the strain itself and its rate only; other strains have a linear coupling
         targets = [
-            _Target(values[:, where], None, floors[where], (name, f"{name}_t"))
+            _RegressionTarget(values[:, where], None, floors[where], (name, f"{name}_t"))
             for name in layout.names
             for where in [layout.slice(name)]
         ]
@@ -212,7 +212,9 @@ class _Regression:
         missing, inputs = map(np.asarray, _base_law(residual.adapted(self.knowledge), *at_base))
         layout, size = aspect.base_layout, missing.shape[1]
         library = _Library(expansion(layout, inputs, {}, size), inputs, dict.fromkeys(layout.names, LINEAR))
-        return _fitted(library, None, [_Target(missing, None, np.full(size, TOLERANCE))], counting)[0]
+        return _fitted(library, None, [_RegressionTarget(missing, None, np.full(size, TOLERANCE))], counting)[
+            0
+        ]
 
     def tip_load(self, residual: Structured) -> Load | None:
         """Return the missing load at the tip."""
@@ -375,7 +377,7 @@ def _longer(knowledge: System, missing: Any, slopes: Any, shares: Any) -> float:
 # regressions of a load or a stress
 
 
-class _Target(NamedTuple):
+class _RegressionTarget(NamedTuple):
     """One target field of a regression: its values, and the floors below which they are noise.
 
     `frames` has the rotation matrices from the material frame to the values' frame, at every point; None if
@@ -410,14 +412,14 @@ def _libraries(system: System, layout: Layout, views: _Views, curved: bool) -> t
     return _Library(material, views.material, simple), _Library(ambient, views.ambient, {})
 
 
-def _targets(system: System, layout: Layout, y: Any, missing: Any, floors: Any) -> list[_Target]:
+def _targets(system: System, layout: Layout, y: Any, missing: Any, floors: Any) -> list[_RegressionTarget]:
     """Return the fields of a missing load (S, l) of this layout."""
     rotations = {
         name: np.asarray(_rotations(jnp.asarray(system.y_layout.get(y, name))))
         for name in {field.frame for field in layout.fields if field.frame}
     }
     return [
-        _Target(missing[:, where], rotations.get(field.frame), floors[where])
+        _RegressionTarget(missing[:, where], rotations.get(field.frame), floors[where])
         for field in layout.fields
         for where in [layout.slice(field.name)]
     ]
@@ -428,7 +430,7 @@ def _load(material: Expansion | None, ambient: Expansion | None) -> Load | None:
 
 
 def _fitted(
-    material: _Library, ambient: _Library | None, targets: Sequence[_Target], counting: _Counting
+    material: _Library, ambient: _Library | None, targets: Sequence[_RegressionTarget], counting: _Counting
 ) -> tuple[Expansion | None, Expansion | None]:
     """Return the expansions, in the material and the global frame, that explain the targets."""
     libraries = [library for library in (material, ambient) if library]
@@ -446,7 +448,7 @@ AMBIENT = -1
 
 
 def _weights(
-    material: _Library, features: Sequence[Any], target: _Target, counting: _Counting
+    material: _Library, features: Sequence[Any], target: _RegressionTarget, counting: _Counting
 ) -> list[Float[Any, "n k"]]:
     """Return the weights of the material and the ambient features (n, k) for one target.
 

@@ -129,14 +129,14 @@ def _estimated_parts(
         return [_estimated(part, robot, method) for part in parts]
 
 
-def _stretch(part: _Part, robot: System) -> float:
+def _stretch(part: _Interval, robot: System) -> float:
     """Return the ratio of the rod's length to its model's, from the straightest row."""
     places = part.fractions * float(robot.length)
     reach = np.linalg.norm(part.rows.position[:, part.rows.fractions > 0.0], axis=2)
     return float(np.nanmax(reach @ places / (places @ places)))
 
 
-def _estimated(part: _Part, robot: System, method: str) -> Trajectory:
+def _estimated(part: _Interval, robot: System, method: str) -> Trajectory:
     tension, settings = part.rows.tension, None
     # the tension held from the row before; for the first row, its own
     control = np.concatenate([tension[:1], tension[:-1]])
@@ -161,7 +161,7 @@ def _estimated(part: _Part, robot: System, method: str) -> Trajectory:
     )
 
 
-def _best(part: _Part, robot: System, control: Float[np.ndarray, "T c"]) -> tuple[np.ndarray, np.ndarray]:
+def _best(part: _Interval, robot: System, control: Float[np.ndarray, "T c"]) -> tuple[np.ndarray, np.ndarray]:
     """Return y and z at the nodes: the motion, n and m from the robot's balance, and v from its law."""
     y0, z0 = (np.asarray(values, dtype=float) for values in robot.rest(jnp.zeros(())))
     h, p = y0[robot.y_layout.slice("h")], y0[robot.y_layout.slice("p")]
@@ -194,7 +194,7 @@ def _best(part: _Part, robot: System, control: Float[np.ndarray, "T c"]) -> tupl
 
 
 def _paper_states(
-    part: _Part, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
+    part: _Interval, robot: System, control: Float[np.ndarray, "T c"], settings: Settings
 ) -> tuple[Float[np.ndarray, "T N y"], Float[np.ndarray, "T N z"]]:
     """Return y and z of the rows. Raises `RecordingError` if a body has no orientation."""
     rows = part.rows
@@ -244,7 +244,7 @@ def _along(
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class _Part:
+class _Interval:
     """Unbroken part of a recording: the rows to estimate, and the bodies away from the clamped end.
 
     `poses` are at motion capture's own rate, `fractions` the places of the bodies.
@@ -270,7 +270,9 @@ def _rows(recording: Recording | Measurements, times: _Times) -> Measurements:
     return rows
 
 
-def _parts(recording: Recording | Measurements, rows: Measurements, robot: System, dt: float) -> list[_Part]:
+def _parts(
+    recording: Recording | Measurements, rows: Measurements, robot: System, dt: float
+) -> list[_Interval]:
     """Return the parts with enough rows for an estimation. Raises `RecordingError` without any."""
     _check(rows, robot)
     pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
@@ -286,7 +288,7 @@ def _parts(recording: Recording | Measurements, rows: Measurements, robot: Syste
             if isinstance(recording, Recording)
             else _of_rows(piece, used)
         )
-        parts.append(_Part(piece, poses, rows.fractions[used]))
+        parts.append(_Interval(piece, poses, rows.fractions[used]))
     return parts
 
 

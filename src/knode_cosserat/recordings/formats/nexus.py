@@ -39,7 +39,7 @@ _SIGNATURE = re.compile(rf'^[\s,;]*"?({_SECTIONS})"?[ ,;\t]*\r?\n"?\d+([.,]\d+)?
 _ANGLES = {"deg": np.pi / 180.0, "rad": 1.0}
 
 
-class _Section(NamedTuple):
+class _TableSection(NamedTuple):
     rate: float
     #: frame numbers and numbers of the samples within a frame
     frame: Float[np.ndarray, " n"]
@@ -73,7 +73,7 @@ def read_nexus(path: Path, wanted: Collection[str] = ()) -> Table:
     )
 
 
-def _sections(lines: list[str]) -> Iterator[_Section]:
+def _sections(lines: list[str]) -> Iterator[_TableSection]:
     starts = [k for k in range(len(lines) - 1) if _BEGIN.match(lines[k]) and _RATE.match(lines[k + 1])]
     for start, end in zip(starts, [*starts[1:], len(lines)], strict=True):
         name = lines[start].strip('", ;\t')
@@ -98,10 +98,12 @@ def _sections(lines: list[str]) -> Iterator[_Section]:
             groups[k] = groups[k] or groups[k - 1]
         cells = exports.cells_reader(lines[start + 5 : rows], titles, delimiter)
         frame, sample = np.nan_to_num(cells([0, 1])).T
-        yield _Section(rate, frame, sample, cells, groups, titles, units)
+        yield _TableSection(rate, frame, sample, cells, groups, titles, units)
 
 
-def _tracks(section: _Section, findings: list[Finding]) -> tuple[list[exports.Track], dict[str, np.ndarray]]:
+def _tracks(
+    section: _TableSection, findings: list[Finding]
+) -> tuple[list[exports.Track], dict[str, np.ndarray]]:
     """Return the bodies and markers of a section, and its other columns by title."""
     from scipy.spatial.transform import Rotation
 
