@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from studies.report import Report
 
 
-class _Program(program.Program):
+class _Program(program.CommandGroup):
     program = "python -m studies"
     plugins = ""
 

@@ -30,7 +30,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.robot_file import format_robot, load_robot, parse_robot
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendons import undelayed
+from knode_cosserat.rods.tendons import remove_delay
 from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.segments import DataError
@@ -386,7 +386,7 @@ def _paper_motion(
     """
     before = measured.initial_tension
     rest = None if before is None else equilibrium(resting, before, space=PAPER_SPACE)
-    acting = undelayed(system, measured.tension[:-1], measured.dt, before)
+    acting = remove_delay(system, measured.tension[:-1], measured.dt, before)
     return simulate(
         system, acting, measured.dt, time="bdf2", space=PAPER_SPACE, start="paper",
         initial="unstressed" if rest is None else rest,

@@ -7,7 +7,7 @@ from hypothesis import given
 
 from knode_cosserat import controls
 from knode_cosserat._files import csv_rows, limits, yaml_text
-from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, allowed, excess
+from knode_cosserat._files.limits import MORE, VARIABLE, LimitSettingError, excess, scaled_limit
 from knode_cosserat.cli.control import parsed_reference
 from tests.limits import assert_limited, limited
 
@@ -69,16 +69,16 @@ def test_a_refusal_names_the_setting_and_the_setting_allows_the_file(
 def test_a_wrong_setting_is_refused_in_one_line(monkeypatch, text):
     monkeypatch.setenv(VARIABLE, text)
     with pytest.raises(LimitSettingError) as refused:
-        allowed(5)
+        scaled_limit(5)
     message = str(refused.value)
     assert message.startswith(f"{VARIABLE} must be a finite number above 0 (got ") and len(message) < 200
     assert "\n" not in message and isinstance(refused.value, ValueError)
 
 
 def test_the_default_and_an_empty_setting_change_nothing(monkeypatch):
-    assert allowed(1_000_000_000) == 1_000_000_000
+    assert scaled_limit(1_000_000_000) == 1_000_000_000
     monkeypatch.setenv(VARIABLE, "")
-    assert allowed(7) == 7 and excess(7, 7, "bytes") == ""
+    assert scaled_limit(7) == 7 and excess(7, 7, "bytes") == ""
     assert excess(8, 7, "bytes") == f"it has 8 bytes; allowed are 7; {MORE}"
 
 
@@ -90,9 +90,9 @@ def test_limits_grow_with_the_factor_and_are_integers_of_64_bits(one, other, fac
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv(VARIABLE, repr(factor))
         low, high = sorted((one, other))
-        found = allowed(low)
-        assert type(found) is int and 0 <= found <= allowed(high) <= limits._LARGEST
+        found = scaled_limit(low)
+        assert type(found) is int and 0 <= found <= scaled_limit(high) <= limits._LARGEST
         assert found == int(min(low * factor, limits._LARGEST))
-        assert bool(excess(one, other, "rows")) == (one > allowed(other))
+        assert bool(excess(one, other, "rows")) == (one > scaled_limit(other))
         patch.setenv(VARIABLE, repr(max(factor, larger)))
-        assert found <= allowed(low)
+        assert found <= scaled_limit(low)

@@ -6,7 +6,7 @@ import pytest
 from scipy.integrate import quad_vec
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.rotation import mean_turned, quaternion_of, since_first, turned
+from knode_cosserat.rotation import mean_turned, quaternion_of, rotate, since_first
 
 AXIS, VECTOR = np.array([2.0, -1.0, 2.0]) / 3.0, np.array([0.3, -0.7, 0.5])
 #: on both sides of where series give way to sines, too
@@ -17,7 +17,7 @@ ANGLES = [0.0, 1e-6, 1e-3, 0.0999, 0.1001, 1.0, 3.0, 9.0]
 def test_turned_and_mean_turned(angle):
     turn = angle * AXIS
     expected = Rotation.from_rotvec(turn).apply(VECTOR)
-    np.testing.assert_allclose(turned(3.0 * quaternion_of(turn), VECTOR), expected, atol=1e-14)
+    np.testing.assert_allclose(rotate(3.0 * quaternion_of(turn), VECTOR), expected, atol=1e-14)
     mean, _ = quad_vec(lambda part: Rotation.from_rotvec(part * turn).apply(VECTOR), 0.0, 1.0, epsabs=1e-15)
     np.testing.assert_allclose(mean_turned(turn, VECTOR), mean, atol=1e-14)
 

@@ -76,10 +76,10 @@ def check_arguments(
                     "holds",
                     next(one for one in value if not any(_matches(one, it) for it in items)),
                 )
-            raise error(f"{name} {verb} {described(value, not makers)}; allowed is {_words(kind)}{hint}")
+            raise error(f"{name} {verb} {kind_text(value, not makers)}; allowed is {_words(kind)}{hint}")
 
 
-def described(value: Any, plain: bool = False) -> str:
+def kind_text(value: Any, plain: bool = False) -> str:
     """Return a value's kind in words, such as "a Recording"; a text without its kind if that is `plain`."""
     if value is None or isinstance(value, bool | int | float):
         return repr(value)

@@ -74,7 +74,7 @@ def object_text(owner: Any, units: dict[str, str], always: Iterable[str] = ()) -
         with contextlib.suppress(Exception):
             text = field_text(value, units.get(field.name, ""))
         parts.append(f"{field.name}={text}".replace(" ", _GLUE))
-    return wrapped(f"{type(owner).__name__}({', '.join(parts)})")
+    return wrap_lines(f"{type(owner).__name__}({', '.join(parts)})")
 
 
 def _is_default(value: Any, default: Any) -> bool:
@@ -85,7 +85,7 @@ def _is_default(value: Any, default: Any) -> bool:
     return False
 
 
-def wrapped(text: str) -> str:
+def wrap_lines(text: str) -> str:
     """Return a text in lines of at most `WIDTH` characters."""
     lines = textwrap.wrap(
         text, WIDTH, subsequent_indent="    ", break_long_words=False, break_on_hyphens=False

@@ -21,7 +21,7 @@ import math
 from collections.abc import Callable, Collection
 from typing import Annotated, Any, ClassVar, NamedTuple, Self, get_origin, get_type_hints
 
-from knode_cosserat._files.yaml_text import did_you_mean, shown
+from knode_cosserat._files.yaml_text import did_you_mean, excerpt
 
 
 class Rule(NamedTuple):
@@ -158,7 +158,7 @@ class ValidatedSettings:
     @classmethod
     def refusal(cls, name: str, value: Any, words: str) -> Exception:
         """Return the error of a value that is not allowed; `words` are the allowed ones."""
-        return cls.error(f"{name} is {shown(value)}; allowed is {words}")
+        return cls.error(f"{name} is {excerpt(value)}; allowed is {words}")
 
     @classmethod
     def from_dict(cls, values: dict[Any, Any]) -> Self:
@@ -179,7 +179,7 @@ class ValidatedSettings:
         for name in names:
             if name not in known:
                 raise cls.error(
-                    f"the key {shown(name)} is unknown; allowed is {', '.join(known)}"
+                    f"the key {excerpt(name)} is unknown; allowed is {', '.join(known)}"
                     f"{did_you_mean(name, known)}"
                 )
 

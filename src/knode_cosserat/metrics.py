@@ -285,7 +285,7 @@ def state_errors(
     places = [np.linspace(0.0, 1.0, np.shape(it.y)[1]) for it in (estimate, truth)]
     nodes = _matching(places[0], places[1], "node", "of its length")
     errors = {}
-    for name, unit in _shared(estimate, truth):
+    for name, unit in _common_rows(estimate, truth):
         found = np.asarray(estimate.part(name), dtype=float)[mine]
         true = np.asarray(truth.part(name), dtype=float)[np.ix_(rows, nodes)]
         if name == "h":
@@ -296,7 +296,7 @@ def state_errors(
     return errors
 
 
-def _shared(estimate: Trajectory, truth: Trajectory) -> Iterator[tuple[str, str]]:
+def _common_rows(estimate: Trajectory, truth: Trajectory) -> Iterator[tuple[str, str]]:
     for part in ("y_layout", "z_layout"):
         mine, other = getattr(estimate.system, part), getattr(truth.system, part)
         sizes = {field.name: field.size for field in other.fields}

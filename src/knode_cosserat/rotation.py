@@ -127,7 +127,7 @@ def quaternion_of(vector: Float[Any, "3"]) -> Float[Any, "4"]:
     return jnp.concatenate([real[None], over * vector])
 
 
-def turned(h: Float[Any, "4"], vector: Float[Any, "3"]) -> Float[Any, "3"]:
+def rotate(h: Float[Any, "4"], vector: Float[Any, "3"]) -> Float[Any, "3"]:
     """Return a vector rotated by a quaternion of any length."""
     return dot(rotation_matrix(h), vector)
 

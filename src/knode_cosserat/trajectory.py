@@ -324,10 +324,10 @@ class Trajectory:
         time = self.time if self.y.ndim == 4 else self.time[index]
         system = self.system
         if np.ndim(system.length):
-            system = _picked(system, index)
+            system = _pick(system, index)
         initial, final, thinned = self.initial_state, self.final_state, self.thinned
         if self.y.ndim == 4:
-            initial, final = _picked((initial, final), index)
+            initial, final = _pick((initial, final), index)
         else:
             rows = range(len(self.time))[index]
             thinned = thinned or rows.step != 1
@@ -349,11 +349,11 @@ class Trajectory:
             TrajectoryFileError: the arrays do not fit together, or the file cannot be written.
         """
         with KIND.naming(path):
-            content = _encoded(self)
+            content = _encode(self)
         container.write(path, content, KIND)
 
 
-def _picked(tree: Any, index: Any) -> Any:
+def _pick(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 
@@ -384,7 +384,7 @@ _CODES = {"result": Result, "stability": Verdict}
 _HINT = "give it, load_trajectory(path, system=…)"
 
 
-def _encoded(trajectory: Trajectory) -> bytes:
+def _encode(trajectory: Trajectory) -> bytes:
     """Return the bytes of a trajectory's file."""
     system = trajectory.system
     _require_names(system)
@@ -429,7 +429,7 @@ def _encoded(trajectory: Trajectory) -> bytes:
         "system": type(system).__name__,
     }
     many = np.ndim(system.length) > 0
-    robots: list[Any] = [_picked(system, i) for i in range(len(system.length))] if many else [system]
+    robots: list[Any] = [_pick(system, i) for i in range(len(system.length))] if many else [system]
     try:
         if type(system) in robot_file.KINDS.values():
             attributes["robot"] = robot_file.format_robot(robots[0])
@@ -439,7 +439,7 @@ def _encoded(trajectory: Trajectory) -> bytes:
             facts["model"] = parts if many else parts[0]
     except ValueError as error:  # a part is a Python function, for example
         facts["system_missing"] = first_line(error)
-    return container.encoded(KIND, facts, variables=variables, attributes=attributes, classes=_STATES)
+    return container.encode(KIND, facts, variables=variables, attributes=attributes, classes=_STATES)
 
 
 #: comment on each control about its interval

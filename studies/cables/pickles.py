@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files.limits import MORE, LimitSettingError, allowed
+from knode_cosserat._files.limits import MORE, LimitSettingError, scaled_limit
 from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -91,7 +91,7 @@ class _Array:
         shape = (shape,) if isinstance(shape, int) else shape
         if not isinstance(shape, tuple) or not all(isinstance(n, int) and n >= 0 for n in shape):
             raise _RefusedError("an array with an impossible shape")
-        if max(shape, default=0) > allowed(MOST_NUMBERS):
+        if max(shape, default=0) > scaled_limit(MOST_NUMBERS):
             raise _RefusedError(TOO_MANY)
         if len(shape) > DEEPEST or math.prod(shape) * kind.dtype.itemsize != len(raw):
             raise _RefusedError("an array with more or fewer bytes than its shape says")
@@ -153,7 +153,7 @@ def read_pickled_array(path: str | Path) -> Float[np.ndarray, "..."]:
     try:
         data = read_bytes(path, LARGEST_FILE)
         _scan(data)
-        values = _numbers(_Reader(io.BytesIO(data)).load(), [allowed(MOST_NUMBERS)], DEEPEST)
+        values = _numbers(_Reader(io.BytesIO(data)).load(), [scaled_limit(MOST_NUMBERS)], DEEPEST)
         return np.asarray(values, dtype=float)
     except LimitSettingError:
         raise

@@ -24,7 +24,7 @@ from knode_cosserat.control import (
 from knode_cosserat.control.ilqr import ILQR
 from knode_cosserat.control.koopman import KoopmanController
 from knode_cosserat.control.loop import check_reference, distance_out_of_reach, warm_up
-from knode_cosserat.control.lqr import LQR, realized
+from knode_cosserat.control.lqr import LQR, realize
 from knode_cosserat.control.mppi import MPPI
 from knode_cosserat.control.references import ReferenceFormatError
 from knode_cosserat.control.tip_feedback import PID, KinematicController
@@ -239,7 +239,7 @@ def test_a_realized_model_has_the_responses_it_was_made_of():
     A = np.diag([0.9, 0.6, -0.3])
     B, C = rng.normal(size=(3, 2)), rng.normal(size=(2, 3))
     responses = np.array([C @ np.linalg.matrix_power(A, k) @ B for k in range(40)])
-    found = realized(responses, least=1e-10)
+    found = realize(responses, least=1e-10)
     assert found[0].shape == (3, 3)
     again = [found[2] @ np.linalg.matrix_power(found[0], k) @ found[1] for k in range(40)]
     assert_allclose(again, responses, atol=1e-10)

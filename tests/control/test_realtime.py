@@ -16,7 +16,7 @@ from knode_cosserat.control import (
     run_loop,
 )
 from knode_cosserat.control.planning import Knots
-from knode_cosserat.control.realtime import Size, candidates, chosen, seconds_in_period
+from knode_cosserat.control.realtime import Size, candidates, choose_size, seconds_in_period
 from knode_cosserat.estimation import KalmanObserver, TipPosition
 from tests import commands
 
@@ -44,19 +44,19 @@ def test_candidates_take_less_and_less_time(dt):
 
 @pytest.mark.parametrize(("dt", "share"), [(0.02, 0.6), (0.01, 0.2), (0.01, 0.05), (0.02, 0.04)])
 def test_the_first_size_that_fits_is_chosen(dt, share):
-    choice = chosen(seconds, dt, share)
+    choice = choose_size(seconds, dt, share)
     sizes = candidates(dt)
     assert choice.size == next(size for size in sizes if seconds(size) <= share * dt)
     assert choice.seconds == seconds(choice.size)
-    assert choice == chosen(seconds, dt, share)
+    assert choice == choose_size(seconds, dt, share)
     assert f"{choice.size.knots} knots" in str(choice) and f"ms of {1e3 * dt:g} ms a period" in str(choice)
 
 
 def test_a_computer_that_is_too_slow_is_told_with_the_shortest_period():
     with pytest.raises(RealtimeError, match=r"60 % of the period of 20 ms.*a period of at least 53\.3 ms"):
-        chosen(lambda size: 1e-3 * size.horizon * size.knots, DT, 0.6)
+        choose_size(lambda size: 1e-3 * size.horizon * size.knots, DT, 0.6)
     with pytest.raises(ValueError, match=r"realtime is 2; allowed is above 0 to 1"):
-        chosen(seconds, DT, 2)
+        choose_size(seconds, DT, 2)
 
 
 def test_steps_of_several_periods_hold_the_means_of_the_controls():

@@ -172,6 +172,6 @@ def test_a_robot_that_cannot_touch_has_no_obstacle_course():
 
 def test_observations_are_a_pure_function_of_the_state(environment, keys):
     state = jax.tree.map(lambda leaf: leaf[0], environment.reset_many(keys)[0])
-    one = dynamics.observed(environment.spec, environment.arrays, state)
-    other = jax.jit(lambda s: dynamics.observed(environment.spec, environment.arrays, s))(state)
+    one = dynamics.observation(environment.spec, environment.arrays, state)
+    other = jax.jit(lambda s: dynamics.observation(environment.spec, environment.arrays, s))(state)
     np.testing.assert_allclose(one, other, atol=1e-6)

@@ -12,7 +12,13 @@ from knode_cosserat.estimation.parameters import Number
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.rods.routing import Helical, Straight
 from knode_cosserat.rods.section import Sleeve
-from knode_cosserat.rods.tendons import EarlyAnchors, LoadCells, RibSpacing, TendonFriction, pressed
+from knode_cosserat.rods.tendons import (
+    EarlyAnchors,
+    LoadCells,
+    RibSpacing,
+    TendonFriction,
+    stiffness_under_pressure,
+)
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(tendon_offset=0.02)
 ROUTED = kc.robots.RoutedTendonRobot.like(NOMINAL)
@@ -67,11 +73,13 @@ def test_numbers_and_their_coordinates(x, logarithmic, nominal, width):
 
 def test_pressed_is_smooth_and_that_of_a_beam_column():
     w = np.array([1e-12, 9.99e-4, 1.001e-3, 0.5, 1.0, 2.0])
-    assert np.asarray(pressed(w)) == pytest.approx(np.sqrt(w) / np.tan(np.sqrt(w)), rel=1e-13)
-    assert float(pressed(np.asarray(0.0))) == 1.0
+    assert np.asarray(stiffness_under_pressure(w)) == pytest.approx(
+        np.sqrt(w) / np.tan(np.sqrt(w)), rel=1e-13
+    )
+    assert float(stiffness_under_pressure(np.asarray(0.0))) == 1.0
     # a rod between two ribs that buckles has no stiffness
-    assert float(pressed(np.asarray(np.pi**2 / 4.0))) == pytest.approx(0.0, abs=1e-12)
-    beyond = np.asarray(pressed(np.pi**2 / 4.0 + np.array([1e-7, 5.0, 50.0])))
+    assert float(stiffness_under_pressure(np.asarray(np.pi**2 / 4.0))) == pytest.approx(0.0, abs=1e-12)
+    beyond = np.asarray(stiffness_under_pressure(np.pi**2 / 4.0 + np.array([1e-7, 5.0, 50.0])))
     assert np.all(np.diff(beyond) < 0.0) and beyond == pytest.approx([-5e-8, -2.5, -25.0])
 
 
@@ -80,7 +88,7 @@ def test_softening_by_tension_bends_the_rod_to_a_smaller_circle():
     """Closed form: T r/EI, softer by the factor of a beam-column, towards the tendon at 45 degrees."""
     robot = ROUTED.replace(gravity=(0.0, 0.0, 0.0))
     tension, c, EI = np.array([2.0, 0.0, 0.0, 0.0]), 1e-2, float(robot.Kbt[0, 0])
-    left = float(pressed(np.asarray(3.0 * c * tension.sum() / EI)))
+    left = float(stiffness_under_pressure(np.asarray(3.0 * c * tension.sum() / EI)))
     assert left < 0.95
     bent = kc.equilibrium(robot.replace(rib_spacing=RibSpacing(softening=c)), tension)
     expected = 2.0 * 0.02 / (EI * left) * np.sqrt(0.5) * np.array([-1.0, 1.0, 0.0])
@@ -94,7 +102,7 @@ def test_softening_by_tension_is_that_of_stiffness():
     robot = ROUTED.replace(gravity=(0.0, 0.0, 0.0), shear_stiffness=1e6, nodes=9)
     tension, c = np.array([2.0, 0.0, 0.0, 0.0]), 1e-3
     EI = float(robot.Kbt[0, 0])
-    left = float(pressed(np.asarray(3.0 * c * tension.sum() / EI)))
+    left = float(stiffness_under_pressure(np.asarray(3.0 * c * tension.sum() / EI)))
     soft = robot.replace(rib_spacing=RibSpacing(softening=c))
     # of ribs whose places are known
     spans = robot.replace(

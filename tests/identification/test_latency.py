@@ -10,7 +10,7 @@ from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.identification.experiments import of_measurements
 from knode_cosserat.identification.misfit import Misfit
-from knode_cosserat.rods.tendons import LoadCells, undelayed
+from knode_cosserat.rods.tendons import LoadCells, remove_delay
 from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
@@ -52,8 +52,8 @@ def test_robots_and_models_of_them_say_what_acts():
     true = tensions("random", 1.0)
     robot = kc.robots.RoutedTendonRobot.like(NOMINAL, load_cells=cells(0.5 * DT))
     expected = 0.5 * (true[:-1] + true[1:])
-    np.testing.assert_allclose(undelayed(robot, true, DT)[:-1], expected, rtol=1e-12)
-    assert undelayed(NOMINAL, true, DT) is true
+    np.testing.assert_allclose(remove_delay(robot, true, DT)[:-1], expected, rtol=1e-12)
+    assert remove_delay(NOMINAL, true, DT) is true
 
 
 @pytest.mark.campaign

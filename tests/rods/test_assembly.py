@@ -11,7 +11,7 @@ from knode_cosserat.robots import Assembly, RigidBody, SlenderRod
 from knode_cosserat.rods.assembly import NeighbourContact
 from knode_cosserat.rods.ends import Clamped, Driven, Pinned
 from knode_cosserat.rods.loads import AttachedMass, DistributedWrench
-from knode_cosserat.rods.parts import eased
+from knode_cosserat.rods.parts import ease
 from knode_cosserat.solvers.simulate import check_limits
 
 L, RADIUS, E, DENSITY = 0.3, 4e-3, 2e9, 1000.0
@@ -239,7 +239,7 @@ def test_neighbours_share_a_load():
 def test_recovery_smooths_contacts_of_the_assembly_and_of_its_rods():
     ball = kc.robots.surroundings.Sphere(smoothing=1e-5)
     robot = side_by_side(1e4).replace(**{"rods.right.surroundings": (ball,)})
-    easier = eased(robot, 0.1)
+    easier = ease(robot, 0.1)
     assert easier.contacts[0].smoothing == pytest.approx(1e-5)
     assert easier.rods[1].surroundings[0].smoothing == pytest.approx(1e-4)
     assert easier.rods[0] is robot.rods[0]

@@ -26,7 +26,7 @@ from knode_cosserat.rods.section import (
 )
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendon_robots import VirtualRobot
-from knode_cosserat.rods.tendons import RibSpacing, pressed
+from knode_cosserat.rods.tendons import RibSpacing, stiffness_under_pressure
 from knode_cosserat.viewer.scene import drawing
 
 L, E, G, DENSITY = 0.5, 1e9, 4e8, 1200.0
@@ -343,7 +343,7 @@ def test_ribs_soften_each_principal_axis_as_a_beam_column():
         return robot.constitutive(0.2, 0.0, y, 0.0 * y, np.array([tension])).strains["u"].softened
 
     def alone(EI):
-        return EI * float(pressed(3.0 * softening * tension / EI))
+        return EI * float(stiffness_under_pressure(3.0 * softening * tension / EI))
 
     R, K = turn(0.6), np.diag([0.05, 0.2, 0.1])
     np.testing.assert_allclose(softened(K), np.diag([alone(0.05), alone(0.2), 0.1]), rtol=1e-12, atol=1e-14)

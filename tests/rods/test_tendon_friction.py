@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knode_cosserat.rods.tendons import STRAIGHT, TendonFriction, Vibration
-from knode_cosserat.schemes.discrete_law import evolved
+from knode_cosserat.schemes.discrete_law import integrate_variable
 
 REACH = 0.1
 FRICTION = TendonFriction(wobble=0.6, curvature=0.1, reach=REACH)
@@ -21,7 +21,9 @@ def remembered(changes, dt, f=0.0):
     """f after these changes of curvature (1/m), each within a step of BDF1."""
     for change in changes:
         rate = np.array([change / dt, 0.0, 0.0])
-        f = float(evolved(FRICTION.evolution(FIRST, rate, STILL), np.array([-f / dt]), 1.0 / dt)[0])
+        f = float(
+            integrate_variable(FRICTION.evolution(FIRST, rate, STILL), np.array([-f / dt]), 1.0 / dt)[0]
+        )
     return f
 
 
@@ -57,8 +59,13 @@ def test_turning_round_takes_twice_the_reach():
 def test_at_rest_nothing_holds_and_vibration_has_grown_as_far_as_it_will():
     rest = np.array(0.0)
     bent = np.array([0.5, 0.0, 0.0])
-    np.testing.assert_array_equal(evolved(FRICTION.evolution(FIRST, bent, bent), np.ones(1), rest), 0.0)
-    grown = [float(evolved(VIBRATION.evolution(total), np.zeros(1), rest)[0]) for total in (8.0, 10.0, 15.0)]
+    np.testing.assert_array_equal(
+        integrate_variable(FRICTION.evolution(FIRST, bent, bent), np.ones(1), rest), 0.0
+    )
+    grown = [
+        float(integrate_variable(VIBRATION.evolution(total), np.zeros(1), rest)[0])
+        for total in (8.0, 10.0, 15.0)
+    ]
     assert grown == [0.0, 0.0, 1.0]
 
 
@@ -68,17 +75,17 @@ def test_an_equilibrium_may_keep_a_part_of_the_friction(part, expected):
     friction = TendonFriction(wobble=0.6, reach=REACH, at_rest=part)
     bent = np.array([0.5 * REACH, 0.0, 0.0])
     assert float(
-        evolved(friction.evolution(FIRST, STILL, bent), np.zeros(1), np.array(0.0))[0]
+        integrate_variable(friction.evolution(FIRST, STILL, bent), np.zeros(1), np.array(0.0))[0]
     ) == pytest.approx(expected)
 
 
 def test_vibration_grows_at_its_rate_and_stays_between_none_and_all():
     x, c0 = 0.0, 1.0 / 0.1
     for step in range(1, 20):
-        x = float(evolved(VIBRATION.evolution(12.0), np.array([-x * c0]), c0)[0])
+        x = float(integrate_variable(VIBRATION.evolution(12.0), np.array([-x * c0]), c0)[0])
         assert x == pytest.approx(min(1.0, 0.8 * 0.1 * step), abs=1e-12)
     for _ in range(40):
-        x = float(evolved(VIBRATION.evolution(8.0), np.array([-x * c0]), c0)[0])
+        x = float(integrate_variable(VIBRATION.evolution(8.0), np.array([-x * c0]), c0)[0])
     assert x == 0.0
 
 

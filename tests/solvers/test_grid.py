@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import settings as given_settings
 
 import knode_cosserat as kc
-from knode_cosserat.schemes.grid import Grid, at_places, grid_of, taken
+from knode_cosserat.schemes.grid import Grid, at_places, grid_of, take_rows
 from knode_cosserat.schemes.problem import StepProblem
 from knode_cosserat.schemes.settings import schemes
 from knode_cosserat.schemes.space import SpaceScheme
@@ -73,7 +73,7 @@ def test_what_is_linear_along_the_rod_is_spread_exactly(places, nodes):
 def test_rows_are_taken_by_their_numbers(rows):
     values = jnp.arange(30.0).reshape(10, 3)
     np.testing.assert_array_equal(
-        taken(values, np.array(rows, dtype=int)), np.asarray(values)[np.array(rows, dtype=int)]
+        take_rows(values, np.array(rows, dtype=int)), np.asarray(values)[np.array(rows, dtype=int)]
     )
 
 

@@ -249,7 +249,7 @@ def test_equilibria_fail_on_two_grids_before_they_fail():
     for robot, tried in ((rod, [10, 19]), (rod.replace(nodes=10), [10])):
         grids.clear()
         with pytest.raises(kc.SimulationError, match="no solution found"):
-            refinement.refined(solve, robot, LOBATTO2)
+            refinement.refine(solve, robot, LOBATTO2)
         assert grids == tried
 
 
@@ -261,8 +261,8 @@ def test_errors_that_no_grid_mends_end_the_refinement():
         return refinement.Solved(robot, np.array([int(kc.Result.COARSE)]), np.array([np.nan]))
 
     robot = ROBOTS.SlenderRod(**ROD)
-    refinement.refined(solve, robot, LOBATTO2)
+    refinement.refine(solve, robot, LOBATTO2)
     assert grids[0] == 10 and len(grids) == 2
     grids.clear()
-    refinement.refined(solve, robot.replace(nodes=10), LOBATTO2)
+    refinement.refine(solve, robot.replace(nodes=10), LOBATTO2)
     assert grids == [10]

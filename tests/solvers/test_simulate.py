@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.rods.parts import eased
+from knode_cosserat.rods.parts import ease
 from knode_cosserat.rods.surroundings import Plane
 from knode_cosserat.rods.tendons import TendonFriction, Vibration
 from knode_cosserat.schemes.grid import at_places
-from knode_cosserat.schemes.history import advanced, history_of
+from knode_cosserat.schemes.history import advance_history, history_of
 from knode_cosserat.schemes.problem import StepProblem
 from knode_cosserat.solvers import Settings
 from knode_cosserat.solvers.rest import resting_history
@@ -99,7 +99,7 @@ def test_a_batch_keeps_nothing_of_another_robot(robot, sine):
 
 
 def test_a_smooth_system_is_as_gentle_as_it_gets(robot):
-    assert eased(robot, 1e-3) is robot
+    assert ease(robot, 1e-3) is robot
 
 
 @pytest.mark.parametrize("part", [1.0, 0.1, 1e-3])
@@ -108,12 +108,12 @@ def test_easing_spreads_contact_and_friction_and_nothing_else(robot, part):
     slender = kc.robots.SlenderRod(
         length=0.4, radius=0.005, density=1e3, youngs_modulus=1e6, surroundings=(plane,)
     )
-    easier = eased(slender, part)
+    easier = ease(slender, part)
     assert float(easier.surroundings[0].smoothing) == pytest.approx(1e-4 / part)
     assert float(easier.surroundings[0].slip) == pytest.approx(2e-3 / part)
     assert float(easier.surroundings[0].friction) == 0.3 and float(easier.length) == 0.4
     rubbing = kc.robots.RoutedTendonRobot.like(robot, friction=TendonFriction(curvature=0.2, reach=0.05))
-    assert float(eased(rubbing, part).friction.reach) == pytest.approx(0.05 / part)
+    assert float(ease(rubbing, part).friction.reach) == pytest.approx(0.05 / part)
 
 
 # tension that makes boundary layers much shorter than a segment
@@ -222,7 +222,7 @@ def test_statics_have_no_time_scheme(robot, sine):
 def test_the_past_keeps_the_newest_first(robot):
     past = resting_history(robot, Settings())
     record = past.records[0] + 1.0
-    after = advanced(past, record, past.rate, past.y[0] + 1.0, past.weights)
+    after = advance_history(past, record, past.rate, past.y[0] + 1.0, past.weights)
     np.testing.assert_array_equal(after.y[1:], past.y[:-1])
     np.testing.assert_array_equal(after.records[0], record)
     np.testing.assert_array_equal(after.records[1], past.records[0])

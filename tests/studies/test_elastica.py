@@ -8,7 +8,7 @@ from numpy.testing import assert_allclose
 
 import knode_cosserat as kc
 from knode_cosserat.control import ControlLimits, PredictiveController, Sensor, circle, run_loop
-from knode_cosserat.control.commands import identified_lag, lagged
+from knode_cosserat.control.commands import apply_lag, identified_lag
 from knode_cosserat.control.planning import lag_weights
 from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPose, TipPosition
 from knode_cosserat.robots import RoutedTendonRobot
@@ -23,7 +23,7 @@ LENGTH = float(ROBOT.length)
 def test_a_lag_is_identified_from_noisy_tensions():
     rng = np.random.default_rng(1)
     commanded = np.repeat(rng.uniform(0.0, 8.0, (40, 4)), 8, axis=0)
-    measured = lagged(commanded, 0.0125, 0.06, np.ones(4)) + rng.normal(0.0, 0.05, commanded.shape)
+    measured = apply_lag(commanded, 0.0125, 0.06, np.ones(4)) + rng.normal(0.0, 0.05, commanded.shape)
     assert_allclose(identified_lag(commanded, measured, 0.0125, np.ones(4)), 0.06, rtol=0.02)
 
 
@@ -48,7 +48,7 @@ def test_a_planning_controller_predicts_with_the_lag():
             return self.pulled
 
         def apply(self, control):
-            ends = lagged(np.tile(control, (parts, 1)), dt / parts, lag, self.pulled)
+            ends = apply_lag(np.tile(control, (parts, 1)), dt / parts, lag, self.pulled)
             for start, end in zip([self.pulled, *ends[:-1]], ends, strict=True):
                 self._stepper.step(0.5 * (start + end))
             self.pulled = ends[-1]
@@ -173,7 +173,7 @@ def test_a_recording_has_the_tension_of_the_end_of_a_row(rubbing):
     measured = found.measured
     assert measured.simulated and measured.continuous
     assert measured.position.shape == (48, 4, 3) and measured.dt == 0.0125
-    expected = lagged(found.commanded, measured.dt, 0.06, np.full(4, 2.0))
+    expected = apply_lag(found.commanded, measured.dt, 0.06, np.full(4, 2.0))
     assert np.std(measured.tension - expected) < 0.06
     assert_allclose(measured.initial_tension, 2.0, atol=0.05)
     assert np.std(measured.position[:15, -1], axis=0).max() < 3e-4

@@ -17,7 +17,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files.yaml_text import did_you_mean, shown
+from knode_cosserat._files.yaml_text import did_you_mean, excerpt
 from knode_cosserat.rods.robot_file import RobotFileError, file_mapping
 from knode_cosserat_hardware.driver import HardwareError, Limits, require_number
 
@@ -108,14 +108,14 @@ def _described(section: Any, source: str) -> HardwareDescription:
         return HardwareDescription()
     if not isinstance(section, dict):
         raise RobotFileError(
-            f"{source}: hardware is {shown(section)}; allowed is a mapping from names to values"
+            f"{source}: hardware is {excerpt(section)}; allowed is a mapping from names to values"
         )
     dimensions = {field.name for field in dataclasses.fields(Dimensions)}
     _require_known(section, ["tension", *sorted(dimensions)], f"{source}: hardware")
     tension = {} if section.get("tension") is None else section["tension"]
     if not isinstance(tension, dict):
         raise RobotFileError(
-            f"{source}: hardware.tension is {shown(tension)}; allowed is low, high, rate, total"
+            f"{source}: hardware.tension is {excerpt(tension)}; allowed is low, high, rate, total"
         )
     _require_known(
         tension, [field.name for field in dataclasses.fields(Limits)], f"{source}: hardware.tension"
@@ -136,6 +136,6 @@ def _require_known(mapping: dict[Any, Any], known: Iterable[str], where: str) ->
     for key in mapping:
         if key not in names:
             raise RobotFileError(
-                f"{where}: the key {shown(key)} is unknown; allowed is {', '.join(names)}"
+                f"{where}: the key {excerpt(key)} is unknown; allowed is {', '.join(names)}"
                 f"{did_you_mean(key, names)}"
             )

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files.yaml_text import shown
+from knode_cosserat._files.yaml_text import excerpt
 from knode_cosserat.errors import KnodeCosseratError
 
 
@@ -258,7 +258,9 @@ def require_number(name: str, value: Any, stated: Any, whole: bool = False) -> N
     if isinstance(value, kinds) and not isinstance(value, bool) and low <= value <= high:
         return
     kind = "a whole number " if whole else ""
-    message = f"{name} must be {kind}between {low:g} and {high:g} {unit}".rstrip() + f" (got {shown(value)})"
+    message = (
+        f"{name} must be {kind}between {low:g} and {high:g} {unit}".rstrip() + f" (got {excerpt(value)})"
+    )
     if unit == "m" and isinstance(value, int | float) and low <= value / 1000 <= high:
         message += f". Did you mean {value / 1000:.12g} ({value:g} mm)?"
     raise HardwareError(message)

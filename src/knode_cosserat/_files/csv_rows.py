@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files.limits import MORE, allowed, excess
+from knode_cosserat._files.limits import MORE, excess, scaled_limit
 from knode_cosserat.errors import KnodeCosseratError
 
 Rows = Float[np.ndarray, "rows columns"]
@@ -83,7 +83,7 @@ def _rows(
         raise CSVTextError(f"{path}: {reason}")
     columns = columns_of(f"{path}: line {reader.line_num}", [title.strip() for title in titles])
     order = np.argsort([column.place for column in columns])
-    most = allowed(MOST_LINES)
+    most = scaled_limit(MOST_LINES)
     rows: list[list[float]] = []
     for cells in filled:
         where = f"{path}: line {reader.line_num}"
@@ -116,7 +116,7 @@ def held_rows(path: str | Path, time: Times, dt: float) -> np.ndarray:
     """Return the index of the row held at the first time + i dt, up to the last. Raises `CSVTextError`."""
     length = float(time[-1]) - float(time[0])
     count = length / float(dt) + SAME_TIME
-    most = allowed(MOST_STEPS)
+    most = scaled_limit(MOST_STEPS)
     if not count < most:
         raise CSVTextError(
             f"{path}: dt is {dt!r}; allowed is one of which the file's {length:g} s are at most {most}; "

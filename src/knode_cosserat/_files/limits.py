@@ -26,7 +26,7 @@ class LimitSettingError(KnodeCosseratError, ValueError):
     code = "limit-setting"
 
 
-def allowed(number: int) -> int:
+def scaled_limit(number: int) -> int:
     """Return a limit times the factor of the environment variable.
 
     Raises:
@@ -44,5 +44,5 @@ def allowed(number: int) -> int:
 
 def excess(number: int, limit: int, unit: str) -> str:
     """Return the reason to refuse a file with so many of a unit; empty if the limit allows it."""
-    most = allowed(limit)
+    most = scaled_limit(limit)
     return f"it has {number} {unit}; allowed are {most}; {MORE}" if number > most else ""

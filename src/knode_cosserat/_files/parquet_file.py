@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from knode_cosserat._files.limits import MORE, allowed
+from knode_cosserat._files.limits import MORE, scaled_limit
 from knode_cosserat._files.reading import ReadError, require_limit
 from knode_cosserat.errors import KnodeCosseratError, first_line
 
@@ -50,8 +50,8 @@ def open_parquet(path: Path, **options: Any) -> Iterator[Any]:
         with pyarrow.parquet.ParquetFile(
             path,
             memory_map=False,
-            thrift_string_size_limit=min(allowed(LONGEST_TEXT), _INT32),
-            thrift_container_size_limit=min(allowed(MOST_ENTRIES), _INT32),
+            thrift_string_size_limit=min(scaled_limit(LONGEST_TEXT), _INT32),
+            thrift_container_size_limit=min(scaled_limit(MOST_ENTRIES), _INT32),
             **options,
         ) as file:
             require_limit(file.metadata.num_columns, MOST_COLUMNS, "columns")
@@ -85,7 +85,7 @@ def require_limited_expansion(metadata: Any, path: Path) -> None:
 
 def expansion_limit(path: Path) -> tuple[int, str]:
     """Return the largest expanded size of a file (bytes), and the limit as text."""
-    ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
+    ratio, allowance = scaled_limit(RATIO), scaled_limit(ALLOWANCE)
     words = f"allowed are {ratio} times the file and {allowance}; {MORE}"
     return ratio * path.stat().st_size + allowance, words
 

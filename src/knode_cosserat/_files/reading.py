@@ -6,7 +6,7 @@ import os
 import stat
 from pathlib import Path
 
-from knode_cosserat._files.limits import MORE, allowed, excess
+from knode_cosserat._files.limits import MORE, excess, scaled_limit
 from knode_cosserat.errors import KnodeCosseratError
 
 #: bytes that are read at a time from a pipe, which states no size
@@ -37,7 +37,7 @@ def read_bytes(path: str | Path, limit: int) -> bytes:
             require_limit(status.st_size, limit, "bytes")
             if stat.S_ISREG(status.st_mode):
                 return file.read()
-            most, parts, size = allowed(limit), [], 0
+            most, parts, size = scaled_limit(limit), [], 0
             while size <= most and (part := file.read(_PIECE)):
                 parts.append(part)
                 size += len(part)

@@ -10,7 +10,7 @@ from typing import Any
 
 import yaml
 
-from knode_cosserat._files.limits import MORE, LimitSettingError, allowed
+from knode_cosserat._files.limits import MORE, LimitSettingError, scaled_limit
 from knode_cosserat._files.reading import ReadError, read_text
 from knode_cosserat.errors import KnodeCosseratError, first_line
 
@@ -39,7 +39,7 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
     Raises:
         YAMLTextError: the text is not YAML, or is not a mapping.
     """
-    most = allowed(MOST_CHARACTERS)
+    most = scaled_limit(MOST_CHARACTERS)
     if len(text) > most:
         raise YAMLTextError(f"the file has {len(text)} characters; allowed are {most}; {MORE}")
     try:
@@ -53,7 +53,7 @@ def mapping_of(text: str, keys: str) -> dict[Any, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise YAMLTextError(f"not YAML: {first_line(error)}") from None
     if not isinstance(content, dict):
-        found = "empty" if content is None else shown(content)
+        found = "empty" if content is None else excerpt(content)
         raise YAMLTextError(f"the file is {found}; allowed is a mapping with {keys}")
     return content
 
@@ -65,7 +65,7 @@ def _content(text: str) -> Any:
         root = loader.get_single_node()
         if root is None:
             return None
-        count, most = _expanded(root, {}), allowed(MOST_VALUES)
+        count, most = _value_count(root, {}), scaled_limit(MOST_VALUES)
         if count > most:
             raise YAMLTextError(f"with its aliases it has {count:.3g} values; allowed are {most}; {MORE}")
         return loader.construct_document(root)
@@ -73,13 +73,13 @@ def _content(text: str) -> Any:
         loader.dispose()
 
 
-def _expanded(node: yaml.Node, known: dict[int, float]) -> float:
+def _value_count(node: yaml.Node, known: dict[int, float]) -> float:
     """Return the number of values in a node with all aliases written out; infinite for one within itself."""
     if id(node) not in known:
         known[id(node)] = float("inf")
         parts = node.value if isinstance(node, yaml.CollectionNode) else ()
         each = (part for pair in parts for part in (pair if isinstance(pair, tuple) else (pair,)))
-        known[id(node)] = 1.0 + sum(_expanded(part, known) for part in each)
+        known[id(node)] = 1.0 + sum(_value_count(part, known) for part in each)
     return known[id(node)]
 
 
@@ -90,7 +90,7 @@ def flow(value: Any) -> str:
     return str(listed).strip()[1:-1]
 
 
-def shown(value: Any) -> str:
+def excerpt(value: Any) -> str:
     """Return a value in one line of bounded length: a file can hold very long values."""
     short = reprlib.Repr()
     short.maxstring = short.maxother = 60
@@ -114,7 +114,7 @@ class _Loader(yaml.SafeLoader):
         except (yaml.YAMLError, RecursionError):
             raise
         except Exception:  # PyYAML converts a scalar by its tag without checking the text
-            problem = f"{shown(node.value)} cannot be read as !!{node.tag.rpartition(':')[2]}"
+            problem = f"{excerpt(node.value)} cannot be read as !!{node.tag.rpartition(':')[2]}"
             raise yaml.constructor.ConstructorError(None, None, problem, node.start_mark) from None
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
@@ -123,7 +123,7 @@ class _Loader(yaml.SafeLoader):
             if isinstance(key, yaml.ScalarNode):
                 if key.value in seen:
                     raise yaml.constructor.ConstructorError(
-                        None, None, f"the key {shown(key.value)} is there twice", key.start_mark
+                        None, None, f"the key {excerpt(key.value)} is there twice", key.start_mark
                     )
                 seen.add(key.value)
         return super().construct_mapping(node, deep)

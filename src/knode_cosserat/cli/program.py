@@ -96,7 +96,7 @@ class _VectorCommand(TyperCommand):
 
 
 class _App(typer.Typer):
-    """Typer application with commands of class `_Command`, whose functions may have groups of options.
+    """Typer application with commands of class `_VectorCommand`, whose functions may have groups of options.
 
     The docstring of a command states its options and examples, that of a group (a named tuple) its options.
     """

@@ -258,7 +258,7 @@ def mean_part(lag: float, dt: float) -> float:
     return lag / dt * (1.0 - remaining_part(lag, dt)) if lag > 0.0 else 0.0
 
 
-def lagged(
+def apply_lag(
     commanded: Float[np.ndarray, "T c"], dt: float, lag: float, initial: Float[np.ndarray, " c"]
 ) -> Float[np.ndarray, "T c"]:
     """Return the controls at the end of each row of commands, after a first-order lag.
@@ -291,7 +291,7 @@ def identified_lag(
     from scipy.optimize import minimize_scalar
 
     def cost(lag: float) -> float:
-        return float(np.nansum((lagged(commanded, dt, lag, initial) - measured) ** 2))
+        return float(np.nansum((apply_lag(commanded, dt, lag, initial) - measured) ** 2))
 
     return float(
         minimize_scalar(cost, bounds=(0.0, LONGEST_LAG), method="bounded", options={"xatol": 1e-5}).x

@@ -14,12 +14,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control import qp
-from knode_cosserat.control.commands import Command, Controller, ControlLimits, lagged, register_controller
+from knode_cosserat.control.commands import Command, Controller, ControlLimits, apply_lag, register_controller
 from knode_cosserat.control.planning import Knots, Tracking, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.solvers.simulate import simulate
 
 #: training motions: their number and duration (s), and the time for which a random control is approached (s)
@@ -169,8 +169,8 @@ def _training_motions(
             if k % max(1, round(HELD / dt)) == 0:
                 wanted = low + wide * rng.uniform(size=len(low)) * (high - low)
             control = motion[k] = limits.applied(control + 0.3 * (wanted - control), control, dt)
-    acting = np.array([lagged(motion, dt, limits.lag, limits.safe) for motion in controls])
-    motions = simulate(fixed(robot), acting, dt)
+    acting = np.array([apply_lag(motion, dt, limits.lag, limits.safe) for motion in controls])
+    motions = simulate(fix_grid(robot), acting, dt)
     y, z = np.asarray(motions.y)[:, :-1], np.asarray(motions.z)[:, :-1]
     outputs = [
         [np.asarray(target.value(robot, *state)) for state in zip(ys, zs, strict=True)]

@@ -276,7 +276,7 @@ class LoopLog:
 # states as trajectories
 
 
-def estimated(controller: Any) -> Trajectory | None:
+def estimated_state(controller: Any) -> Trajectory | None:
     """Return the state that a controller's observer estimates, a trajectory of one row, or None."""
     observer = getattr(controller, "observer", None)
     if observer is None:
@@ -290,7 +290,7 @@ def estimated(controller: Any) -> Trajectory | None:
     )  # fmt: skip
 
 
-def joined(states: Sequence[Trajectory], times: Sequence[float]) -> Trajectory:
+def join_rows(states: Sequence[Trajectory], times: Sequence[float]) -> Trajectory:
     """Return a trajectory of rows of one robot, at these times (s)."""
     y, z, control, result = (
         np.concatenate([np.asarray(getattr(state, name)) for state in states])
@@ -396,7 +396,7 @@ class Loop:
         plant.apply(command.control)
         if applied is not None:
             applied()
-        state, observer = estimated(controller), getattr(controller, "observer", None)
+        state, observer = estimated_state(controller), getattr(controller, "observer", None)
         moved = clock.perf_counter()
         controller.advance(command.control)
         controller.prepare(time + controller.dt, reference)
@@ -441,7 +441,7 @@ class Loop:
             compiled=_COMPILATIONS.count - self._compiled_before,
             initial_control=self._initial if rows[0].time == 0.0 else None,
             settings=self.controller.settings,
-            estimated=joined(states, columns.time) if states else None,
+            estimated=join_rows(states, columns.time) if states else None,
         )
 
 

@@ -17,7 +17,7 @@ from knode_cosserat.estimation.online import Belief, Spread, errors_along
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 
 #: preload of all controls, as a part of their range: tendons only pull, so that each needs room to let go
 PRELOAD = 0.25
@@ -38,7 +38,7 @@ def linear_model(
         SimulationError: there is no such equilibrium.
     """
     count = len(control)
-    observer = KalmanObserver(robot, dt, output, initial=equilibrium(fixed(robot), control))
+    observer = KalmanObserver(robot, dt, output, initial=equilibrium(fix_grid(robot), control))
     used, size = observer.belief.spread.rate.shape[1:]
     rows = np.zeros((count, 2, used, size))
     belief = Belief(np.zeros(0), observer.belief.past, Spread(rows, rows[:, 0], np.zeros((count, 0))))
@@ -53,10 +53,10 @@ def linear_model(
     values, slopes = errors_along(
         moved.system, output, motion.records, motion.d_records, zero, columns=columns
     )
-    return *realized(np.moveaxis(np.asarray(slopes), 0, -1)), np.asarray(values[-1])
+    return *realize(np.moveaxis(np.asarray(slopes), 0, -1)), np.asarray(values[-1])
 
 
-def realized(
+def realize(
     responses: Float[np.ndarray, "T p c"], least: float = LEAST, most: int = ORDER
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return A, B, C with C Aᵏ B equal to the responses k = 0, 1, … as well as a state of low order can."""

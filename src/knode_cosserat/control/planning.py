@@ -19,7 +19,7 @@ from knode_cosserat.control.commands import (
     Controller,
     ControlLimits,
     Status,
-    lagged,
+    apply_lag,
     mean_part,
     remaining_part,
 )
@@ -127,7 +127,7 @@ def lag_weights(basis: Float[np.ndarray, "T knots"], lag: float, dt: float) -> F
     before = np.zeros(basis.shape[1] + 1)
     before[-1] = 1.0
     commands = np.concatenate([basis, np.zeros((len(basis), 1))], axis=1)
-    starts = np.concatenate([before[None], lagged(commands, dt, lag, before)[:-1]])
+    starts = np.concatenate([before[None], apply_lag(commands, dt, lag, before)[:-1]])
     return commands + (starts - commands) * mean_part(lag, dt)
 
 

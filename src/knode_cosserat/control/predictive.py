@@ -20,7 +20,7 @@ from jaxtyping import Float
 from knode_cosserat.control import qp
 from knode_cosserat.control.commands import Command, ControlLimits, register_controller
 from knode_cosserat.control.planning import Knots, PlanController, PredictedOutputs, Weights
-from knode_cosserat.control.realtime import SHARE, ChosenSize, Size, chosen, seconds_in_period
+from knode_cosserat.control.realtime import SHARE, ChosenSize, Size, choose_size, seconds_in_period
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.outputs import Output
@@ -92,7 +92,7 @@ class PredictiveController(PlanController):
                 return seconds_in_period(type(self)(copy.copy(observer), target, limits, **own))
 
             share = SHARE if realtime is True else float(realtime)
-            self.choice = chosen(seconds, observer.dt, share)
+            self.choice = choose_size(seconds, observer.dt, share)
             horizon, knots, stride = self.choice.size
             log.info("%s", self.choice)
         super().__init__(observer, target, limits, Knots.spaced(horizon, knots, stride), weights)

@@ -53,10 +53,10 @@ def solve(problem: QuadraticProgram) -> Float[np.ndarray, " n"] | None:
     between violation and cost, and neither program is badly scaled. (DAQP's own soft constraints need such a
     weight; with a badly conditioned cost, squared violations were up to 6 times the least ones.)
     """
-    x = _solved(problem)
+    x = _solve_hard(problem)
     if x is not None or not problem.soft:
         return x
-    least = _solved(_least_violation(problem))
+    least = _solve_hard(_least_violation(problem))
     if least is None:
         return None
     least = least[: len(problem.g)]
@@ -65,11 +65,11 @@ def solve(problem: QuadraticProgram) -> Float[np.ndarray, " n"] | None:
     below, above = problem.below.copy(), problem.above.copy()
     below[-problem.soft :] -= low + more
     above[-problem.soft :] += high + more
-    x = _solved(problem._replace(below=below, above=above))
+    x = _solve_hard(problem._replace(below=below, above=above))
     return least if x is None else x
 
 
-def _solved(problem: QuadraticProgram) -> Float[np.ndarray, " n"] | None:
+def _solve_hard(problem: QuadraticProgram) -> Float[np.ndarray, " n"] | None:
     """Return the solution with all rows hard; None if it is infeasible or took longer than the limit."""
     import daqp
 

@@ -83,7 +83,7 @@ def candidates(dt: float) -> list[Size]:
     return found
 
 
-def chosen(
+def choose_size(
     seconds_of: Callable[[Size], float], dt: float, share: float, sizes: Sequence[Size] | None = None
 ) -> ChosenSize:
     """Return the first of some sizes, in falling order of their time, that takes the share of a period.

@@ -84,7 +84,7 @@ class Core(EliminationCode):
         self.past, self.weights, self.t0 = [a(ny, "ends") for _ in range(3)], a(3), a(1)
         self.errors, self.error_rate = [a(numbers, "used") for _ in memory], a(numbers, "used")
         self.time_errors = [a(numbers, "used") for _ in memory]
-        #: arrays of the state of a motion (`StateHistory`) and of an equilibrium (`Shape`)
+        #: arrays of the state of a motion (`StateHistory`) and of an equilibrium (`StaticState`)
         self.motion = [
             self.records, [self.rate], self.past, [self.weights], [self.t0],
             [*self.errors, self.error_rate], self.time_errors,

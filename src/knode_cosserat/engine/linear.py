@@ -27,7 +27,7 @@ class Columns:
         return self.base.name
 
 
-class Component(NamedTuple):
+class Entry(NamedTuple):
     """Component i of an array at place j; without an array, a number of one straight piece of a map."""
 
     array: Array | Columns | None
@@ -42,15 +42,15 @@ class Component(NamedTuple):
         return own, i, j if isinstance(j, int) else j.key
 
 
-Coefficient = Component | Value | float
+Coefficient = Entry | Value | float
 
 
 @dataclasses.dataclass(frozen=True)
 class Add:
     """Add a product to a number, or subtract it if it is negative."""
 
-    target: Component
-    source: Component
+    target: Entry
+    source: Entry
     coefficient: Coefficient = 1.0
     is_negative: bool = False
 
@@ -63,7 +63,7 @@ class Add:
 class Scale:
     """Multiply a number; without a coefficient, set it to zero."""
 
-    target: Component
+    target: Entry
     coefficient: Coefficient | None = None
 
     def transpose(self) -> Scale:
@@ -75,8 +75,8 @@ class Scale:
 class Show:
     """Copy a number to one that no other operation reads or writes."""
 
-    target: Component
-    source: Component
+    target: Entry
+    source: Entry
 
     def transpose(self) -> Add:
         """Return the transposed operation."""
@@ -177,12 +177,12 @@ class _Sums:
             return -product if operation.is_negative else product
         return value - product if operation.is_negative else value + product
 
-    def _get(self, number: Component) -> Value | None:
+    def _get(self, number: Entry) -> Value | None:
         if number.array is None:
             return self._values.get(number.key)
         return self._memory._get(*number, self._lanes)
 
     def _times(self, coefficient: Coefficient, value: Value) -> Value:
-        if isinstance(coefficient, Component):
+        if isinstance(coefficient, Entry):
             coefficient = self._memory._get(*coefficient, 1)
         return value if coefficient == 1.0 else coefficient * value

@@ -19,7 +19,16 @@ import numpy as np
 from knode_cosserat.engine.codegen import Index, Value
 from knode_cosserat.engine.elimination import EliminationCode
 from knode_cosserat.engine.equations import TangentEquations
-from knode_cosserat.engine.linear import Add, Columns, Component, Operation, PlaceLoop, Scale, Show, write
+from knode_cosserat.engine.linear import (
+    Add,
+    Columns,
+    Entry,
+    Operation,
+    PlaceLoop,
+    Scale,
+    Show,
+    write,
+)
 from knode_cosserat.engine.memory import Array
 from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.rods.system import System
@@ -172,7 +181,7 @@ class StepMap(EliminationCode):
         found = list[Operation]()
         for block in range(0, self.own, COLUMNS):
             start, end = (
-                [Component(self.X, self._of_X(i, block), point) for i in range(self.equations.ny)]
+                [Entry(self.X, self._of_X(i, block), point) for i in range(self.equations.ny)]
                 for point in (j, j + 1)
             )
             found += [*map(Scale, end), *self._by_factors(start, end, j)]
@@ -213,7 +222,7 @@ class StepMap(EliminationCode):
         if self.rows["far"]:
             found.append(PlaceLoop(0, self._count("pieces"), lambda j: by_data("far", [j], j)))
         if self.equations.moves_lengths:
-            found.append(PlaceLoop(0, self._count("pieces"), lambda j: [Scale(Component(t.lengths, 0, j))]))
+            found.append(PlaceLoop(0, self._count("pieces"), lambda j: [Scale(Entry(t.lengths, 0, j))]))
         return [*found, *by_data("tip", self.tips, 0), *by_data("base", self.bases, 0)]
 
     def _by_data(self, name: str, j: Any, places: Sequence[Any], data: Any) -> list[Operation]:
@@ -223,14 +232,14 @@ class StepMap(EliminationCode):
         if name == "rates" and self.settings.uses_rate:
             columns |= set(range(e.numbers))
         kept = t.history if self.settings.uses_rate else None
-        history = {c: Component(kept, c % e.numbers, places[c // e.numbers]) for c in sorted(columns)}
+        history = {c: Entry(kept, c % e.numbers, places[c // e.numbers]) for c in sorted(columns)}
         found: list[Operation] = []
         for number in history.values():
             found.append(Scale(number))
             for part, weight in zip((*t.records, t.rate), weights, strict=False):
-                found.append(Add(number, Component(part, number.i, number.j), weight))
-        found += [Scale(Component(target, i, j)) for i in self.rows[name]]
-        controls = {c: Component(control, c) for c in range(e.nc)}
+                found.append(Add(number, Entry(part, number.i, number.j), weight))
+        found += [Scale(Entry(target, i, j)) for i in self.rows[name]]
+        controls = {c: Entry(control, c) for c in range(e.nc)}
         for nonzeros, matrix, source in (
             (e.by_history[name], self.by_history[name], history),
             (e.by_control[name], self.by_control[name], controls),
@@ -264,7 +273,7 @@ class StepMap(EliminationCode):
         found.append(PlaceLoop(0, self._count("used"), functools.partial(self._set_record, c0)))
         found.append(PlaceLoop(0, self._count("nodes"), functools.partial(self._show, row)))
         last = ((c % self.own, self._place(f"first alpha {c // self.own}")) for c in range(self.equations.k))
-        return found + [Show(Component(unknowns, c), Component(t.alpha, *at)) for c, at in enumerate(last)]
+        return found + [Show(Entry(unknowns, c), Entry(t.alpha, *at)) for c, at in enumerate(last)]
 
     def _near_ends(self, rates: Array) -> list[Operation]:
         """Copy rates to the ends of pieces, if they are not those at the start of the next piece."""
@@ -290,7 +299,7 @@ class StepMap(EliminationCode):
         return [i for i in sorted(rows) if i < e.ny]
 
     def _rates_over_piece(
-        self, weights: Sequence[float], target: Sequence[Component], rates: Array, j: Index
+        self, weights: Sequence[float], target: Sequence[Entry], rates: Array, j: Index
     ) -> list[Operation]:
         """Add h times the weighted sum of a piece's rates."""
         h, found = self._get(self.h, 0, j), list[Operation]()
@@ -298,10 +307,10 @@ class StepMap(EliminationCode):
         for weight, (array, place) in zip(weights, places, strict=False):
             if weight:
                 own = h * weight
-                found += [Add(target[i], Component(array, i, place), own) for i in self._rows_of(rates)]
+                found += [Add(target[i], Entry(array, i, place), own) for i in self._rows_of(rates)]
         return found
 
-    def _by_length(self, weights: Sequence[float], target: Sequence[Component], j: Index) -> list[Operation]:
+    def _by_length(self, weights: Sequence[float], target: Sequence[Entry], j: Index) -> list[Operation]:
         """Add the weighted sum of a piece's rates times the tangent of its length."""
         found, places = list[Operation](), self._places_of((self.f, self.fe), j)
         if not self.equations.moves_lengths:
@@ -314,12 +323,10 @@ class StepMap(EliminationCode):
             ]
             if parts:
                 rate = functools.reduce(operator.add, parts)
-                found.append(Add(number, Component(self.tangents.lengths, 0, j), rate))
+                found.append(Add(number, Entry(self.tangents.lengths, 0, j), rate))
         return found
 
-    def _slopes(
-        self, target: tuple[Array, Any], source: Callable[[int], Component], j: Any
-    ) -> list[Operation]:
+    def _slopes(self, target: tuple[Array, Any], source: Callable[[int], Entry], j: Any) -> list[Operation]:
         """Add the product of the rates' derivatives at a place with numbers."""
         nonzeros = [(i, c, 0) for i, c in self.equations.pattern]
         return _products(nonzeros, (self.slope, j), target, source)
@@ -328,7 +335,7 @@ class StepMap(EliminationCode):
         """Add the part of rates at a piece's start by y behind a jump."""
         t, far = self.tangents, self.rows["far"]
         return [
-            Add(Component(t.rates, i, j), Component(t.far, c, j), Component(self.slope, n, j))
+            Add(Entry(t.rates, i, j), Entry(t.far, c, j), Entry(self.slope, n, j))
             for n, (i, c) in enumerate(self.equations.pattern)
             if c in far
         ]
@@ -336,9 +343,9 @@ class StepMap(EliminationCode):
     def _at_fixed_ends(self, k: int, j: Index) -> list[Operation]:
         """Set y at a stage at fixed y, and add its part of the rates there."""
         t, stage, first, at = self.tangents, *self._stage(k, j)
-        own = [Component(t.between, i, at) for i in range(self.equations.ny)]
+        own = [Entry(t.between, i, at) for i in range(self.equations.ny)]
         found: list[Operation] = [Scale(number) for number in own]
-        found += [Add(own[i], Component(t.far, i, j), 1.0 - stage.end) for i in self.rows["far"]]
+        found += [Add(own[i], Entry(t.far, i, j), 1.0 - stage.end) for i in self.rows["far"]]
         found += self._by_length(stage.rates, own, j) + self._rates_over_piece(stage.rates, own, t.rates, j)
         return found + self._slopes((t.rates, first), own.__getitem__, first)
 
@@ -349,16 +356,16 @@ class StepMap(EliminationCode):
     def _advance(self, j: Index) -> list[Operation]:
         """Set w at the end of a piece: its defect at fixed y, and w at its start by the factors."""
         e, t, formula = self.equations, self.tangents, self.space.formula
-        end, found = [Component(t.w, i, j + 1) for i in range(e.ny)], self._moved(j)
+        end, found = [Entry(t.w, i, j + 1) for i in range(e.ny)], self._moved(j)
         for k in range(len(self.stages)):
             found += self._at_fixed_ends(k, j)
         found += map(Scale, end)
-        found += [Add(end[i], Component(t.far, i, j)) for i in self.rows["far"]]
+        found += [Add(end[i], Entry(t.far, i, j)) for i in self.rows["far"]]
         found += self._by_length(formula.weights, end, j)
         found += self._rates_over_piece(formula.weights, end, t.rates, j)
-        return found + self._by_factors([Component(t.w, i, j) for i in range(e.ny)], end, j)
+        return found + self._by_factors([Entry(t.w, i, j) for i in range(e.ny)], end, j)
 
-    def _by_factors(self, start: Sequence[Component], end: Sequence[Component], j: Index) -> list[Operation]:
+    def _by_factors(self, start: Sequence[Entry], end: Sequence[Entry], j: Index) -> list[Operation]:
         """Add A times numbers at the start of a piece to those at its end, and apply B⁻¹ to the sum."""
         el, found = self.elimination, list[Operation]()
         stored = {int(node): n for n, node in enumerate(el.stored)}
@@ -366,10 +373,10 @@ class StepMap(EliminationCode):
         for i, c in zip(*np.nonzero(el.matrix != el.program.constant(0.0)), strict=True):
             entry: Any = el.program.values[int(el.matrix[i, c])]
             if (i, c) in entries:
-                entry = Component(self.entries, entries[i, c], j)
+                entry = Entry(self.entries, entries[i, c], j)
             found.append(Add(end[i], start[c], entry))
         for i, c, node in el.substitution:
-            factor = Component(self.factor, stored[node], j) if node in stored else el.program.values[node]
+            factor = Entry(self.factor, stored[node], j) if node in stored else el.program.values[node]
             found.append(Scale(end[i], factor) if i == c else Add(end[i], end[c], factor, is_negative=True))
         return found
 
@@ -379,23 +386,23 @@ class StepMap(EliminationCode):
         """Add the changes of y at a point by those of its unknowns."""
         return [
             Add(
-                Component(target, i, j), Component(source, c, group), Component(self.X, self._of_X(i, c), j),
+                Entry(target, i, j), Entry(source, c, group), Entry(self.X, self._of_X(i, c), j),
                 is_negative,
             )
             for i, c in zip(*map(np.ndarray.tolist, np.nonzero(self.nonzero_X)), strict=True)
         ]  # fmt: skip
 
-    def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Component:
+    def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Entry:
         """Return an entry of a matrix with rows in lanes."""
-        return Component(matrix, c * self._padded(rows) + i, j)
+        return Entry(matrix, c * self._padded(rows) + i, j)
 
     def _correction(self) -> list[Operation]:
         """Return the map from the results at fixed y to y and the unknowns."""
         e, t, k, own = self.equations, self.tangents, self.equations.k, self.own
         found = _set(
             (
-                Component(t.w, i % e.ny, self.bases[i // e.ny]),
-                Component(t.base, i) if i in self.rows["base"] else None,
+                Entry(t.w, i % e.ny, self.bases[i // e.ny]),
+                Entry(t.base, i) if i in self.rows["base"] else None,
             )
             for i in range(t.base.size)
         )
@@ -403,12 +410,12 @@ class StepMap(EliminationCode):
         for i, c, _ in e.tip_slopes:
             strand, component = divmod(c, e.ny)
             entry = self._entry_at(self.M, k, i, component, strand)
-            found.append(Add(Component(t.tip, i), Component(t.w, component, self.tips[strand]), entry))
-        alpha = [Component(t.alpha, i % own, self._place(f"alpha {i // own}")) for i in range(k)]
+            found.append(Add(Entry(t.tip, i), Entry(t.w, component, self.tips[strand]), entry))
+        alpha = [Entry(t.alpha, i % own, self._place(f"alpha {i // own}")) for i in range(k)]
         found += map(Scale, alpha)
         for i, c in np.ndindex(k, k):
             entry = self._entry_at(self.inverse, k, i, c)
-            found.append(Add(alpha[i], Component(t.tip, c), entry, is_negative=True))
+            found.append(Add(alpha[i], Entry(t.tip, c), entry, is_negative=True))
         return [*found, PlaceLoop(0, self.strands, self._sweep_to_base)]
 
     def _sweep_to_tip(self, strand: Index) -> list[Operation]:
@@ -418,7 +425,7 @@ class StepMap(EliminationCode):
         def group(g: Index) -> list[Operation]:
             first = base + g.value * size
             last, at = self._now.index(first + size), self._now.index(strand.value * count + g.value)
-            pivots = ((Component(t.beta, c, at), Component(t.w, p, last)) for c, p in enumerate(self.pivots))
+            pivots = ((Entry(t.beta, c, at), Entry(t.w, p, last)) for c, p in enumerate(self.pivots))
             changed = self._by_unknowns(t.w, last, t.beta, at, is_negative=True)
             return [PlaceLoop(first, last.value, self._advance), *_set(pivots), *changed]
 
@@ -445,14 +452,14 @@ class StepMap(EliminationCode):
             # a strand has one more alpha
             alpha, change = (
                 f.index(group.value + strand.value),
-                [Component(t.beta, c, group) for c in range(own)],
+                [Entry(t.beta, c, group) for c in range(own)],
             )
             found = solve(alpha + 1, end)
-            found += [Scale(Component(t.alpha, c, alpha)) for c in range(own)]
-            found += [Add(change[c], Component(t.alpha, c, alpha + 1), is_negative=True) for c in range(own)]
+            found += [Scale(Entry(t.alpha, c, alpha)) for c in range(own)]
+            found += [Add(change[c], Entry(t.alpha, c, alpha + 1), is_negative=True) for c in range(own)]
             for i, c in zip(*map(np.ndarray.tolist, np.nonzero(self.nonzero_T)), strict=True):
-                entry = Component(self.T, self._of_X(i, c), group)
-                found.append(Add(Component(t.alpha, i, alpha), change[c], entry, is_negative=True))
+                entry = Entry(self.T, self._of_X(i, c), group)
+                found.append(Add(Entry(t.alpha, i, alpha), change[c], entry, is_negative=True))
             return [*found, PlaceLoop(start + 1, end.value, functools.partial(solve, alpha))]
 
         stop = base.value + self._count("points of strand")
@@ -466,30 +473,30 @@ class StepMap(EliminationCode):
     def _add_jumps(self, j: Index) -> list[Operation]:
         """Add the changes of jumps by y."""
         t, nonzeros = self.tangents, [(i, c, 0) for i, c, _ in self.equations.jumping]
-        return _products(nonzeros, (self.jump, j), (t.newest, j), lambda c: Component(t.y, c, j))
+        return _products(nonzeros, (self.jump, j), (t.newest, j), lambda c: Entry(t.y, c, j))
 
     def _add_jumps_at_fixed_y(self, j: Index) -> list[Operation]:
         """Add the changes of jumps at fixed y."""
         t = self.tangents
-        return [Add(Component(t.newest, i, j), Component(t.far, i, j)) for i in self.rows["far"]]
+        return [Add(Entry(t.newest, i, j), Entry(t.far, i, j)) for i in self.rows["far"]]
 
     def _change_of_rates(self, j: Index) -> list[Operation]:
         """Set the change of rates at ends of pieces by y."""
         t = self.tangents
-        found: list[Operation] = [Scale(Component(t.change, i, j)) for i in self._rows_of(t.change)]
-        return found + self._slopes((t.change, j), lambda c: Component(t.newest, c, j), j)
+        found: list[Operation] = [Scale(Entry(t.change, i, j)) for i in self._rows_of(t.change)]
+        return found + self._slopes((t.change, j), lambda c: Entry(t.newest, c, j), j)
 
     def _solve_stage(self, k: int, j: Index) -> list[Operation]:
         """Add the change of y at a stage, and set that of the rates there."""
         e, t, stage, first, at = self.equations, self.tangents, *self._stage(k, j)
-        own, found = [Component(None, i) for i in range(e.ny)], list[Operation]()
+        own, found = [Entry(None, i) for i in range(e.ny)], list[Operation]()
         for i in range(e.ny):
-            found.append(Add(own[i], Component(t.newest, i, j), 1.0 - stage.end))
-            found.append(Add(own[i], Component(t.y, i, j + 1), stage.end))
+            found.append(Add(own[i], Entry(t.newest, i, j), 1.0 - stage.end))
+            found.append(Add(own[i], Entry(t.y, i, j + 1), stage.end))
         found += self._rates_over_piece(stage.rates, own, t.change, j)
-        found += [Scale(Component(t.change, i, first)) for i in self._rows_of(t.change)]
+        found += [Scale(Entry(t.change, i, first)) for i in self._rows_of(t.change)]
         found += self._slopes((t.change, first), own.__getitem__, first)
-        found += [Add(Component(t.between, i, at), own[i]) for i in range(e.ny)]
+        found += [Add(Entry(t.between, i, at), own[i]) for i in range(e.ny)]
         return found + _copies(e.ny, (t.newest, first), (t.between, at))
 
     def _set_record(self, c0: Value, j: Index) -> list[Operation]:
@@ -497,18 +504,18 @@ class StepMap(EliminationCode):
         e, t, rows = self.equations, self.tangents, self.rows["rates"]
         strains = [(e.ny + i, c, node) for i, c, node in e.z_by_y]
         found = _set(
-            (Component(t.newest, i, j), Component(t.rates, i, j) if i in rows else None)
+            (Entry(t.newest, i, j), Entry(t.rates, i, j) if i in rows else None)
             for i in range(e.ny, e.ny + e.nz)
         )
-        found += _products(strains, (self.z_by_y, j), (t.newest, j), lambda c: Component(t.newest, c, j))
+        found += _products(strains, (self.z_by_y, j), (t.newest, j), lambda c: Entry(t.newest, c, j))
         for i in range(e.numbers - e.ny - e.nz):
-            rate = Component(t.newest, e.ny + e.nz + i, j)
+            rate = Entry(t.newest, e.ny + e.nz + i, j)
             found.append(Scale(rate))
             for rates in (t.rates, t.change):
-                found += [Add(rate, Component(rates, i, j))] if i in self._rows_of(rates) else []
+                found += [Add(rate, Entry(rates, i, j))] if i in self._rows_of(rates) else []
         if self.settings.uses_rate:
             found += _copies(e.numbers, (t.rate, j), (t.history, j))
-            found += [Add(Component(t.rate, i, j), Component(t.newest, i, j), c0) for i in range(e.numbers)]
+            found += [Add(Entry(t.rate, i, j), Entry(t.newest, i, j), c0) for i in range(e.numbers)]
         return found
 
     def _show(self, row: Columns, node: Index) -> list[Operation]:
@@ -517,8 +524,8 @@ class StepMap(EliminationCode):
         own = Columns(self._now.pointer(row.base, node.value * (row.width * self.packed.size)), row.width)
         return [
             Show(
-                Component(own, int(component)),
-                Component(t.y if i < self.equations.ny else t.newest, i, self._of_strand(q, point)),
+                Entry(own, int(component)),
+                Entry(t.y if i < self.equations.ny else t.newest, i, self._of_strand(q, point)),
             )
             for (q, i), component in np.ndenumerate(self.packed)
         ]
@@ -528,11 +535,11 @@ def _products(
     nonzeros: Nonzeros,
     matrix: tuple[Array, Any],
     target: tuple[Array, Any],
-    source: Callable[[int], Component],
+    source: Callable[[int], Entry],
 ) -> list[Operation]:
     """Add the product of a sparse matrix with numbers; matrix and result have an array and a place."""
     return [
-        Add(Component(target[0], i, target[1]), source(c), Component(matrix[0], n, matrix[1]))
+        Add(Entry(target[0], i, target[1]), source(c), Entry(matrix[0], n, matrix[1]))
         for n, (i, c, _) in enumerate(nonzeros)
     ]
 
@@ -542,12 +549,12 @@ def _copies(
 ) -> list[Operation]:
     """Copy components, by default all; target and source have an array and a place."""
     return _set(
-        (Component(target[0], i, target[1]), Component(source[0], i, source[1]))
+        (Entry(target[0], i, target[1]), Entry(source[0], i, source[1]))
         for i in (range(size) if rows is None else rows)
     )
 
 
-def _set(pairs: Iterable[tuple[Component, Component | None]]) -> list[Operation]:
+def _set(pairs: Iterable[tuple[Entry, Entry | None]]) -> list[Operation]:
     """Set the first number of each pair to the second, or to zero."""
     found = list[Operation]()
     for target, source in pairs:

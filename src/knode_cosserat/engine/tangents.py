@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.engine.codegen import Index, StackVariable, Value
-from knode_cosserat.engine.linear import Add, Columns, Component, write
+from knode_cosserat.engine.linear import Add, Columns, Entry, write
 from knode_cosserat.engine.memory import Array, aligned_zeros
 from knode_cosserat.engine.program import Nonzeros
 from knode_cosserat.engine.step_map import COLUMNS, STATE, StepMap
@@ -307,7 +307,7 @@ class TangentCore(_TangentCode):
             "weights", "directions", "n_directions"
         )
         f = self._now
-        at_tip = [Add(Component(t.tip, i), Component(self.added_tip, i)) for i in range(self.equations.k)]
+        at_tip = [Add(Entry(t.tip, i), Entry(self.added_tip, i)) for i in range(self.equations.k)]
         write(self, [*self._at_fixed_y(coefficients, control), *at_tip], COLUMNS, False)
         with f.loop(count) as d:
             own = f.pointer(directions, d.value * self.direction_size)

@@ -119,12 +119,12 @@ class Arrays(NamedTuple):
     record: Any
 
 
-def scaled(arrays: Arrays, control: Float[Any, "... c"]) -> Float[Any, "... c"]:
+def scale_controls(arrays: Arrays, control: Float[Any, "... c"]) -> Float[Any, "... c"]:
     """Return controls as numbers from -1 to 1 within their limits."""
     return 2.0 * (control - arrays.low) / (arrays.high - arrays.low) - 1.0
 
 
-def commanded(
+def next_command(
     spec: Spec, arrays: Arrays, before: Float[Any, " c"], action: Float[Any, " c"]
 ) -> Float[Any, " c"]:
     """Return the command of an action after another command, within limits and rate."""
@@ -184,10 +184,10 @@ class Transition(NamedTuple):
 def system_of(spec: Spec, arrays: Arrays, state: EpisodeState) -> System:
     """Return the robot of an episode, at its present time."""
     drawn = jnp.where(state.count >= state.changes_at, state.drawn[1], state.drawn[0])
-    return _assembled(spec, arrays, drawn, state.model, state.goal)
+    return _assemble(spec, arrays, drawn, state.model, state.goal)
 
 
-def _assembled(spec: Spec, arrays: Arrays, drawn: Any, model: Any, goal: Any) -> System:
+def _assemble(spec: Spec, arrays: Arrays, drawn: Any, model: Any, goal: Any) -> System:
     system: System = arrays.robot
     if spec.models:
         system = jax.tree.map(lambda leaf: leaf[model], arrays.models)
@@ -226,14 +226,14 @@ def _noisy(arrays: Arrays, key: Any, positions: Float[Any, " p"]) -> Float[Any, 
     return positions + arrays.noise * jax.random.normal(key, positions.shape)
 
 
-def observed(spec: Spec, arrays: Arrays, state: Any) -> Float[Any, " o"]:
+def observation(spec: Spec, arrays: Arrays, state: Any) -> Float[Any, " o"]:
     """Return the observation: measured positions, the last command, the target now and later, the task's.
 
     Lengths are in lengths of the nominal robot from its tip at rest, and controls from -1 to 1.
     """
     length, origin = nominal_model(arrays.robot).length, arrays.survey.origin
     measured = (state.measured.reshape(MEASURED, -1, 3) - origin) / length
-    control = scaled(arrays, state.commands[0])
+    control = scale_controls(arrays, state.commands[0])
     times = (state.count + np.asarray(PREVIEW)) * spec.dt
     targets = jax.vmap(lambda t: spec.task.target(state.goal, t))(times)
     places = (targets[:, :3] - origin) / length
@@ -256,13 +256,13 @@ def reset(spec: Spec, arrays: Arrays, key: Any) -> tuple[EpisodeState, Float[Any
     one, two = jax.random.split(other)
     model = jax.random.randint(one, (), 0, max(spec.models, 1))
     delay = jax.random.randint(two, (), spec.delay[0], spec.delay[1] + 1)
-    system = _assembled(spec, arrays, drawn[0], model, goal)
+    system = _assemble(spec, arrays, drawn[0], model, goal)
     measured = _noisy(arrays, noise_key, spec.output.value(system, *split_record(system, arrays.record)))
     state = EpisodeState(
         arrays.history, goal, drawn, changes_at, model, jnp.tile(arrays.start, (spec.delay[1] + 1, 1)), delay,
         jnp.tile(measured, (MEASURED, 1)), jnp.array(0), key,
     )  # fmt: skip
-    return state, observed(spec, arrays, state)
+    return state, observation(spec, arrays, state)
 
 
 # steps
@@ -273,14 +273,14 @@ def step_many(
 ) -> tuple[EpisodeState, Transition]:
     """Return the states after one period of many episodes under actions (B, c), and their transitions."""
     history, others = states.history._replace(t0=states.count * spec.dt), states._replace(history=None)
-    systems, others, acting, valid = moved(spec, arrays, others, actions)
+    systems, others, acting, valid = apply_actions(spec, arrays, others, actions)
     if is_traced((arrays, states, actions)):
         task, axes = period(spec), (None if spec.is_shared else 0, 0, 0)
         solve = rollout(task, Pattern.of(systems))
         rows, history = jax.vmap(solve, in_axes=axes)(systems, acting, history)
     else:
         _, history, rows = period(spec).solve(systems, np.asarray(acting), history)
-    others, transitions = arrived(
+    others, transitions = finish_step(
         spec, arrays, systems, others, (rows.records[:, 0], rows.result[:, 0], valid)
     )
     return others._replace(history=history), transitions
@@ -292,13 +292,13 @@ def period(spec: Spec) -> TimeIntegration:
 
 
 @functools.partial(jax.jit, static_argnames="spec")
-def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Any:
+def apply_actions(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, "B c"]) -> Any:
     """Return systems, states with the commands of actions, acting controls (B, 1, c), and valid actions."""
 
     def move(state: EpisodeState, action: Any) -> Any:
         before, action = state.commands[0], jnp.asarray(action, dtype=float)
         valid = jnp.all(jnp.isfinite(action))
-        command = commanded(spec, arrays, before, jnp.where(valid, action, 0.0))
+        command = next_command(spec, arrays, before, jnp.where(valid, action, 0.0))
         commands = jnp.concatenate([jnp.where(valid, command, before)[None], state.commands[:-1]])
         state = state._replace(commands=commands)
         system = None if spec.is_shared else system_of(spec, arrays, state)
@@ -309,7 +309,7 @@ def moved(spec: Spec, arrays: Arrays, states: EpisodeState, actions: Float[Any, 
 
 
 @functools.partial(jax.jit, static_argnames="spec")
-def arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solution: Any) -> Any:
+def finish_step(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solution: Any) -> Any:
     """Return the states after a solved step, and the transitions; states have no history here.
 
     `solution` has records and results of the rows, and True for valid actions. Without a solution, the state
@@ -341,7 +341,7 @@ def arrived(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, solu
         )
         truncated = (ending != Ending.RUNNING) & ~terminated
         transition = Transition(
-            observed(spec, arrays, state), jnp.where(usable, reward, 0.0).astype(jnp.float32), terminated,
+            observation(spec, arrays, state), jnp.where(usable, reward, 0.0).astype(jnp.float32), terminated,
             truncated, ending, error, tip.position, clearance, state.commands[0],
         )  # fmt: skip
         return state, transition

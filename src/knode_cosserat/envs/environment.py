@@ -265,7 +265,7 @@ class Episodes:
             rows = np.flatnonzero(where // self._size == part)
             for first in range(0, len(rows), RESET_AT_ONCE):
                 some = rows[first : first + RESET_AT_ONCE]
-                places, padded = _padded(where[some] - part * self._size, keys[some], self._size)
+                places, padded = _pad_restarts(where[some] - part * self._size, keys[some], self._size)
                 self._parts[part], seen, histories = dynamics.restart(
                     environment.spec, environment.arrays, self._parts[part], places, padded
                 )
@@ -282,7 +282,7 @@ class Episodes:
     def _step(self, part: int, actions: np.ndarray) -> Any:
         """Move the episodes of a part on; their histories stay in the engine's memory."""
         spec, arrays, before = self.environment.spec, self.environment.arrays, self._parts[part]
-        systems, states, acting, valid = dynamics.moved(spec, arrays, before, actions)
+        systems, states, acting, valid = dynamics.apply_actions(spec, arrays, before, actions)
         pattern, motions = self._motions[part]
         if not spec.is_shared:
             if Pattern.of(systems) != pattern:
@@ -291,7 +291,7 @@ class Episodes:
         motions.set_times(np.asarray(before.count) * spec.dt)
         _, rows = motions.solve(np.asarray(acting), (0, 1))
         solution = rows.records[:, 0], rows.result[:, 0], valid
-        self._parts[part], transitions = dynamics.arrived(spec, arrays, systems, states, solution)
+        self._parts[part], transitions = dynamics.finish_step(spec, arrays, systems, states, solution)
         return jax.tree.map(np.asarray, transitions)
 
     def warm_up(self) -> None:
@@ -309,7 +309,7 @@ class Episodes:
         return np.concatenate(parts)[: self.count]
 
 
-def _padded(places: np.ndarray, keys: np.ndarray, beyond: int) -> tuple[np.ndarray, np.ndarray]:
+def _pad_restarts(places: np.ndarray, keys: np.ndarray, beyond: int) -> tuple[np.ndarray, np.ndarray]:
     """Return places (n,) and keys (n, 2) of restarts, filled up with places beyond the end."""
     all_places = np.full(RESET_AT_ONCE, beyond)
     all_keys = np.zeros((RESET_AT_ONCE, 2), dtype=np.uint32)

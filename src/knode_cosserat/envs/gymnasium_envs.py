@@ -97,7 +97,7 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return picture(self.environment, self._state)
 
 
-def made(task: str, render_mode: str | None = None, **settings: Any) -> SingleEnv:
+def make_single(task: str, render_mode: str | None = None, **settings: Any) -> SingleEnv:
     """Return the environment of a task, for `gymnasium.make("knode_cosserat/Follow-v0")`."""
     return SingleEnv(make(task, **settings), render_mode)
 
@@ -110,7 +110,7 @@ def register() -> None:
     for name in TASKS:
         gymnasium.register(
             id=f"knode_cosserat/{name.capitalize()}-v0",
-            entry_point="knode_cosserat.envs.gymnasium_envs:made",
+            entry_point="knode_cosserat.envs.gymnasium_envs:make_single",
             kwargs={"task": name},
         )
 

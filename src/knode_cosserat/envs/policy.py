@@ -17,7 +17,14 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.control import Command, Controller, Plant, Reference, controller_named, run_loop
 from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.control.planning import PlanController
-from knode_cosserat.envs.dynamics import MEASURED, Ending, EpisodeState, commanded, observed, scaled
+from knode_cosserat.envs.dynamics import (
+    MEASURED,
+    Ending,
+    EpisodeState,
+    next_command,
+    observation,
+    scale_controls,
+)
 from knode_cosserat.envs.environment import Environment
 from knode_cosserat.envs.tasks import TaskError
 from knode_cosserat.estimation.outputs import TipPosition
@@ -36,11 +43,11 @@ class PolicyController(Controller):
         self.environment, self.policy, self.dt = environment, policy, environment.dt
         spec, arrays = environment.spec, environment.arrays
         self._observed = jax.jit(
-            lambda measured, control, count: observed(
+            lambda measured, control, count: observation(
                 spec, arrays, state._replace(measured=measured, commands=control[None], count=count)
             )
         )
-        self._commanded = jax.jit(lambda control, action: commanded(spec, arrays, control, action))
+        self._commanded = jax.jit(lambda control, action: next_command(spec, arrays, control, action))
         self.reset(np.asarray(arrays.start))
 
     def reset(self, control: Float[np.ndarray, " c"]) -> None:
@@ -98,7 +105,7 @@ class _EpisodePlant(Plant):
         """Move on by one period under a control; after the end of the episode nothing moves."""
         if self.ending is not Ending.RUNNING:
             return
-        action = scaled(self.environment.arrays, np.asarray(control))
+        action = scale_controls(self.environment.arrays, np.asarray(control))
         self.state, after = self.environment.step(self.state, np.clip(action, -1.0, 1.0))
         self.rewards.append(float(after.reward))
         self.ending, self._tip = Ending(int(after.ending)), np.asarray(after.tip)

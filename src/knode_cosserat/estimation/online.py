@@ -267,7 +267,7 @@ class OnlineModel:
         moved, motion = self.rollout(belief._replace(spread=wide), controls, d_controls, columns)
         if motion is None:
             return None
-        seen = _measured(
+        seen = _output_rows(
             moved.structure, output, columns, moved.numbers, motion.records, motion.d_records, measured
         )
         return Predicted(motion.past, motion.records[-1], motion.spread, *map(np.asarray, seen))
@@ -355,7 +355,7 @@ class Predicted(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnames=("structure", "output", "columns"))
-def _measured(
+def _output_rows(
     structure: Structure, output: Output, columns: tuple[int, ...], numbers: Any, records: Any,
     d_records: Any, measured: Any,
 ) -> Any:  # fmt: skip

@@ -144,11 +144,11 @@ class Replace:
             return robot.replace(**dict(zip(self.parameters, values, strict=True)))
         name, numbers = self.parameters[0], jnp.stack(values)
         if self.kind == "coefficients":
-            numbers = numbers.reshape(np.shape(_stated(robot, name)))
+            numbers = numbers.reshape(np.shape(_parameter_value(robot, name)))
         elif self.kind == "turn":
-            numbers = quaternion_product(quaternion_of(numbers), _stated(robot, name))
+            numbers = quaternion_product(quaternion_of(numbers), _parameter_value(robot, name))
         elif self.kind == "multiple":
-            whole = _stated(robot, name)
+            whole = _parameter_value(robot, name)
             numbers = whole * (values[0] / whole.reshape(-1)[0])
         return robot.replace(**{name: numbers})
 
@@ -354,7 +354,7 @@ def _parts_of_residual(robot: System, choice: Adapted) -> list[Adapted]:
     return [dataclasses.replace(choice, name=f"{RESIDUAL}.{name}") for name in kept]
 
 
-def _stated(robot: System, name: str) -> Any:
+def _parameter_value(robot: System, name: str) -> Any:
     """Return the value of a parameter, or of coefficients of a residual."""
     part = name.removeprefix(f"{RESIDUAL}.")
     if part == name:
@@ -368,7 +368,7 @@ def _stated(robot: System, name: str) -> Any:
 
 def _adapted_effect(robot: System, adapted: Adapted) -> PossibleEffect:
     name, deviation = adapted.name, adapted.deviation
-    stated = _stated(robot, name)
+    stated = _parameter_value(robot, name)
     try:
         value = np.asarray(stated, dtype=float)
     except (TypeError, ValueError):

@@ -24,7 +24,7 @@ from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.trajectory import Trajectory
 
 #: seconds that recovery may take before a prediction has failed
@@ -127,7 +127,7 @@ def predict(
         SimulationError: an equilibrium or a step has no solution.
     """
     check_arguments(predict, locals())
-    robot, measured = fixed(robot), Measurements.of(measured)
+    robot, measured = fix_grid(robot), Measurements.of(measured)
     initial: Any = "unstressed" if measured.unstressed else None
     first = measured.tension[0] if measured.static else measured.initial_tension
     if first is not None and not measured.unstressed:

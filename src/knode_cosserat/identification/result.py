@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._reprs import robot_text, wrapped
+from knode_cosserat._reprs import robot_text, wrap_lines
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.identification.next_experiment import NextExperiment
 from knode_cosserat.identification.posterior import SURE, UNLIKELY, Posterior
@@ -164,7 +164,7 @@ class Identified:
             known = [error for error in errors.values() if error is not None]
             if known:
                 parts.append(f"tip error, {name}: {1e3 * sum(known) / len(known):.3g} mm")
-        return wrapped("; ".join(parts))
+        return wrap_lines("; ".join(parts))
 
     def __str__(self) -> str:
         rows: list[tuple[str, ...]] = [

@@ -15,10 +15,10 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendons import undelayed
+from knode_cosserat.rods.tendons import remove_delay
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.schemes.time import BDF2, LIGHTLY_DAMPED, TWO_STAGES, TimeScheme
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
@@ -88,9 +88,9 @@ def simulated_rows(
     """
     count = steps_per_row(dt, continuous)
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
-    acting = undelayed(robot, tension, dt / count, initial)
+    acting = remove_delay(robot, tension, dt / count, initial)
     motion = simulate(
-        fixed(robot), acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
+        fix_grid(robot), acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
         initial="equilibrium" if start is None else start,  # type: ignore[arg-type]
         recovery_budget=recovery,
     )  # fmt: skip

@@ -13,12 +13,12 @@ from jaxtyping import Float
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendons import undelayed
+from knode_cosserat.rods.tendons import remove_delay
 from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.schemes.result import Result, SimulationError
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.trajectory import Trajectory
 
 #: amplitudes of the recordings' tensions about their initial ones
@@ -108,13 +108,13 @@ def moved(
     robot: System, tension: Float[np.ndarray, "T c"], like: Experiment, space: str | SpaceScheme
 ) -> tuple[Trajectory, Trajectory]:
     """Return the equilibrium under a recording's initial tensions, and the rows from there."""
-    robot, initial, dt = fixed(robot), np.asarray(like.held), like.dt
+    robot, initial, dt = fix_grid(robot), np.asarray(like.held), like.dt
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
         still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY, with_stability=False)
         if like.static:
-            tension = np.concatenate([initial[None], undelayed(robot, tension, dt, initial)])
+            tension = np.concatenate([initial[None], remove_delay(robot, tension, dt, initial)])
             rows = equilibria(
                 robot, tension, initial=still, space=space, recovery_budget=RECOVERY, with_stability=False
             )

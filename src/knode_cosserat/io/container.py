@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from knode_cosserat._files.limits import MORE, LimitSettingError, allowed, excess
+from knode_cosserat._files.limits import MORE, LimitSettingError, excess, scaled_limit
 from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat.errors import KnodeCosseratError, first_line
@@ -134,7 +134,7 @@ def write(path: str | Path, content: bytes, kind: Kind) -> None:
         raise kind.error(f"{path}: cannot be written: {reason}") from None
 
 
-def encoded(
+def encode(
     kind: Kind, facts: Mapping[str, Any], *, variables: Mapping[str, Variable] | None = None,
     attributes: Mapping[str, Any] | None = None, classes: Mapping[str, type] | None = None,
     others: bool = False,
@@ -202,7 +202,7 @@ class _Packer:
     def __init__(self, classes: Mapping[str, type], others: bool) -> None:
         self._classes, self._others = classes, others
         self.arrays: dict[str, np.ndarray] = {}
-        self._objects, self._most_objects = 0, allowed(MOST_OBJECTS)
+        self._objects, self._most_objects = 0, scaled_limit(MOST_OBJECTS)
 
     def text(self, facts: dict[str, Any]) -> str:
         """Return the facts as JSON. Raises `ContainerError`."""
@@ -313,17 +313,17 @@ def kind_of(path: str | Path) -> str:
 
 
 def read(path: str | Path, kind: Kind, classes: Mapping[str, type] | None = None) -> Content:
-    """Read a file of a kind; see `decoded`. Raises the kind's error."""
+    """Read a file of a kind; see `decode`. Raises the kind's error."""
     with kind.naming(path):
         # os.path has no errors, not even for a name with a zero byte
         if not os.path.isfile(path):
             reason = "not a file" if os.path.exists(path) else "no such file"
             raise ContainerError("this is a folder; allowed is a file" if os.path.isdir(path) else reason)
         data = read_bytes(path, LARGEST_FILE)
-    return decoded(data, kind, str(path), classes)
+    return decode(data, kind, str(path), classes)
 
 
-def decoded(data: bytes, kind: Kind, source: str, classes: Mapping[str, type] | None = None) -> Content:
+def decode(data: bytes, kind: Kind, source: str, classes: Mapping[str, type] | None = None) -> Content:
     """Return the content of a file's bytes.
 
     Args:
@@ -396,7 +396,7 @@ def _read_arrays(file: Any, size: int) -> tuple[dict[str, np.ndarray], dict[str,
             elif name != "arrays":
                 raise ContainerError(f"{name!r} is a group; allowed are variables")
     expanded = sum(item.size * item.dtype.itemsize for items in groups for item in items.values())
-    most = allowed(EXPANSION) * size + allowed(ALLOWANCE)
+    most = scaled_limit(EXPANSION) * size + scaled_limit(ALLOWANCE)
     if expanded > most:
         raise ContainerError(
             f"its arrays take {expanded / 1e9:.3g} GB; allowed are {most / 1e9:.3g} GB for a file of this "
@@ -415,7 +415,7 @@ class _Unpacker:
 
     def __init__(self, arrays: Mapping[str, np.ndarray], classes: Mapping[str, type]) -> None:
         self._arrays, self._classes = arrays, classes
-        self._objects, self._most_objects = 0, allowed(MOST_OBJECTS)
+        self._objects, self._most_objects = 0, scaled_limit(MOST_OBJECTS)
 
     def facts(self, text: str) -> dict[str, Any]:
         """Return the facts. Raises `ContainerError`."""

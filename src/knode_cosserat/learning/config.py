@@ -7,7 +7,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self
 
 import numpy as np
 
-from knode_cosserat._files.yaml_text import shown
+from knode_cosserat._files.yaml_text import excerpt
 from knode_cosserat._settings import FLAG, LINE, Rule, ValidatedSettings, choice, items, number, part
 from knode_cosserat.errors import KnodeCosseratError
 
@@ -46,7 +46,7 @@ class _Options(ValidatedSettings):
     def from_dict(cls, values: Any) -> Self:
         """Return settings from `to_dict`'s result; missing options have defaults. Raises `ConfigError`."""
         if not isinstance(values, dict):
-            raise ConfigError(f"{cls.__name__} is {shown(values)}; allowed is a mapping")
+            raise ConfigError(f"{cls.__name__} is {excerpt(values)}; allowed is a mapping")
         return super().from_dict({key: value for key, value in values.items() if key != "kind"})
 
 
@@ -99,7 +99,7 @@ def _kind_of(*kinds: type[_Options]) -> Rule:
         if not isinstance(value, dict):
             return value if isinstance(value, kinds) else None
         if value.get("kind") not in named:
-            raise ConfigError(f"the kind is {shown(value.get('kind'))}; allowed is {', '.join(named)}")
+            raise ConfigError(f"the kind is {excerpt(value.get('kind'))}; allowed is {', '.join(named)}")
         return named[value["kind"]].from_dict(value)
 
     words = " or ".join(kind.__name__ for kind in kinds)

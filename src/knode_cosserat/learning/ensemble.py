@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat._reprs import count_of, wrapped
+from knode_cosserat._reprs import count_of, wrap_lines
 from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
@@ -32,7 +32,7 @@ class Ensemble(Sequence[KNODE]):
 
     def __repr__(self) -> str:
         first = " ".join(repr(self.members[0]).split())
-        return wrapped(f"Ensemble of {count_of(len(self), 'model')}; the first: {first}")
+        return wrap_lines(f"Ensemble of {count_of(len(self), 'model')}; the first: {first}")
 
     def __len__(self) -> int:
         return len(self.members)

@@ -22,8 +22,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat._files.limits import MORE, allowed
-from knode_cosserat._reprs import count_of, quantity, robot_text, wrapped
+from knode_cosserat._files.limits import MORE, scaled_limit
+from knode_cosserat._reprs import count_of, quantity, robot_text, wrap_lines
 from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.io import container
 from knode_cosserat.io.container import ContainerError
@@ -87,7 +87,7 @@ class KNODE(Wrapped):
             parts.append(f"fitted to {count_of(len(facts['trajectories']), 'trajectory', 'trajectories')}")
         if isinstance(facts.get("held_out_error"), float):
             parts.append(f"held-out tip error {quantity(1e3 * facts['held_out_error'], 'mm')}")
-        return wrapped("; ".join(parts))
+        return wrap_lines("; ".join(parts))
 
     @property
     def adapted(self) -> System:
@@ -198,7 +198,7 @@ def decoded_model(
     data: bytes, source: str, *, knowledge: System | None = None, residuals: Iterable[type] = ()
 ) -> KNODE:
     """Return the model in a file's bytes; see `load_model`."""
-    return _model(container.decoded(data, KIND, source, _classes(residuals)), source, knowledge)
+    return _model(container.decode(data, KIND, source, _classes(residuals)), source, knowledge)
 
 
 def _classes(residuals: Iterable[Any]) -> dict[str, type]:
@@ -226,7 +226,7 @@ def _encoded(model: KNODE) -> bytes:
         raise ContainerError("a batch of models cannot be written to one file; write them one by one")
     facts = _facts(model)
     _require_fit(model)
-    return container.encoded(KIND, facts, classes=CLASSES, others=True)
+    return container.encode(KIND, facts, classes=CLASSES, others=True)
 
 
 def _facts(model: KNODE) -> dict[str, Any]:
@@ -283,7 +283,7 @@ def _knowledge(described: dict[str, Any], nominal: System | None) -> System:
     if "model" in described:
         return _model_of(described["model"], nominal)
     if "robot" in described:
-        text, most = str(described["robot"]), allowed(MOST_TEXT)
+        text, most = str(described["robot"]), scaled_limit(MOST_TEXT)
         if len(text) > most:
             raise ContainerError(f"its robot file has {len(text)} characters; allowed is {most}; {MORE}")
         try:

@@ -31,7 +31,14 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
 from knode_cosserat._files.writing import replacing
-from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
+from knode_cosserat._files.yaml_text import (
+    YAMLTextError,
+    did_you_mean,
+    excerpt,
+    flow,
+    mapping_of,
+    read_yaml,
+)
 from knode_cosserat._settings import (
     FLAG,
     LINE,
@@ -506,10 +513,10 @@ class RecordingConfig(_RecordingSettings):
         places, names = [marker.fraction for marker in self.markers], [marker.name for marker in self.markers]
         if any(b <= a for a, b in itertools.pairwise(places)):
             raise RecordingError(
-                f"markers have the fractions {shown(places)}; allowed is each above the last"
+                f"markers have the fractions {excerpt(places)}; allowed is each above the last"
             )
         if len(set(names)) < len(names):
-            raise RecordingError(f"markers have the names {shown(names)}; allowed is each once")
+            raise RecordingError(f"markers have the names {excerpt(names)}; allowed is each once")
         if self.tension and self.motors:
             raise RecordingError("tension and motors are both there; allowed is one of them")
         if self.measured is None and self.tensions == "measured":

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from knode_cosserat._files import csv_rows
-from knode_cosserat._files.limits import MORE, allowed
+from knode_cosserat._files.limits import MORE, scaled_limit
 from knode_cosserat._files.reading import read_bytes, require_limit
 from knode_cosserat.recordings.findings import RecordingError
 
@@ -59,8 +59,8 @@ def file_bytes(path: Path, limit: int) -> bytes:
     data = read_bytes(path, limit)
     if not data.startswith(GZIP_MAGIC):
         return data
-    ratio, allowance = allowed(RATIO), allowed(ALLOWANCE)
-    most = min(ratio * len(data) + allowance, allowed(limit))
+    ratio, allowance = scaled_limit(RATIO), scaled_limit(ALLOWANCE)
+    most = min(ratio * len(data) + allowance, scaled_limit(limit))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
             content = file.read(most + 1)
@@ -69,7 +69,7 @@ def file_bytes(path: Path, limit: int) -> bytes:
     except (OSError, zlib.error) as error:
         raise RecordingError(f"cannot be decompressed: {error}") from None
     if len(content) > most:
-        words = f"{ratio} times the file and {allowance}" if most < allowed(limit) else str(most)
+        words = f"{ratio} times the file and {allowance}" if most < scaled_limit(limit) else str(most)
         raise RecordingError(f"it has more than {most} bytes when decompressed; allowed are {words}; {MORE}")
     return content
 
@@ -103,7 +103,7 @@ class Decompression:
     """
 
     def __init__(self, size: int) -> None:
-        self._remaining = allowed(RATIO) * size + allowed(ALLOWANCE)
+        self._remaining = scaled_limit(RATIO) * size + scaled_limit(ALLOWANCE)
         #: true if a limit was reached: bytes may be missing
         self.is_limited = False
 
@@ -114,7 +114,7 @@ class Decompression:
         readable. `size` is the decompressed size (bytes), zero if unknown. Raises `ImportError` without the
         library.
         """
-        limit = min(allowed(LARGEST_CHUNK), self._remaining)
+        limit = min(scaled_limit(LARGEST_CHUNK), self._remaining)
         most = min(size or limit, limit)
         decompressor, parts, count = _decompressor(compression), list[bytes](), 0
         # in pieces, so that the data before a damaged byte are recovered

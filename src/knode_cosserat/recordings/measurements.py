@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._numbers import real_array
-from knode_cosserat._reprs import count_of, wrapped
+from knode_cosserat._reprs import count_of, wrap_lines
 from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.streams import Body, Sensor, Tensions
@@ -75,7 +75,7 @@ class Measurements:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
         places = ", ".join(f"{fraction:.4g}" for fraction in self.fractions) or "none"
         more = "".join(f"; {it.topic}" for it in self.sensors)
-        return wrapped(
+        return wrap_lines(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
             f"{count_of(self.tension.shape[-1], 'tendon')}; "
             f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length{more}; "

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from scipy.interpolate import CubicSpline, PPoly
 from scipy.spatial.transform import Rotation, Slerp
 
-from knode_cosserat._files.limits import MORE, allowed
-from knode_cosserat._reprs import count_of, wrapped
+from knode_cosserat._files.limits import MORE, scaled_limit
+from knode_cosserat._reprs import count_of, wrap_lines
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
@@ -67,7 +67,7 @@ class Recording:
         bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies) or "none"
         sensors = "".join(f"; {sensor.topic}" for sensor in self.sensors)
         streams = [name for name in ("tension", "command") if getattr(self, name) is not None]
-        return wrapped(
+        return wrap_lines(
             f"Recording ({origin}): {self.end:.4g} s; {count_of(self.tendons, 'tendon')} "
             f"({', '.join(streams)}); bodies {bodies} of the length{sensors}; "
             f"{count_of(len(self.findings), 'finding')}; source: {self.source}"
@@ -220,7 +220,7 @@ class Recording:
         if not (dt > 0.0 and math.isfinite(dt)):
             raise RecordingError(f"dt is {dt}; allowed is a time step above 0 s")
         rows = math.floor((last - start) / dt + _SAME / dt) + 1 if last - start > -_SAME else 0
-        most = allowed(MOST_ROWS)
+        most = scaled_limit(MOST_ROWS)
         if not 0 < rows <= most:
             raise RecordingError(
                 f"{self.source}: no rows of {dt:g} s from {start:g} s on; everything is known from 0 to "

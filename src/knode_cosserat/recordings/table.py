@@ -26,7 +26,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat._files.yaml_text import did_you_mean, shown
+from knode_cosserat._files.yaml_text import did_you_mean, excerpt
 from knode_cosserat.recordings.config import (
     PLACE,
     TIME_UNITS,
@@ -82,7 +82,7 @@ class Table(NamedTuple):
         """Return a configuration that has also what the table states. Raises `RecordingError`."""
         simulated = self.metadata.get("simulated")
         if simulated not in (None, "true", "false"):
-            raise RecordingError(f"simulated is {shown(simulated)}; allowed is true or false")
+            raise RecordingError(f"simulated is {excerpt(simulated)}; allowed is true or false")
         if self.bodies:
             config = config.replace(position_unit="m", up=config.up or self.up)
         if config.simulated is None and simulated is not None:
@@ -162,7 +162,7 @@ def columns_of(table: pd.DataFrame, places: Sequence[int]) -> Float[np.ndarray, 
             numbers = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float, na_value=np.nan)
             row = int(np.argmax(~np.isfinite(numbers) & ~_is_missing(cells).to_numpy()))
             raise RecordingError(
-                f"row {row + 1}: {table.columns[place]} is {shown(str(cells.iloc[row]).strip())}; "
+                f"row {row + 1}: {table.columns[place]} is {excerpt(str(cells.iloc[row]).strip())}; "
                 "allowed is a finite number"
             )
     return table.iloc[:, list(places)].to_numpy(dtype=float)
@@ -226,7 +226,7 @@ def _metadata_numbers(key: str, metadata: Mapping[str, str]) -> tuple[float, ...
         return tuple(map(float, words))
     except ValueError:
         kind = "numbers (N)" if key == INITIAL else "a number"
-        raise RecordingError(f"{key} is {shown(metadata[key])}; allowed is {kind}") from None
+        raise RecordingError(f"{key} is {excerpt(metadata[key])}; allowed is {kind}") from None
 
 
 def position_titles(body: str, unit: str) -> list[str]:

@@ -34,7 +34,7 @@ from knode_cosserat.rods.system import Discontinuities, Scales, System, is_trace
 from knode_cosserat.rotation import cross, quaternion_of, quaternion_product
 
 
-def _changed(part: Any, **fields: Any) -> Any:
+def _copy(part: Any, **fields: Any) -> Any:
     """Return a copy with other fields, unchecked: where code is made, parameters are any numbers or none."""
     copy = object.__new__(type(part))
     for field in dataclasses.fields(part):
@@ -119,7 +119,7 @@ class Assembly(System):
     @functools.cached_property
     def members(self) -> tuple[SlenderRod, ...]:
         """Rods with the grid and the gravity of the assembly."""
-        return tuple(_changed(rod, nodes=self.nodes, gravity=self.gravity) for rod in self.rods)
+        return tuple(_copy(rod, nodes=self.nodes, gravity=self.gravity) for rod in self.rods)
 
     @property  # type: ignore[misc]
     def length(self) -> Any:
@@ -263,10 +263,10 @@ class Assembly(System):
     def placed(self, poses: Any) -> list[SlenderRod]:
         """Return the rods whose ends know the poses of their bodies, by name."""
         return [
-            _changed(
+            _copy(
                 rod,
                 **{
-                    name: _changed(end, frame=poses[end.body])
+                    name: _copy(end, frame=poses[end.body])
                     for name in ("base_end", "tip_end")
                     if (end := getattr(rod, name)).body in poses
                 },

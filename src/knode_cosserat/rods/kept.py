@@ -15,10 +15,10 @@ from knode_cosserat.rods.system import System, is_traced
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-_ENTRIES: dict[int, _Entry] = {}
+_ENTRIES: dict[int, _KeptResult] = {}
 
 
-class _Entry:
+class _KeptResult:
     """Results for one system."""
 
     def __init__(self, system: System):
@@ -50,7 +50,7 @@ def kept(function: Function) -> Function:
         if entry is None or not entry.fits(system):
             if is_traced(system):
                 return function(system, *arguments)
-            entry = _ENTRIES[id(system)] = _Entry(system)
+            entry = _ENTRIES[id(system)] = _KeptResult(system)
         key = function, *arguments
         if key not in entry.results:
             result = function(system, *arguments)

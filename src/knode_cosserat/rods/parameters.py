@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._files.yaml_text import did_you_mean, flow, shown
+from knode_cosserat._files.yaml_text import did_you_mean, excerpt, flow
 from knode_cosserat._reprs import object_text
 from knode_cosserat.errors import KnodeCosseratError
 
@@ -123,7 +123,7 @@ class Parameter:
             array = np.array("ragged")
         if array.dtype.kind not in "fiu":
             hint = self._hint_of_text(value) if isinstance(value, str) else ""
-            raise ParameterError(f"{name} must be {self.allowed} (got {text or shown(value)}){hint}")
+            raise ParameterError(f"{name} must be {self.allowed} (got {text or excerpt(value)}){hint}")
         text, size = text or numbers_text(array.tolist()), _SIZES.get(self.shape)
         if (array.ndim != 1 or array.size == 0) if size is None else array.shape != size:
             raise ParameterError(f"{name} must be {self.allowed} (got {text})")
@@ -165,7 +165,7 @@ class Parameter:
             array = np.diag(np.broadcast_to(array, 3))
         if array is None and not isinstance(value, str):
             array = np.asarray(None)
-        self.check(name, value if array is None else array, shown(value))
+        self.check(name, value if array is None else array, excerpt(value))
         return value
 
     def written(self, value: Any) -> str:
@@ -258,7 +258,7 @@ class Choice:
 
     def read(self, name: str, value: Any) -> Any:
         """Return a value of a file. Raises `ParameterError`."""
-        self.check(name, value, shown(value))
+        self.check(name, value, excerpt(value))
         return value
 
     def written(self, value: Any) -> str:
@@ -285,12 +285,12 @@ class _Text:
         """Raise `ParameterError` unless a value is a name."""
         if not isinstance(value, str) or not re.fullmatch(NAME, value):
             raise ParameterError(
-                f"{name} is {text or shown(value)}; allowed is a name of letters, digits, - and _"
+                f"{name} is {text or excerpt(value)}; allowed is a name of letters, digits, - and _"
             )
 
     def read(self, name: str, value: Any) -> Any:
         """Return a value of a file. Raises `ParameterError`."""
-        self.check(name, value, shown(value))
+        self.check(name, value, excerpt(value))
         return value
 
     def written(self, value: Any) -> str:
@@ -327,7 +327,7 @@ class _Slot:
         if not isinstance(value, list):
             known = ", ".join(kinds_of(self.family))
             raise ParameterError(
-                f"{name} is {shown(value)}; allowed is a list of mappings, each with a kind: {known}"
+                f"{name} is {excerpt(value)}; allowed is a list of mappings, each with a kind: {known}"
             )
         return tuple(self._part(f"{name}.{k}", one) for k, one in enumerate(value))
 
@@ -335,11 +335,11 @@ class _Slot:
         known = kinds_of(self.family)
         names = ", ".join(known)
         if not isinstance(value, dict) or "kind" not in value:
-            raise ParameterError(f"{name} is {shown(value)}; allowed is a mapping with a kind: {names}")
+            raise ParameterError(f"{name} is {excerpt(value)}; allowed is a mapping with a kind: {names}")
         kind = value["kind"]
         if not isinstance(kind, str) or kind not in known:
             hint = did_you_mean(kind, known)
-            raise ParameterError(f"{name}.kind is {shown(kind)}; allowed is {names}{hint}")
+            raise ParameterError(f"{name}.kind is {excerpt(kind)}; allowed is {names}{hint}")
         return read_object(known[kind], {key: value[key] for key in value if key != "kind"}, name)
 
     def flowed(self, value: Any) -> str:
@@ -571,7 +571,7 @@ def require_keys(mapping: Mapping[Any, Any], known: Iterable[str], required: Ite
     for key in mapping:
         if key not in known:
             raise ParameterError(
-                f"the key {shown(key)} is unknown; allowed is {', '.join(known)}{did_you_mean(key, known)}"
+                f"the key {excerpt(key)} is unknown; allowed is {', '.join(known)}{did_you_mean(key, known)}"
             )
     for key in required:
         if key not in mapping:
@@ -599,7 +599,7 @@ def read_object(cls: type, values: Mapping[Any, Any], name: str) -> Any:
         elif isinstance(value, int) and not isinstance(value, bool):
             fields[key] = value
         else:
-            raise ParameterError(f"{key} is {shown(value)}; allowed is a whole number, 2 or more")
+            raise ParameterError(f"{key} is {excerpt(value)}; allowed is a whole number, 2 or more")
     try:
         return cls(**fields)
     except ParameterError as error:

@@ -221,7 +221,7 @@ class Effect(Part):
 
 
 @functools.singledispatch
-def eased(system: Any, part: float) -> Any:
+def ease(system: Any, part: float) -> Any:
     """Return a system whose parts have near-discontinuities spread over 1/part of their width.
 
     Solvers use it as an intermediate problem when the direct solution fails. It is the system itself if no
@@ -231,9 +231,7 @@ def eased(system: Any, part: float) -> Any:
     for name in slots_of(type(system)):
         value = getattr(system, name)
         parts = value if isinstance(value, tuple) else (value,)
-        easier = tuple(
-            one.eased(part) if isinstance(one, Part) else one and eased(one, part) for one in parts
-        )
+        easier = tuple(one.eased(part) if isinstance(one, Part) else one and ease(one, part) for one in parts)
         if any(new is not old for new, old in zip(easier, parts, strict=True)):
             changes[name] = easier if isinstance(value, tuple) else easier[0]
     return system.replace(**changes) if changes else system

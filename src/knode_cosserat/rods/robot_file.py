@@ -26,7 +26,14 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
-from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, flow, mapping_of, read_yaml, shown
+from knode_cosserat._files.yaml_text import (
+    YAMLTextError,
+    did_you_mean,
+    excerpt,
+    flow,
+    mapping_of,
+    read_yaml,
+)
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods import chambers, fluids, frame, insertion, magnets  # noqa: F401 (files name their kinds)
 from knode_cosserat.rods.assembly import Assembly
@@ -195,27 +202,27 @@ def _robot(file: dict[Any, Any]) -> System:
     number = file.get("format", FORMATS[0])
     if isinstance(number, bool) or number not in FORMATS:
         raise ParameterError(
-            f"format is {shown(number)}; allowed is {' or '.join(map(str, FORMATS))}, "
+            f"format is {excerpt(number)}; allowed is {' or '.join(map(str, FORMATS))}, "
             "the formats that this version reads"
         )
     for key in file:
         if key not in KEYS and any(key in parameters_of(kind) for kind in KINDS.values()):
             raise ParameterError(
-                f"the key {shown(key)} is unknown; allowed is {', '.join(KEYS)}; "
+                f"the key {excerpt(key)} is unknown; allowed is {', '.join(KEYS)}; "
                 "a robot's parameters belong under the key parameters"
             )
     require_keys(file, KEYS, REQUIRED)
     for key in ("kind", "description"):
         if not isinstance(file.get(key, ""), str):
-            raise ParameterError(f"{key} is {shown(file[key])}; allowed is text")
+            raise ParameterError(f"{key} is {excerpt(file[key])}; allowed is text")
     # the machine around the rod, which drivers read
     if not isinstance(file.get("hardware", {}), dict | None):
-        raise ParameterError(f"hardware is {shown(file['hardware'])}; allowed is a mapping")
+        raise ParameterError(f"hardware is {excerpt(file['hardware'])}; allowed is a mapping")
     kind, values = file["kind"], file["parameters"]
     if kind not in KINDS:
         raise ParameterError(f"kind is {kind!r}; allowed is {', '.join(KINDS)}{did_you_mean(kind, KINDS)}")
     if not isinstance(values, dict):
-        raise ParameterError(f"parameters is {shown(values)}; allowed is a mapping from names to values")
+        raise ParameterError(f"parameters is {excerpt(values)}; allowed is a mapping from names to values")
     robot: System = read_object(KINDS[kind], values, "")
     return robot
 

@@ -185,12 +185,12 @@ class SlenderRod(System):
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]
         """Layout of y: that of the rod, then the parts' fields."""
-        return _joined(Y_LAYOUT, *(part.y_fields(self) for part in self.parts.values()))
+        return _join_layouts(Y_LAYOUT, *(part.y_fields(self) for part in self.parts.values()))
 
     @functools.cached_property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """Layout of z: that of the rod, then the parts' fields."""
-        return _joined(Z_LAYOUT, *(part.z_fields(self) for part in self.parts.values()))
+        return _join_layouts(Z_LAYOUT, *(part.z_fields(self) for part in self.parts.values()))
 
     @functools.cached_property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -428,7 +428,7 @@ class SlenderRod(System):
                 rates["m"] = rates["m"] - self.seen(t, load.moment)
             for name, rate in part.rates(at).items():
                 rates[name] = rates[name] + rate if name in rates else rate
-        y_s = jnp.concatenate(_ordered(rates, self.y_layout, 0))
+        y_s = jnp.concatenate(_order_fields(rates, self.y_layout, 0))
         return y_s * math.prod(part.arclength_rate(at) for part, at in parts)
 
     # discontinuities: places where something begins, ends or pulls
@@ -473,7 +473,7 @@ class SlenderRod(System):
         more: Fields = {}
         for part in self.parts.values():
             more |= part.rest_y(self, s)
-        y = jnp.concatenate([p, h, np.zeros(12), *_ordered(more, self.y_layout)])
+        y = jnp.concatenate([p, h, np.zeros(12), *_order_fields(more, self.y_layout)])
         return y, self.with_internal(jnp.concatenate([v, u]))
 
     def with_internal(self, strains: Float[Any, "6"]) -> Float[Any, " z"]:
@@ -481,7 +481,7 @@ class SlenderRod(System):
         z: Fields = {}
         for part in self.parts.values():
             z |= part.rest_z(self, strains)
-        return jnp.concatenate([strains, *_ordered(z, self.z_layout, 2)])
+        return jnp.concatenate([strains, *_order_fields(z, self.z_layout, 2)])
 
     def _rest_shape(self, base: Pose, s: Any) -> tuple[Any, Any, Any]:
         if not self.sections:
@@ -672,7 +672,7 @@ class RodObserved(Observed, of=SlenderRod):
         return jnp.concatenate([*stiffness, others]), jnp.concatenate([*damping, others])
 
 
-def _joined(layout: Layout, *parts: tuple[Any, ...]) -> Layout:
+def _join_layouts(layout: Layout, *parts: tuple[Any, ...]) -> Layout:
     """Return a layout with the fields of the parts. Raises `ParameterError` if two have the same name."""
     joined = Layout(*layout.fields, *(field for fields in parts for field in fields))
     for name in joined.names:
@@ -681,7 +681,7 @@ def _joined(layout: Layout, *parts: tuple[Any, ...]) -> Layout:
     return joined
 
 
-def _ordered(values: Fields, layout: Layout, first: int = 6) -> list[Any]:
+def _order_fields(values: Fields, layout: Layout, first: int = 6) -> list[Any]:
     """Return the values of a layout's fields from the `first` on, zero without one; `KeyError` for others."""
     for name in values:
         layout.slice(name)

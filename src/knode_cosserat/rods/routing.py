@@ -128,7 +128,7 @@ class Polynomial(Routing):
 
     def rate(self, sigma: Any) -> tuple[Any, Any]:
         """Return the polynomials' derivatives."""
-        return _horner(_derived(self.x), sigma), _horner(_derived(self.y), sigma)
+        return _horner(_derivative(self.x), sigma), _horner(_derivative(self.y), sigma)
 
 
 class FunctionRouting(Routing):
@@ -302,6 +302,6 @@ def _horner(coefficients: Any, sigma: Any) -> Any:
     return total
 
 
-def _derived(coefficients: Any) -> Any:
+def _derivative(coefficients: Any) -> Any:
     count = coefficients.shape[0]
     return coefficients[1:] * np.arange(1.0, count) if count > 1 else np.zeros(1)

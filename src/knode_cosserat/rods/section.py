@@ -23,7 +23,7 @@ from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, as_number, choice, known_size, parameter, places
 from knode_cosserat.rods.parts import Part, Stretched
 from knode_cosserat.rods.system import is_traced
-from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, turned
+from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, rotate
 
 #: d₃: along the rod
 ALONG = np.array([0.0, 0.0, 1.0])
@@ -47,7 +47,7 @@ def _angle() -> Any:
     return parameter("rad", "angle about the rod from x to its x axis", low=-10.0, high=10.0, default=0.0)
 
 
-def _tabulated(unit: str, meaning: str, low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
+def _table_field(unit: str, meaning: str, low: float, high: float, default: Any = dataclasses.MISSING) -> Any:
     """Return a field for values along the rod."""
     return parameter(unit, meaning, shape="list", low=low, high=high, default=default)
 
@@ -236,13 +236,13 @@ class TabulatedSection(CrossSection):
     kind: ClassVar[str] = "tabulated"
     is_homogeneous: ClassVar[bool] = False
 
-    bending_stiffness: Any = _tabulated("N m2", "E I about x", 1e-15, 1e9)
-    torsional_stiffness: Any = _tabulated("N m2", "G J", 1e-15, 1e9)
-    axial_stiffness: Any = _tabulated("N", "E A", 1e-9, 1e15)
-    mass_per_length: Any = _tabulated("kg/m", "mass per length", 1e-9, 1e6)
+    bending_stiffness: Any = _table_field("N m2", "E I about x", 1e-15, 1e9)
+    torsional_stiffness: Any = _table_field("N m2", "G J", 1e-15, 1e9)
+    axial_stiffness: Any = _table_field("N", "E A", 1e-9, 1e15)
+    mass_per_length: Any = _table_field("kg/m", "mass per length", 1e-9, 1e6)
     at: tuple[float, ...] | None = places("where the values are, in order")
-    bending_stiffness_y: Any = _tabulated("N m2", "E I about y; by default as about x", 1e-15, 1e9, None)
-    shear_stiffness: Any = _tabulated("N", "G A; by default E A / 2.6", 1e-9, 1e15, None)
+    bending_stiffness_y: Any = _table_field("N m2", "E I about y; by default as about x", 1e-15, 1e9, None)
+    shear_stiffness: Any = _table_field("N", "G A; by default E A / 2.6", 1e-9, 1e15, None)
     angle: Any = _angle()
     radius: Any = parameter(
         "m", "outer radius, for contact and drawings; by default of a round section with its E I and E A",
@@ -518,7 +518,7 @@ def shape_at_rest(
 
     def advance(pose: Pose, step: tuple[Any, Any]) -> tuple[Pose, None]:
         turn, way = step
-        return Pose(pose.p + turned(pose.h, way), quaternion_product(pose.h, turn)), None
+        return Pose(pose.p + rotate(pose.h, way), quaternion_product(pose.h, turn)), None
 
     pairs = (each.reshape(2, -1, 3).swapaxes(0, 1) for each in (v, u))
     return jax.lax.scan(advance, base, jax.vmap(step)(ds, *pairs))[0]

@@ -58,12 +58,12 @@ class Bundle(System):
     @property
     def y_layout(self) -> Layout:  # type: ignore[override]
         """The strand's layout of y, numbered for each rod."""
-        return numbered(self.strand_class.y_layout, self.strands)
+        return number_fields(self.strand_class.y_layout, self.strands)
 
     @property
     def z_layout(self) -> Layout:  # type: ignore[override]
         """The strand's layout of z, numbered for each rod."""
-        return numbered(self.strand_class.z_layout, self.strands)
+        return number_fields(self.strand_class.z_layout, self.strands)
 
     @property
     def base_unknowns(self) -> tuple[str, ...]:  # type: ignore[override]
@@ -88,7 +88,7 @@ def _(system: Bundle) -> System:
 
 
 @functools.lru_cache(maxsize=64)
-def numbered(layout: Layout, count: int) -> Layout:
+def number_fields(layout: Layout, count: int) -> Layout:
     """Return the fields of `count` strands with this layout."""
     return Layout(
         *(

@@ -167,7 +167,7 @@ def _columns(vectors: Float[Any, "c 3"]) -> tuple[Any, Any]:
     return tuple(jax.lax.index_in_dim(vectors, k, 1, keepdims=False) for k in range(2))  # type: ignore[return-value]
 
 
-def _turned(x: Float[Any, "6"], r: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
+def _attachment_motion(x: Float[Any, "6"], r: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
     """Return the components (c,) of Wᵢ x = v + u × rᵢ."""
     vx, vy, vz, ux, uy, uz = (jax.lax.index_in_dim(x, k, 0, keepdims=False) for k in range(6))
     rx, ry = _columns(r)
@@ -175,7 +175,7 @@ def _turned(x: Float[Any, "6"], r: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
 
 
 def _rates(x: Float[Any, "6"], r: Float[Any, "c 3"], r_s: Float[Any, "c 3"]) -> tuple[Any, Any, Any]:
-    (px, py, pz), (dx, dy) = _turned(x, r), _columns(r_s)
+    (px, py, pz), (dx, dy) = _attachment_motion(x, r), _columns(r_s)
     return px + dx, py + dy, pz
 
 
@@ -225,17 +225,17 @@ _in_turn = jax.lax.optimization_barrier
 
 def _turn(dx: Any, shorter: Any, r: Any) -> Any:
     """Return the rotation of a tendon by dx: the largest |Wᵢ dx|/|ṗᵢ|."""
-    turned = jnp.stack(_turned(dx, r)) * shorter
+    turned = jnp.stack(_attachment_motion(dx, r)) * shorter
     return jnp.sqrt(jnp.max(jnp.sum(turned * turned, axis=0)))
 
 
-def _unturned(law: TendonLaw) -> Float[Any, "6"]:
+def _initial_solution(law: TendonLaw) -> Float[Any, "6"]:
     """Return the solution with unrotated tendons: a better initial guess far from the unbent rod."""
     free = -_residual(np.zeros(6), *_levers(UNBENT, law.r, law.r_s), law)
     return jnp.concatenate([dot(inverse(law.K_v), free[:3]), dot(inverse(law.K_u), free[3:])])
 
 
-def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
+def _solve(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
     """Return the law's solution, starting from the unbent rod and tendons."""
     known = flexibility, law
 
@@ -253,7 +253,7 @@ def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
     def corrected(reached: Any) -> Any:
         """Return the next iterate of Newton's method, damped."""
         (count, x, _), (_, law) = _in_turn((reached, known))
-        x = jnp.where(count == 0, _unturned(law), x)
+        x = jnp.where(count == 0, _initial_solution(law), x)
         g, shorter = _levers(x, law.r, law.r_s)
         # slower than a written-out inverse, but quick to compile
         root = jnp.linalg.cholesky(_stiffness(g, shorter, law))
@@ -294,7 +294,7 @@ def _solved(flexibility: Any, law: TendonLaw) -> Float[Any, "6"]:
     return jnp.where(missing <= MISSING, x, jnp.nan)
 
 
-_solution = jax.custom_jvp(_solved)
+_solution = jax.custom_jvp(_solve)
 
 
 def _slope(primals: Any, tangents: Any) -> tuple[Any, Any]:

@@ -158,7 +158,7 @@ class LoadCells(Part):
     """Correction of measured tensions: true tension = gain * measured + offset, for each tendon.
 
     A tendon only pulls: a negative result is set to zero. `simulate` ignores the latency and applies the
-    controls without a delay; `undelayed` corrects a recording for it.
+    controls without a delay; `remove_delay` corrects a recording for it.
     """
 
     kind: ClassVar[str] = "load-cells"
@@ -196,7 +196,7 @@ class LoadCells(Part):
         return jnp.maximum(self.gain * measured + self.offset, 0.0)
 
 
-def undelayed(
+def remove_delay(
     system: Any, measured: Float[np.ndarray, "T c"], dt: float, before: Float[np.ndarray, " c"] | None = None
 ) -> Float[np.ndarray, "T c"]:
     """Return the controls that acted on a system, from measured ones that are held for `dt` (s) each.
@@ -494,7 +494,7 @@ class Vibration(Part):
 
 #: below this the series of √w cot √w is exact to rounding
 SMALL_PRESSURE = 1e-3
-#: argument of `pressed` at which a beam-column buckles
+#: argument of `stiffness_under_pressure` at which a beam-column buckles
 BUCKLED = 0.25 * np.pi**2
 
 
@@ -550,13 +550,15 @@ class RibSpacing(Part):
         separation = jnp.sqrt(half**2 + Kbt[0, 1] ** 2 + (1e-8 * mean) ** 2)
         principal = mean + separation * np.array([1.0, -1.0])
         softening = self.softening + self.softening_at(point.material_place / length) * length**2
-        lost = principal * (1.0 - pressed(3.0 * softening * jnp.sum(tension(point)) / principal))
+        lost = principal * (
+            1.0 - stiffness_under_pressure(3.0 * softening * jnp.sum(tension(point)) / principal)
+        )
         deviator = half * (ABOUT_X - ABOUT_Y) + Kbt[0, 1] * COUPLED
         loss = 0.5 * jnp.sum(lost) * ACROSS + 0.5 * (lost[0] - lost[1]) / separation * deviator
         return law.with_strain("u", law.strains["u"].soften(loss))
 
 
-def pressed(w: Any) -> Any:
+def stiffness_under_pressure(w: Any) -> Any:
     """Return √w cot √w for w ≥ 0: the remaining fraction of a beam-column's stiffness under pressure.
 
     Beyond π²/4, where it buckles, the fraction continues below zero along the tangent.

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
-from knode_cosserat.rods.parts import eased
+from knode_cosserat.rods.parts import ease
 from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import Discontinuities, System
 
@@ -116,7 +116,7 @@ def _(system: Wrapped) -> System:
     return system if strand_count(system) == 1 else system.around(strand_of(system.knowledge))
 
 
-@eased.register
+@ease.register
 def _(system: Wrapped, part: float) -> Wrapped:
-    easier = eased(system.knowledge, part)
+    easier = ease(system.knowledge, part)
     return system if easier is system.knowledge else system.around(easier)

@@ -68,7 +68,8 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
         return _JointStep([discrete_law(own, each, c0, h, size) for (own, each, size), h in parts], ends)
     if isinstance(law, InternalState):
         internal = {
-            name: evolved(evolution, layout.get(hz, name), c0) for name, evolution in law.evolutions.items()
+            name: integrate_variable(evolution, layout.get(hz, name), c0)
+            for name, evolution in law.evolutions.items()
         }
         return MaterialStep(law.law(internal), layout, c0, hz, internal, length)
     if isinstance(law, MaterialLaw):
@@ -78,7 +79,7 @@ def discrete_law(law: Any, layout: Layout, c0: Any, hz: Float[Any, " z"], length
     return _StatedStrains(law)
 
 
-def evolved(evolution: Evolution, h: Any, c0: Any) -> Any:
+def integrate_variable(evolution: Evolution, h: Any, c0: Any) -> Any:
     """Return an internal variable from its rate and history h; in an equilibrium, c0 = 0, its value at rest.
 
     The variable is kept within its bounds.
@@ -204,7 +205,7 @@ class MaterialStep:
             return elastic.strain()
         law = _NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
         # the search is not differentiated: one more correction has the derivatives of the implicit function
-        found = _searched(jax.lax.stop_gradient(law))
+        found = _search(jax.lax.stop_gradient(law))
         return found + law.correction(found)
 
     def _internal(self, strains: Fields) -> Fields:
@@ -218,7 +219,7 @@ class MaterialStep:
         if self.law.internal is not None:
             rates = {name: self._rate(name, value) for name, value in strains.items()}
             for name, evolution in self.law.internal(strains, rates).items():
-                found[name] = evolved(evolution, self.history[name], self.c0)
+                found[name] = integrate_variable(evolution, self.history[name], self.c0)
         return found
 
 
@@ -269,7 +270,7 @@ class _NonlinearStrain(NamedTuple):
         return -dot(inverse(jax.jacfwd(self.residual)(strain)), self.residual(strain))
 
 
-def _searched(law: _NonlinearStrain) -> Float[Any, "3"]:
+def _search(law: _NonlinearStrain) -> Float[Any, "3"]:
     """Return the strain by Newton's method with a line search; NaN if it does not converge."""
     moving = law.c0 > 0.0
     # without sliding, friction does not make the first corrections overshoot

@@ -87,8 +87,8 @@ class Grid:
         if not len(self.between):
             return values
         part = self.bounds[:, 0].reshape(-1, *(1 for _ in values.shape[1:]))
-        start, end = (taken(values, self.segment + k) for k in (0, 1))
-        return _joined([start + part * (end - start), values[-1:]])
+        start, end = (take_rows(values, self.segment + k) for k in (0, 1))
+        return _join([start + part * (end - start), values[-1:]])
 
     @functools.cached_property
     def lengths(self) -> Float[np.ndarray, " pieces"]:
@@ -173,7 +173,7 @@ def at_places(system: System, space: SpaceScheme, records: Float[Any, "nodes x"]
             grid_of(system, space).stencils, (records[:, :ny], records[:, ny:]), strict=True
         )
     ]
-    return _joined(found, axis=-1)
+    return _join(found, axis=-1)
 
 
 def inside(s: Any, low: Any, high: Any) -> Any:
@@ -182,15 +182,15 @@ def inside(s: Any, low: Any, high: Any) -> Any:
     return array_module(s).clip(s, low + margin, high - margin)
 
 
-def taken(values: Any, rows: np.ndarray) -> Any:
+def take_rows(values: Any, rows: np.ndarray) -> Any:
     """Return rows of an array by known indices; runs of neighbours are copied as a whole."""
     if not len(rows):
         return values[:0]
     runs = np.split(rows, np.flatnonzero(np.diff(rows) != 1) + 1)
     found = [values[run[0] : run[-1] + 1] for run in runs]
-    return found[0] if len(found) == 1 else _joined(found)
+    return found[0] if len(found) == 1 else _join(found)
 
 
-def _joined(parts: list[Any], axis: int = 0) -> Any:
+def _join(parts: list[Any], axis: int = 0) -> Any:
     """Return arrays as one; by NumPy outside of JAX's transformations, where each shape would be compiled."""
     return array_module(parts).concatenate(parts, axis=axis)

@@ -20,7 +20,7 @@ from knode_cosserat.schemes.problem import no_history
 from knode_cosserat.schemes.result import Result
 from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
-from knode_cosserat.schemes.time import BDF1, padded
+from knode_cosserat.schemes.time import BDF1, pad_coefficients
 
 #: number of earlier states in the first guess of a step, and the extrapolations in time (constant, linear,
 #: quadratic) of which the guess is the weighted mean
@@ -90,7 +90,7 @@ def coefficient_table(settings: Settings, dt: float, known: int = 1) -> np.ndarr
         schemes = [BDF1(), *schemes[1:]]
     steps = [dt] * (settings.memory - 1)
     rows = [scheme.coefficients(dt, *steps) for scheme in (*schemes, settings.time)]
-    return np.array([padded(row, settings.memory) for row in rows])
+    return np.array([pad_coefficients(row, settings.memory) for row in rows])
 
 
 def at_stages(system: System, settings: Settings, controls: Any, before: Any, sudden: bool) -> Any:
@@ -122,7 +122,7 @@ def history_of(states: Any, rate: Any, coefficients: Any, settings: Settings) ->
     return history + d1 * rate if settings.uses_rate else history
 
 
-def advanced(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
+def advance_history(past: StateHistory, records: Any, rate: Any, y: Any, weights: Any) -> StateHistory:
     """Return the history of the next step."""
     numeric = array_module((past, records, rate, y))
     records, y = numeric.stack([records, *past.records[:-1]]), numeric.concatenate([y[None], past.y[:-1]])

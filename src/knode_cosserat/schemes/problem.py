@@ -24,7 +24,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.strands import in_strands, strand_count, strand_of
 from knode_cosserat.rods.system import System, array_module
 from knode_cosserat.schemes import semi_discrete
-from knode_cosserat.schemes.grid import Grid, grid_of, taken
+from knode_cosserat.schemes.grid import Grid, grid_of, take_rows
 from knode_cosserat.schemes.semi_discrete import History, Point, records_in_strands, unpacked_history
 from knode_cosserat.schemes.space import Formula, SpaceScheme
 
@@ -44,7 +44,7 @@ def row_of(
     """Return the row of a solved step: y on the near side of discontinuities, z and y_s on the far side."""
     nodes, ny = grid_of(system).nodes, system.y_layout.size
     numeric = array_module((y, records))
-    return numeric.concatenate([taken(y, nodes), taken(records, nodes)[:, ny:]], axis=1)
+    return numeric.concatenate([take_rows(y, nodes), take_rows(records, nodes)[:, ny:]], axis=1)
 
 
 def places_of(system: System, space: SpaceScheme) -> Float[Any, " places"]:
@@ -154,7 +154,7 @@ class StepProblem(eqx.Module):
     def at_ends(self, values: Any) -> tuple[Any, Any]:
         """Return values at the starts and at the ends of pieces; 0 at the ends if they were not evaluated."""
         grid = self.grid
-        end = taken(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
+        end = take_rows(values, grid.end_of) if len(values) > grid.tip else jnp.zeros(())
         return values[: grid.tip], end
 
     def stages(self, y: Float[Any, "points y"], formula: Formula, known: _Stages | None = None) -> _Stages:
@@ -176,7 +176,7 @@ class StepProblem(eqx.Module):
         """Evaluate the equations at the ends of pieces: at `every` end, or at those that the scheme uses."""
         grid, ends = self.grid, self.far(y)
         if every or self.space.implicit:
-            ends = jnp.concatenate([ends, y[-1:], taken(y, grid.near)])
+            ends = jnp.concatenate([ends, y[-1:], take_rows(y, grid.near)])
         f, z = self._evaluated(slice(0, len(ends)), ends)
         return _Stages([ends], [f], [z])
 

@@ -89,8 +89,8 @@ def derivatives(system: System, point: Point) -> tuple[Float[Any, " y"], Float[A
     if strand_count(system) > 1:
         return _of_strands(system, point)
     z = law(system, point).strains()
-    added, corrected = _corrected(system, point, z)
-    return _balanced(system, point, z) + added, corrected
+    added, corrected = _add_corrections(system, point, z)
+    return _solve_balance(system, point, z) + added, corrected
 
 
 def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[Any, " z"]]:
@@ -104,7 +104,7 @@ def _of_strands(system: System, point: Point) -> tuple[Float[Any, " y"], Float[A
     return y_s.reshape(-1), z.reshape(-1)
 
 
-def _corrected(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
+def _add_corrections(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
     """Return the corrections of y_s, and z with its corrections, from z of the law."""
     added: Any = 0.0
     for correction in corrections_of(system):
@@ -145,12 +145,12 @@ def strains(system: System, point: Point) -> Float[Any, " z"]:
     """Return z at one point."""
     if strand_count(system) > 1:
         return _of_strands(system, point)[1]
-    return _corrected(system, point, law(system, point).strains())[1]
+    return _add_corrections(system, point, law(system, point).strains())[1]
 
 
 def law_residual(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " z"]:
     """Return the residual of the law of z, at any z less the corrections of the law's z."""
-    _, z = _uncorrected(system, point, z)
+    _, z = _subtract_corrections(system, point, z)
     return law(system, point).residual(z)
 
 
@@ -158,20 +158,20 @@ def rates(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]
     """Return y_s at one point, for any z; with several strands, for the z of their law."""
     if strand_count(system) > 1:
         return _of_strands(system, point)[0]
-    added, z = _uncorrected(system, point, z)
-    return _balanced(system, point, z) + added
+    added, z = _subtract_corrections(system, point, z)
+    return _solve_balance(system, point, z) + added
 
 
-def _uncorrected(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
+def _subtract_corrections(system: System, point: Point, z: Float[Any, " z"]) -> tuple[Any, Float[Any, " z"]]:
     """Return the corrections of y_s at the law's z, and a given z less the corrections there."""
     if not corrections_of(system):
         return 0.0, z
     of_law = law(system, point).strains()
-    added, corrected = _corrected(system, point, of_law)
+    added, corrected = _add_corrections(system, point, of_law)
     return added, z - (corrected - of_law)
 
 
-def _balanced(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
+def _solve_balance(system: System, point: Point, z: Float[Any, " z"]) -> Float[Any, " y"]:
     """Return y_s of the balance."""
     balance = _balance(system, point, z)
     if not isinstance(balance, tuple):

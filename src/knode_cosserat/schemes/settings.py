@@ -112,8 +112,8 @@ class Settings:
     def described(self) -> dict[str, Any]:
         """Return the settings as plain data, for a file: schemes by class name and options."""
         return {
-            "time": _described(self.time),
-            "space": _described(self.space),
+            "time": _describe(self.time),
+            "space": _describe(self.space),
             "start": self.start,
             "newton": dataclasses.asdict(self.newton),
             "between": self.between,
@@ -125,8 +125,8 @@ class Settings:
         """Return settings from plain data; `KeyError`, `TypeError` or `ValueError` if it is not valid."""
         time = described["time"]
         return cls(
-            time=None if time is None else _named(TimeScheme, **time),
-            space=_named(SpaceScheme, **described["space"]),
+            time=None if time is None else _scheme_class(TimeScheme, **time),
+            space=_scheme_class(SpaceScheme, **described["space"]),
             start=described["start"],
             newton=NewtonOptions(**described["newton"]),
             between=described["between"],
@@ -139,7 +139,7 @@ class Settings:
 MEASURED = Settings(BDF2(), start="paper")
 
 
-def _described(scheme: Any) -> dict[str, Any] | None:
+def _describe(scheme: Any) -> dict[str, Any] | None:
     return None if scheme is None else {"scheme": type(scheme).__name__, **dataclasses.asdict(scheme)}
 
 
@@ -158,7 +158,7 @@ def _scheme(what: str, given: Any, kind: Any) -> Any:
     raise ValueError(f"{what} is {given!r}; allowed is {names}, or a {kind.__name__}")
 
 
-def _named(base: type, *, scheme: str, **options: Any) -> Any:
+def _scheme_class(base: type, *, scheme: str, **options: Any) -> Any:
     """Return a scheme by its class name, from the package or defined by the user."""
     ours_last = sorted(_subclasses(base), key=lambda cls: cls.__module__.startswith("knode_cosserat."))
     known = {cls.__name__: cls for cls in ours_last}

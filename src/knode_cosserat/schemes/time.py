@@ -183,7 +183,7 @@ LIGHTLY_DAMPED = BDFAlpha(-0.45)
 TWO_STAGES = SDIRK2()
 
 
-def padded(coefficients: Coefficients, memory: int) -> Coefficients:
+def pad_coefficients(coefficients: Coefficients, memory: int) -> Coefficients:
     """Return the coefficients of a step with zeros for earlier states that its scheme does not use."""
     *earlier, d1 = coefficients
     return *earlier, *[0.0] * (memory + 1 - len(earlier)), d1

@@ -21,7 +21,7 @@ from knode_cosserat.schemes.settings import NewtonOptions, Settings
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.energy import is_tested
 from knode_cosserat.solvers.guess import state_from_positions
-from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refined, resampled
+from knode_cosserat.solvers.refinement import Solved, has_chosen, mark_unseen, refine, resample
 from knode_cosserat.solvers.rest import unloaded_shape
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import (
@@ -36,8 +36,8 @@ from knode_cosserat.solvers.simulate import (
     check_initial,
     check_tolerance,
     checked_controls,
-    marked,
-    stacked,
+    mark_extrapolated,
+    stack_robots,
 )
 from knode_cosserat.solvers.small_motion import stable_near, verdicts
 from knode_cosserat.solvers.static_run import static_batch, static_run
@@ -92,11 +92,11 @@ def equilibrium(
     control = _checked_control(robot, control)
     check_tolerance(robot, initial, position_tolerance)
     solve = functools.partial(
-        _solved, controls=control[..., None, :], settings=Settings.of(None, space, "paper", newton),
+        _solve, controls=control[..., None, :], settings=Settings.of(None, space, "paper", newton),
         initial=initial, recovery_budget=recovery_budget, on_failure=on_failure,
         with_stability=with_stability,
     )  # fmt: skip
-    return refined(solve, robot, solve.keywords["settings"].space, position_tolerance)
+    return refine(solve, robot, solve.keywords["settings"].space, position_tolerance)
 
 
 def equilibria(
@@ -130,25 +130,25 @@ def equilibria(
     """
     check_arguments(equilibria, locals())
     # refuses what is no robot
-    stacked(robot)
+    stack_robots(robot)
     solve = functools.partial(
-        _solved, controls=controls, settings=Settings.of(None, space, "paper", newton), initial=initial,
+        _solve, controls=controls, settings=Settings.of(None, space, "paper", newton), initial=initial,
         recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
     )  # fmt: skip
-    return refined(solve, robot, solve.keywords["settings"].space)
+    return refine(solve, robot, solve.keywords["settings"].space)
 
 
-def _solved(
+def _solve(
     robot: Any, controls: Any, settings: Settings, initial: Any, recovery_budget: float | None,
     on_failure: str, with_stability: bool,
 ) -> Solved[Trajectory]:  # fmt: skip
     """Return the equilibria of a robot or a batch on its grid; arguments as in `equilibria`."""
-    system, batch = stacked(robot)
+    system, batch = stack_robots(robot)
     controls, batch = checked_controls(system, controls, batch)
     if initial is not None and not isinstance(initial, Trajectory):
         initial = _guess(robot, initial, controls[(0,) * (np.ndim(controls) - 1)])
     elif initial is not None and isinstance(robot, System) and has_chosen(robot):
-        initial = resampled(initial, robot)
+        initial = resample(initial, robot)
     if initial is not None:
         check_initial(system, initial, batch)
     bare = without_range(system)
@@ -161,7 +161,7 @@ def _solved(
         rest = unloaded_shape(bare, settings.space) if y is None else y
         if batch and rest.ndim == 2:
             rest = jnp.broadcast_to(rest, (batch, *rest.shape))
-        rows = mark_unseen(system, _traced(bare, controls, rest, task, Pattern.of(bare)))
+        rows = mark_unseen(system, _solve_traced(bare, controls, rest, task, Pattern.of(bare)))
         tested: Any = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
     else:
         rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
@@ -184,11 +184,11 @@ def _solved(
     found = Trajectory(
         system, settings, time, control=controls, **rows_of(system, rows), stability=tested
     )  # fmt: skip
-    return Solved.of(marked(found, None), said)
+    return Solved.of(mark_extrapolated(found, None), said)
 
 
 @functools.partial(jax.jit, static_argnames=("task", "pattern"))
-def _traced(system, controls, y, task, pattern):  # type: ignore[no-untyped-def]
+def _solve_traced(system, controls, y, task, pattern):  # type: ignore[no-untyped-def]
     """Solve inside JAX's transformations: without recovery; unsolved rows become NaN."""
     run: Any = static_rollout(task, pattern)
     if np.ndim(controls) == 3:
@@ -197,7 +197,7 @@ def _traced(system, controls, y, task, pattern):  # type: ignore[no-untyped-def]
 
 
 def _checked_control(robot: Any, control: Any) -> Any:
-    layout = stacked(robot)[0].control_layout
+    layout = stack_robots(robot)[0].control_layout
     if control is None:
         if layout.size:
             raise ValueError(f"control is None; allowed is ({layout.size},): {', '.join(layout.labels)}")

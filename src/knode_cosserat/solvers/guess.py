@@ -195,9 +195,11 @@ def state_from_positions(
     if hasattr(system, "material"):
         material = materials(system, s * float(system.length), np.asarray(control))
         u_rest = np.asarray(material.u_star)
-    h = _carried(record[0, y_layout.slice("h")] if base is None or base.h is None else base.h, tangent)
+    h = _transport_frames(
+        record[0, y_layout.slice("h")] if base is None or base.h is None else base.h, tangent
+    )
     spin = (0.0 if tip is None else tip.spin) - (0.0 if base is None else base.spin)
-    h = _twisted(h, None if tip is None else tip.h, u_rest[:, 2] * float(system.length), spin)
+    h = _twist_frames(h, None if tip is None else tip.h, u_rest[:, 2] * float(system.length), spin)
     frames = rotations(h)
     between = (frames[:-1].inv() * frames[1:]).as_rotvec() / (float(system.length) / (system.nodes - 1))
     u = np.concatenate([between[:1], 0.5 * (between[:-1] + between[1:]), between[-1:]])
@@ -237,7 +239,7 @@ def rotations(h: Any) -> Any:
     return Rotation.from_quat(np.roll(h, -1, axis=-1))
 
 
-def _carried(base: Any, tangents: Any) -> Any:
+def _transport_frames(base: Any, tangents: Any) -> Any:
     """Return twist-free orientations (quaternions, scalar first) along tangents, starting at the base's."""
     from scipy.spatial.transform import Rotation
 
@@ -263,7 +265,7 @@ def continuous(h: Float[np.ndarray, "nodes 4"]) -> Float[np.ndarray, "nodes 4"]:
     return h * np.cumprod(np.concatenate([[1.0], signs]))[:, None]
 
 
-def _twisted(h: Any, tip: Any, rate: Any, spin: float) -> Any:
+def _twist_frames(h: Any, tip: Any, rate: Any, spin: float) -> Any:
     """Return orientations twisted about their tangents as at rest, and then evenly to meet the tip's.
 
     `rate` is the twist at rest (rad over the whole length) at the nodes. Of the windings that meet the tip's

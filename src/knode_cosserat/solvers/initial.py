@@ -18,7 +18,13 @@ from knode_cosserat.schemes.history import EXTRAPOLATIONS, SolverState
 from knode_cosserat.schemes.problem import no_history, row_of
 from knode_cosserat.schemes.result import Result, SimulationError
 from knode_cosserat.schemes.settings import Settings
-from knode_cosserat.solvers.replay import at_one_state, carried, history_settings, replay, state_of_rows
+from knode_cosserat.solvers.replay import (
+    at_one_state,
+    change_at_places,
+    history_settings,
+    replay,
+    state_of_rows,
+)
 from knode_cosserat.solvers.rest import SOLVED, rest_record, resting_history, unloaded_shape
 from knode_cosserat.solvers.rollout import static_rollout
 from knode_cosserat.solvers.run import InitialState, TimeIntegration, failure, warn_of_results
@@ -103,7 +109,7 @@ def initial_state(
     result: Any = int(Result.CONVERGED)
     control = np.zeros(system.control_layout.size) if held is None else np.asarray(held, dtype=float)
     if held is not None or Ends.of(system).rest_is_guess:
-        record, result = _settled(system, settings, recovery_budget, control)
+        record, result = _settle(system, settings, recovery_budget, control)
         history = at_one_state(system, made, record, control)
     else:
         record, history = rest_record(system), resting_history(system, made)
@@ -115,7 +121,7 @@ def initial_state(
     return InitialState(found[0], np.broadcast_to(control, shape).copy(), *found[1:])
 
 
-def _settled(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
+def _settle(system: System, settings: Settings, budget: float | None, control: Any) -> tuple[Any, Any]:
     """Return y and z of the equilibrium under a control, and COARSE or CONVERGED."""
     many, held = np.ndim(system.length) > 0, control[None]
     task = TimeIntegration(Settings(None, settings.space, newton=settings.newton), recovery_budget=budget)
@@ -202,6 +208,6 @@ def _last_state(system: System, initial: Trajectory, settings: Settings, record:
     # the row may have been changed since; rates are unchanged
     history = state.history
     change = record - row_of(system, history.y[0], history.records[0])[:, : record.shape[1]]
-    shift = carried(system, settings.space, change)
+    shift = change_at_places(system, settings.space, change)
     y = history.y + grid_of(system).spread(change[:, : system.y_layout.size])
     return dataclasses.replace(state, history=history._replace(records=history.records + shift, y=y))

@@ -18,14 +18,14 @@ from knode_cosserat.engine import loops as engine
 from knode_cosserat.engine.pattern import values_along
 from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.kept import kept
-from knode_cosserat.rods.parts import eased
+from knode_cosserat.rods.parts import ease
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.schemes import history
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.result import Result
 from knode_cosserat.schemes.settings import Settings
-from knode_cosserat.schemes.time import BDF1, BDF2, padded
+from knode_cosserat.schemes.time import BDF1, BDF2, pad_coefficients
 from knode_cosserat.solvers.guess import (
     LARGEST_JUMP,
     LARGEST_TURN,
@@ -237,12 +237,12 @@ class Recovery(abc.ABC):
     def ease(self, control: Any) -> SolvedStep | None:
         """Continue from eased friction and contact to the system's own."""
         system = self.system
-        easiest = eased(system, EASIEST)
+        easiest = ease(system, EASIEST)
         if easiest is system:
             return None
 
         def at_part(part: float, y: Any) -> SolvedStep:
-            easier = eased(system, EASIEST ** (1.0 - part)) if part < 1.0 else system
+            easier = ease(system, EASIEST ** (1.0 - part)) if part < 1.0 else system
             return self.solve(control, y, system=easier)
 
         return self._in_parts(lambda guess: self.solve(control, guess, system=easiest), at_part)
@@ -332,7 +332,7 @@ class StepRecovery(Recovery):
         scheme = settings.time if settings.start == "paper" and settings.stages == 1 else BDF1()
         for _ in range(MOST_SUBSTEPS):
             until = min(1.0, reached + part)
-            coefficients = padded(scheme.coefficients((until - reached) * dt, *previous), memory)
+            coefficients = pad_coefficients(scheme.coefficients((until - reached) * dt, *previous), memory)
             step = history.TimeStep(past, coefficients, float(self.step.t) - (1.0 - until) * dt)
             substep = StepRecovery(self.system, settings, step, dt, self.budget)
             found = substep.direct(before + until * (now - before), ease=part < EASE_BELOW)
@@ -390,7 +390,7 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
         )  # fmt: skip
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
-    one = history.TimeStep(step.past, padded(BDF1().coefficients(dt), settings.memory), step.t[-1])
+    one = history.TimeStep(step.past, pad_coefficients(BDF1().coefficients(dt), settings.memory), step.t[-1])
     # without direct methods: a whole step of one stage would be another scheme's
     divided = StepRecovery(system, settings, one, dt, budget)
     solved = divided.recover((before[-1], now[-1]), has_direct=False)

@@ -51,7 +51,7 @@ class Solved(NamedTuple, Generic[Found]):
         return Solved(found, found.result, found.position_error, warnings, undecided)
 
 
-def refined(
+def refine(
     solve: Callable[[Any], Solved[Found]], robot: Any, space: SpaceScheme, tolerance: float | None = None,
     stays: bool = False,
 ) -> Found:  # fmt: skip
@@ -146,12 +146,12 @@ def on_grid(robot: Any, nodes: int) -> Any:
     return [on_grid(one, nodes) for one in robot]
 
 
-def fixed(system: System) -> System:
+def fix_grid(system: System) -> System:
     """Return a system whose nodes stay, for functions that keep to its grid."""
     return on_grid(system, int(system.nodes)) if has_chosen(system) else system
 
 
-def resampled(initial: Trajectory, system: System) -> Trajectory:
+def resample(initial: Trajectory, system: System) -> Trajectory:
     """Return the last row of a trajectory, as a guess on the grid of a system."""
     nodes = initial.y.shape[-2]
     if nodes == system.nodes:

@@ -20,7 +20,7 @@ from knode_cosserat.schemes.history import (
     SolverState,
     StateHistory,
     StepCoefficients,
-    advanced,
+    advance_history,
     at_stages,
     history_of,
     repeated_record_history,
@@ -177,12 +177,14 @@ def _along(
         terms[i] = history_of(past.records, past.rate, coefficients, settings)
         found = evaluate(coefficients[0], t, control, terms[i], row[:, : system.y_layout.size])
         change = row - row_of(system, found.y, found.records)[:, : row.shape[1]]
-        records = found.records + carried(system, settings.space, change)
-        past = advanced(past, records, coefficients[0] * records + terms[i], found.y, past.weights)
+        records = found.records + change_at_places(system, settings.space, change)
+        past = advance_history(past, records, coefficients[0] * records + terms[i], found.y, past.weights)
     return past._replace(t0=t0 + count // stages * steps.dt), terms
 
 
-def carried(system: System, space: SpaceScheme, change: Float[Any, "nodes x"]) -> Float[Any, "places more"]:
+def change_at_places(
+    system: System, space: SpaceScheme, change: Float[Any, "nodes x"]
+) -> Float[Any, "places more"]:
     """Return a change of y and z at the nodes as a change of the records at all places; y_s is unchanged."""
     width = no_history(system, space).shape[-1] - change.shape[1]
     numeric = array_module(change)

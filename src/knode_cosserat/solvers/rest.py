@@ -25,14 +25,14 @@ from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
 SOLVED = 2e-8
 
 
-def unloaded(
+def unloaded_state(
     system: System, space: SpaceScheme
 ) -> tuple[Float[Any, "... nodes x"], Float[Any, "... places x"]]:
     """Return y and z of the unloaded system, or of a batch of robots, at the nodes and at all places."""
     along = np.concatenate([np.linspace(0.0, 1.0, system.nodes), grid_of(system, space).along])
     if is_traced(system):
         if np.ndim(system.length):
-            return map_robots(lambda one: unloaded(one, space), system)
+            return map_robots(lambda one: unloaded_state(one, space), system)
         found: Any = jnp.concatenate(jax.vmap(system.rest)(along * system.length), axis=1)
     else:
         rest = values_along(_rest, system, np.multiply.outer(system.length, along))
@@ -42,7 +42,7 @@ def unloaded(
 
 def unloaded_shape(system: System, space: SpaceScheme) -> Any:
     """Return y at all points (points, y) of the unloaded robot, or of a batch of robots."""
-    return unloaded(system, space)[1][..., : grid_of(system).tip + 1, : system.y_layout.size]
+    return unloaded_state(system, space)[1][..., : grid_of(system).tip + 1, : system.y_layout.size]
 
 
 def map_robots(function: Callable[..., Any], system: System, *arguments: Any) -> Any:
@@ -62,7 +62,7 @@ def _rest(system: System, s: Any, _: Any) -> Any:
 @kept
 def rest_record(system: System) -> Float[Any, "... nodes x"]:
     """Return y and z (nodes, y + z) of the system at rest, or of a batch of robots."""
-    return unloaded(system, LOBATTO2)[0]
+    return unloaded_state(system, LOBATTO2)[0]
 
 
 @kept
@@ -75,7 +75,7 @@ def resting_history(system: System, settings: Settings) -> StateHistory:
             return constant_history(one, settings, rest_record(one), control)
 
         return map_robots(begun, system) if np.ndim(system.length) else begun(system)
-    _, records = unloaded(system, settings.space)
+    _, records = unloaded_state(system, settings.space)
     y = records[..., : grid_of(system).tip + 1, : system.y_layout.size]
     return repeated_record_history(system, settings, records, y, 0.0)
 

@@ -93,20 +93,20 @@ def _primitive(
     return primitive
 
 
-def _spread(x: Any, axis: Any, size: int) -> Any:
+def _batch_first(x: Any, axis: Any, size: int) -> Any:
     """Return an array with its batch as first axis, which it may not have."""
     if axis is None:
         return jnp.broadcast_to(x, (size, *np.shape(x)))
     return jnp.moveaxis(x, axis, 0)
 
 
-def _joined(x: Any, robots: int) -> Any:
+def _join(x: Any, robots: int) -> Any:
     """Return an array (batch, robots or 1, ...) with one axis for both."""
     size = x.shape[0]
     return jnp.broadcast_to(x, (size, robots, *x.shape[2:])).reshape(size * robots, *x.shape[2:])
 
 
-def _divided(x: Any, robots: int) -> Any:
+def _divide(x: Any, robots: int) -> Any:
     """Return an array with its first axis divided into a batch and robots."""
     return x.reshape(x.shape[0] // robots, robots, *x.shape[1:])
 
@@ -118,7 +118,7 @@ def _as_robots(spec: Solves, operands: Arrays, axes: Arrays, robots: int) -> lis
         axis is None and x.shape[0] == 1 for x, axis in zip(operands, axes[: spec.leaves], strict=False)
     )
     return [
-        x if shared and k < spec.leaves else _joined(_spread(x, axis, size), robots)
+        x if shared and k < spec.leaves else _join(_batch_first(x, axis, size), robots)
         for k, (x, axis) in enumerate(zip(operands, axes, strict=True))
     ]
 
@@ -152,7 +152,7 @@ solve_p = _primitive("solve", _solved_shapes, _core_of_solves, _solve)
 def _batched_solve(operands: Arrays, axes: Arrays, *, spec: Solves) -> Any:
     robots = _robots(operands[spec.leaves], axes[spec.leaves])
     found = solve_p.bind(*_as_robots(spec, operands, axes, robots), spec=spec)
-    return [_divided(x, robots) for x in found], [0] * len(found)
+    return [_divide(x, robots) for x in found], [0] * len(found)
 
 
 def _robots(x: Any, axis: Any) -> int:
@@ -258,12 +258,12 @@ def _batched_linear(primitive: Primitive, operands: Arrays, axes: Arrays, *, spe
         size = next(np.shape(x)[axis] for x, axis in zip(operands, axes, strict=True) if axis is not None)
         columns = []
         for x, axis in zip(operands[n:], axes[n:], strict=True):
-            own = jnp.moveaxis(_spread(x, axis, size), 0, 1)
+            own = jnp.moveaxis(_batch_first(x, axis, size), 0, 1)
             columns.append(own.reshape(robots, size * own.shape[2], *own.shape[3:]))
         found = primitive.bind(*operands[:n], *columns, spec=spec)
         return [x.reshape(robots, size, x.shape[1] // size, *x.shape[2:]) for x in found], [1] * len(found)
     found = primitive.bind(*_as_robots(spec, operands, axes, robots), spec=spec)
-    return [_divided(x, robots) for x in found], [0] * len(found)
+    return [_divide(x, robots) for x in found], [0] * len(found)
 
 
 def _tangents_of_linear(primitive: Primitive, primals: Arrays, tangents: Arrays, *, spec: Solves) -> Any:
@@ -276,7 +276,7 @@ def _tangents_of_linear(primitive: Primitive, primals: Arrays, tangents: Arrays,
     return found, primitive.bind(*primals[:n], *moved, spec=spec)
 
 
-def _transposed(other: Primitive, cotangents: Arrays, *operands: Any, spec: Solves) -> list[Any]:
+def _transpose(other: Primitive, cotangents: Arrays, *operands: Any, spec: Solves) -> list[Any]:
     n = _residuals(spec)
     given = [ad.instantiate_zeros(each) for each in cotangents]
     return [None] * n + list(other.bind(*operands[:n], *given, spec=spec))
@@ -285,7 +285,7 @@ def _transposed(other: Primitive, cotangents: Arrays, *operands: Any, spec: Solv
 for _one, _other in ((push_p, pull_p), (pull_p, push_p)):
     batching.primitive_batchers[_one] = functools.partial(_batched_linear, _one)
     ad.primitive_jvps[_one] = functools.partial(_tangents_of_linear, _one)
-    ad.primitive_transposes[_one] = functools.partial(_transposed, _other)
+    ad.primitive_transposes[_one] = functools.partial(_transpose, _other)
 
 
 # differentiable functions
@@ -302,18 +302,18 @@ def rollout(
 
     @jax.custom_jvp
     def run(system: System, controls: Any, past: StateHistory) -> tuple[StepRows, StateHistory]:
-        done, found, rows = _solved(Solves(task, pattern), system, controls, past)
+        done, found, rows = _solve_primitive(Solves(task, pattern), system, controls, past)
         last = StateHistory(*found)._replace(t0=past.t0 + task.steps * task.dt)
         return rows, jax.tree.map(lambda x: jnp.where(done < task.steps, jnp.nan, x), last)
 
     def tangent(primals: Any, tangents: Any) -> Any:
         rows, last = run(*primals)
-        d_past = jax.tree.map(_instantiated, tangents[2], is_leaf=_is_zero)
+        d_past = jax.tree.map(_instantiate, tangents[2], is_leaf=_is_zero)
         used = used_places(primals[0], task.settings.space)
         past = primals[2]
         states = past.records[:, :used], past.rate[:used], past.t0
         d_states = d_past.records[:, :used], d_past.rate[:used]
-        d_rows, d_records, d_rate = _pushed(
+        d_rows, d_records, d_rate = _push_tangents(
             Solves(task, pattern), primals, tangents, rows, (states, d_states)
         )
         # first guesses, error estimates and the extra stages of these count as constants
@@ -334,20 +334,22 @@ def static_rollout(task: TimeIntegration, pattern: Pattern) -> Callable[[System,
 
     @jax.custom_jvp
     def run(system: System, controls: Any, y: Any) -> StepRows:
-        return _solved(Solves(task, pattern), system, controls, StaticState(y))[2]
+        return _solve_primitive(Solves(task, pattern), system, controls, StaticState(y))[2]
 
     def tangent(primals: Any, tangents: Any) -> Any:
         rows, system = run(*primals), primals[0]
         none = no_history(system, task.settings.space)[: used_places(system, task.settings.space)]
         still = jnp.stack([none] * task.settings.memory), none
         states = (*still, jnp.zeros(())), still
-        return rows, _pushed(Solves(task, pattern), primals, tangents, rows, states)[0]
+        return rows, _push_tangents(Solves(task, pattern), primals, tangents, rows, states)[0]
 
     run.defjvp(tangent, symbolic_zeros=True)
     return run
 
 
-def _solved(spec: Solves, system: System, controls: Any, states: Any) -> tuple[Any, list[Any], StepRows]:
+def _solve_primitive(
+    spec: Solves, system: System, controls: Any, states: Any
+) -> tuple[Any, list[Any], StepRows]:
     """Return the number of steps done, the last state, and rows: NaN where unsolved."""
     operands = [*jax.tree.leaves(system), controls, *states]
     done, *found = (each[0] for each in solve_p.bind(*map(_one_robot, operands), spec=spec))
@@ -361,7 +363,7 @@ def _solved(spec: Solves, system: System, controls: Any, states: Any) -> tuple[A
     return done, found[: len(states)], rows
 
 
-def _pushed(
+def _push_tangents(
     spec: Solves, primals: Any, tangents: Any, rows: StepRows, states: tuple[Any, Any]
 ) -> tuple[StepRows, Any, Any]:
     """Return the tangents of rows, and of the records and the rate after the last step.
@@ -373,7 +375,7 @@ def _pushed(
     moving = tuple(not _is_zero(leaf) for leaf in d_leaves)
     spec = dataclasses.replace(spec, moving=moving)
     residuals = *jax.tree.leaves(system), controls, *before, *rows.every_stage
-    moved = *spec.moved(d_leaves), _instantiated(tangents[1]), *d_before
+    moved = *spec.moved(d_leaves), _instantiate(tangents[1]), *d_before
     operands = [*map(_one_robot, residuals), *(_one_robot(_one_robot(each)) for each in moved)]
     d_records, d_unknowns, *after = (each[0, 0] for each in push_p.bind(*operands, spec=spec))
     d_records, d_unknowns = (
@@ -392,7 +394,7 @@ def _is_zero(tangent: Any) -> bool:
     return isinstance(tangent, SymbolicZero)
 
 
-def _instantiated(tangent: Any) -> Any:
+def _instantiate(tangent: Any) -> Any:
     """Return a tangent as an array."""
     if not _is_zero(tangent):
         return tangent

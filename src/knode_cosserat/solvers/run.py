@@ -153,7 +153,7 @@ def run_one(
             reached, last = done, min([stop, *(int(k) for k in far if k >= done)])
             while last > done:
                 span, earlier = slice(done, last), state
-                reached, state, _ = task.solve(system, controls, earlier, (done, last), _picked(rows, span))
+                reached, state, _ = task.solve(system, controls, earlier, (done, last), _pick(rows, span))
                 if not len(watched) or reached <= watched[0]:
                     break
                 previous = rows.records[done - 1] if done else _nodes(system, first_state)
@@ -387,13 +387,13 @@ def run_batch(
     done, lasts = np.zeros(size, dtype=int), jax.tree.map(lambda leaf: np.empty(np.shape(leaf)), states)
 
     def robot(index: Any) -> System:
-        return _picked(system, index) if batched else system
+        return _pick(system, index) if batched else system
 
     with _bar(watch, size, "robot") as advance:
 
         def work(first: int) -> None:
             index = slice(first, first + chunk)
-            own, rows = _picked(states, index), _picked(every, index)
+            own, rows = _pick(states, index), _pick(every, index)
             done[index], after, _ = task.solve(robot(index), controls[index], own, rows=rows)
             _put(lasts, index, after)
             advance(len(done[index]))
@@ -405,14 +405,14 @@ def run_batch(
     turned = np.max(turns_within(system, controls, before), axis=-1) > LARGEST_TURN
     far = turned if task.settings.time else False
     for i in np.flatnonzero((done < task.steps) | far):
-        *solved, cause = run_one(task, robot(i), controls[i], (_picked(states, i), before[i]))
+        *solved, cause = run_one(task, robot(i), controls[i], (_pick(states, i), before[i]))
         _put((every, lasts), i, solved)
         if cause:
             causes[int(i)] = cause
     return every, lasts, causes
 
 
-def _picked(tree: Any, index: Any) -> Any:
+def _pick(tree: Any, index: Any) -> Any:
     return jax.tree.map(lambda leaf: leaf[index], tree)
 
 

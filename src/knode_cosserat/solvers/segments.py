@@ -372,7 +372,7 @@ def _jump(knowledge: System, acting: Any, rows: Point) -> Any:
     return jax.vmap(at_row, in_axes=(None, Point(None, 0, 0, 0, own._replace(c0=0))))(acting, rows)
 
 
-def undivided(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
+def is_undivided(knowledge: System, place: Float[Any, " S"]) -> Float[np.ndarray, " S"]:
     """Return 1 for each segment (by its start, a part of the length) without inner discontinuity, else 0."""
     if not knowledge.discontinuities.places:
         return np.ones(len(place))

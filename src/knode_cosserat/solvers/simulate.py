@@ -30,8 +30,8 @@ from knode_cosserat.solvers.refinement import (
     has_chosen,
     nodes_of,
     on_grid,
-    refined,
-    resampled,
+    refine,
+    resample,
 )
 from knode_cosserat.solvers.rollout import Solves, rollout
 from knode_cosserat.solvers.run import (
@@ -125,14 +125,14 @@ def simulate(
         raise ValueError("position_tolerance needs estimates of errors: leave out errors=False")
     check_tolerance(robot, initial, position_tolerance)
     robot = on_grid_of(robot, initial) if isinstance(initial, Trajectory) else robot
-    system, batch = stacked(robot)
+    system, batch = stack_robots(robot)
     controls, batch = checked_controls(system, controls, batch)
     check_initial(system, initial, batch)
     warn_if_undamped(robot, dt)
     warn_of_long_steps(robot, dt)
 
     def solve(robot: Any) -> Solved[Trajectory]:
-        system = stacked(robot)[0]
+        system = stack_robots(robot)[0]
         before = initial
         # ranges are not part of the equations: programs are compiled for systems without them
         bare = without_range(system)
@@ -142,26 +142,26 @@ def simulate(
         task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
         if is_traced((system, controls, before)):
             named, rows = (None, before) if isinstance(before, Trajectory) else (before, None)
-            found = _traced(bare, controls, rows, named, Solves(task, Pattern.of(bare)))
+            found = _simulate_traced(bare, controls, rows, named, Solves(task, Pattern.of(bare)))
             result, error = as_seen(system, found.result, found.position_error)
             found = dataclasses.replace(found, system=system, result=result, position_error=error)
-            return Solved.of(marked(found, initial))
+            return Solved.of(mark_extrapolated(found, initial))
         run = _initial(bare, controls, before, task)
         every, last, said = _plain(bare, run, on_failure, progress)
-        return Solved.of(marked(_trajectory(system, run, every, last), initial), said)
+        return Solved.of(mark_extrapolated(_trajectory(system, run, every, last), initial), said)
 
     # the state of a motion is known on its own grid only
     moving = isinstance(initial, Trajectory) and (
         initial.settings is None or initial.settings.time is not None
     )
-    return refined(solve, robot, settings.space, position_tolerance, stays=moving)
+    return refine(solve, robot, settings.space, position_tolerance, stays=moving)
 
 
 def _again_at_rest(initial: Trajectory, system: System, settings: Settings) -> Trajectory:
     """Return the last equilibrium of a trajectory on the grid of a system."""
     if initial.y.shape[-2] == system.nodes:
         return initial
-    guess, bare = resampled(initial, system), without_range(system)
+    guess, bare = resample(initial, system), without_range(system)
     task = TimeIntegration(Settings(None, settings.space, newton=settings.newton))
     y, control = grid_of(bare).spread(guess.y[-1]), np.asarray(guess.control[-1:])
     rows, _, cause = static_run(task, bare, control, y, control[0])
@@ -170,7 +170,7 @@ def _again_at_rest(initial: Trajectory, system: System, settings: Settings) -> T
     return dataclasses.replace(guess, system=system, settings=task.settings, **rows_of(bare, rows))
 
 
-def marked(trajectory: Trajectory, initial: Any) -> Trajectory:
+def mark_extrapolated(trajectory: Trajectory, initial: Any) -> Trajectory:
     """Return a trajectory with `extrapolated` marked where its system extrapolates.
 
     The first row takes the mark of the last row of the trajectory that it continues (`initial`, if it is
@@ -219,7 +219,7 @@ def on_grid_of(robot: Any, initial: Trajectory) -> Any:
     return on_grid(robot, ChosenNodes(nodes) if nodes >= robot.needed_nodes else nodes)
 
 
-def stacked(robot: Any) -> tuple[System, int | None]:
+def stack_robots(robot: Any) -> tuple[System, int | None]:
     """Return one system of a robot or of a batch of robots, and the number of robots in a batch."""
     if isinstance(robot, System):
         return robot, None
@@ -379,7 +379,7 @@ def _initial_rows(system: System, task: TimeIntegration, shape: tuple[int, ...])
 
 
 @functools.partial(jax.jit, static_argnames=("named", "spec"))
-def _traced(system, controls, rows, named, spec):  # type: ignore[no-untyped-def]
+def _simulate_traced(system, controls, rows, named, spec):  # type: ignore[no-untyped-def]
     """Simulate inside JAX's transformations: without recovery; unsolved rows become NaN.
 
     A single jitted function, so that a transformation traces it once and not at every call.

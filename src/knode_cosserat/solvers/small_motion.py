@@ -138,7 +138,7 @@ def stable_near(system: System, settings: Settings, row: StepRows, control: np.n
     rate = fastest_growth(system, step)
     if not rate or abs(rate.imag) > rate.real:
         return None
-    image, kept = _reduced(step, history_size(system))
+    image, kept = _reduce(step, history_size(system))
     with one_thread():
         factors, vectors = np.linalg.eig(image)
     mode = np.zeros(len(step.unit))
@@ -166,10 +166,10 @@ def stable_near(system: System, settings: Settings, row: StepRows, control: np.n
 def _eigenvalues(step: LinearStep, size: int) -> np.ndarray:
     """Return the eigenvalues of a map of history with `size` terms at each place, but zeros."""
     with one_thread():
-        return np.linalg.eigvals(_reduced(step, size)[0])
+        return np.linalg.eigvals(_reduce(step, size)[0])
 
 
-def _reduced(step: LinearStep, size: int) -> tuple[np.ndarray, np.ndarray]:
+def _reduce(step: LinearStep, size: int) -> tuple[np.ndarray, np.ndarray]:
     """Return a map of history, in its units, between terms that act, and the places of these terms."""
     unit = step.unit
     # terms whose rates are in no equation; a random history shows them

@@ -21,7 +21,7 @@ from knode_cosserat.solvers.guess import LARGEST_JUMP, LARGEST_TURN, turns_betwe
 from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.recovery import Budget
 from knode_cosserat.solvers.run import TimeIntegration, carried_results, rows_of
-from knode_cosserat.solvers.simulate import check_initial, checked_dt, marked
+from knode_cosserat.solvers.simulate import check_initial, checked_dt, mark_extrapolated
 from knode_cosserat.trajectory import Trajectory
 
 #: function that returns a solved step's row and the state of the solver after it
@@ -228,6 +228,6 @@ class Stepper:
                 robot, self._task.settings, np.array([time]), control=control[None],
                 **rows_of(robot, row), initial_state=state, final_state=state,
             )  # fmt: skip
-            return vars(marked(found, None))
+            return vars(mark_extrapolated(found, None))
 
         return Trajectory.deferred(fields)

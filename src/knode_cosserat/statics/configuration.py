@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat._reprs import quantity, wrapped
+from knode_cosserat._reprs import quantity, wrap_lines
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.settings import NewtonOptions
 from knode_cosserat.schemes.space import SpaceScheme
-from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refined
+from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refine
 from knode_cosserat.statics.arguments import checked_control, static_settings
 from knode_cosserat.statics.response import Pose, first_solved, tip_pose
 
@@ -75,7 +75,7 @@ class Configuration:
 
     def __repr__(self) -> str:
         turned = "" if self.quaternion is None else f", quaternion {quantity(self.quaternion)}"
-        return wrapped(
+        return wrap_lines(
             f"Configuration: control {quantity(self.control)}; "
             f"position {quantity(self.position, 'm')}{turned}; jacobian {self.jacobian.shape}"
         )
@@ -167,4 +167,4 @@ def configuration(
         )  # fmt: skip
         return Solved(linearised, found.result, found.position_error)
 
-    return refined(solve, robot, settings.space)
+    return refine(solve, robot, settings.space)

@@ -145,7 +145,7 @@ def displacements(system: System, motion: np.ndarray) -> np.ndarray:
     return np.apply_along_axis(lambda own: np.interp(nodes, grid, own), 0, moves)
 
 
-def normalised(moves: np.ndarray) -> np.ndarray:
+def normalise(moves: np.ndarray) -> np.ndarray:
     """Return displacements (nodes, strands, 3) with maximum 1; a single strand has no axis."""
     # a mode of pure torsion does not move the line
     moves = moves / max(float(np.max(np.linalg.norm(moves, axis=-1))), np.finfo(float).tiny)

@@ -9,7 +9,7 @@ from jaxtyping import Float
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.rods.strands import of_rods
-from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalised
+from knode_cosserat.statics.dynamics import RESOLVED, displacements, linearised_modes, normalise
 from knode_cosserat.statics.stability import checked_equilibrium
 from knode_cosserat.trajectory import Trajectory
 
@@ -86,6 +86,6 @@ def modes(equilibrium: Trajectory, row: int = -1, count: int = 10) -> Modes:
         for same in np.flatnonzero(np.abs(values[: len(shapes)] - value) < SAME * abs(value)):
             other = shapes[same].reshape(shape.shape)
             shape = shape - other * np.vdot(other, shape) / np.vdot(other, other)
-        shapes.append(normalised(shape))
+        shapes.append(normalise(shape))
     p = of_rods(system, y, "p")
     return Modes(values, error, np.stack(shapes), p[:, 0] if p.shape[1] == 1 else p)

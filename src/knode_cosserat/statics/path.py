@@ -149,7 +149,7 @@ class _PathPoints:
         y = np.asarray(still_state(system, settings.space, ends[0], nodes).y)
         self.y, self.parts, self.errors = [y], [0.0], [0.0]
         zero = np.zeros_like(self.y[0])
-        y, _, _, _, tangent = _corrected(system, settings, ends, (y, 0.0), (zero, 1.0))
+        y, _, _, _, tangent = _correct(system, settings, ends, (y, 0.0), (zero, 1.0))
         self.tangent, self.step, self.complete = tangent, FIRST, False
 
     def advance(self) -> bool:
@@ -165,7 +165,7 @@ class _PathPoints:
                 tangent = np.zeros_like(y), 1.0
             else:
                 tangent = self.tangent
-            found = _corrected(self.system, self.settings, self.ends, guess, tangent)
+            found = _correct(self.system, self.settings, self.ends, guess, tangent)
             y_new, part_new, error, count, (way, rate) = found
             if error <= self.settings.newton.acceptable:
                 scale = np.asarray(self.system.scales().y)
@@ -183,7 +183,7 @@ class _PathPoints:
 
 
 @functools.partial(jax.jit, static_argnames="settings")
-def _linearised(system, settings, ends, y, part):  # type: ignore[no-untyped-def]
+def _linearise(system, settings, ends, y, part):  # type: ignore[no-untyped-def]
     """Return the residuals of pieces, tip and base, and their derivatives by the part.
 
     Then those of pieces by y at their starts and ends, of the base by its unknowns, and of the tip by y.
@@ -235,7 +235,7 @@ def _directions(
     system: System, settings: Settings, ends: tuple[Any, Any], y: np.ndarray, part: float
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """Return the error of the residuals, and the changes of y that remove them or follow the load."""
-    given = jax.tree.map(np.asarray, _linearised(system, settings, ends, y, part))
+    given = jax.tree.map(np.asarray, _linearise(system, settings, ends, y, part))
     (defects, tip, base), moved, pieces, at_ends = given
     scales = system.scales()
     scale, rows = np.asarray(scales.y), np.asarray(scales.tip)
@@ -257,7 +257,7 @@ def _directions(
         return np.inf, np.zeros_like(y), np.zeros_like(y)
 
 
-def _corrected(
+def _correct(
     system: System, settings: Settings, ends: tuple[Any, Any], start: tuple[np.ndarray, float],
     tangent: tuple[np.ndarray, float],
 ) -> tuple[np.ndarray, float, float, int, tuple[np.ndarray, float]]:  # fmt: skip

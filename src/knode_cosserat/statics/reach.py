@@ -19,14 +19,14 @@ import jax
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments, numbers_of
-from knode_cosserat._reprs import packed_text, quantity, wrapped
+from knode_cosserat._reprs import packed_text, quantity, wrap_lines
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.result import Code, Codes, Result, SimulationError
 from knode_cosserat.schemes.settings import NewtonOptions, Settings
 from knode_cosserat.schemes.space import SpaceScheme
-from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refined
+from knode_cosserat.solvers.refinement import Solved, is_too_coarse, refine
 from knode_cosserat.statics.arguments import (
     checked_control,
     checked_limits,
@@ -130,7 +130,7 @@ class InverseKinematics:
             largest = quantity(1e3 * np.max(self.position_error), "mm")
             return f"InverseKinematics of {len(self.result)} poses: {results}; largest error {largest}"
         layout = self.equilibrium.system.control_layout
-        return wrapped(
+        return wrap_lines(
             f"InverseKinematics: {self.result}; {packed_text(layout, self.control)}; tip at "
             f"{quantity(self.position, 'm')}; error {quantity(1e3 * self.position_error, 'mm')}, "
             f"{quantity(self.angle_error, 'rad')}"
@@ -212,7 +212,7 @@ def inverse_kinematics(
         )
         return Solved(found, results, errors)
 
-    return refined(solve, robot, settings.space)
+    return refine(solve, robot, settings.space)
 
 
 def _path(rows: list[InverseKinematics]) -> InverseKinematics:

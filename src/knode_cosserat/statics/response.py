@@ -18,7 +18,7 @@ from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.system import System, unknown_count
 from knode_cosserat.schemes.problem import row_of
 from knode_cosserat.schemes.settings import Settings
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.solvers.replay import still_state
 from knode_cosserat.solvers.rest import rest_record, unloaded_shape
 from knode_cosserat.solvers.run import TimeIntegration
@@ -134,7 +134,7 @@ def first_solved(system: System, settings: Settings, pose: Pose, control: Any) -
         found = respond(system, settings, pose, control, unloaded_shape(system, settings.space))
     if found is None or not found.error <= settings.newton.acceptable:
         recovered = equilibrium(
-            fixed(system), control, space=settings.space, newton=settings.newton, with_stability=False
+            fix_grid(system), control, space=settings.space, newton=settings.newton, with_stability=False
         )
         found = respond(
             system, settings, pose, control, still_state(system, settings.space, control, recovered.y[0]).y

@@ -35,10 +35,19 @@ from knode_cosserat.schemes.result import Result
 from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.schemes.space import Lobatto4, SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibrium as rests
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.solvers.replay import still_state
-from knode_cosserat.statics.dynamics import displacements, linearised_modes, normalised
-from knode_cosserat.statics.stiffness import NEEDED, Pieces, divided, firm, joined, narrow, symmetric, wide
+from knode_cosserat.statics.dynamics import displacements, linearised_modes, normalise
+from knode_cosserat.statics.stiffness import (
+    NEEDED,
+    Pieces,
+    divide,
+    firm,
+    join_segments,
+    narrow,
+    symmetric,
+    wide,
+)
 from knode_cosserat.trajectory import Trajectory
 
 #: largest residual of an equilibrium, in natural units
@@ -150,7 +159,12 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
             control=control[None], result=np.zeros(1, int), residual=np.zeros(1), iterations=np.zeros(1, int),
         )  # fmt: skip
         found = rests(
-            fixed(system), control, space="lobatto4", initial=one, on_failure="return", with_stability=False
+            fix_grid(system),
+            control,
+            space="lobatto4",
+            initial=one,
+            on_failure="return",
+            with_stability=False,
         )
         if found.result[0] not in NEARBY:
             raise ValueError(
@@ -171,7 +185,7 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     if set(strand_of(system).base_unknowns) - set(NEEDED):
         return _by_motion(system, y, control)
     by = [count for count in DIVISIONS if count <= 2 or count * system.nodes * strand_count(system) <= POINTS]
-    return _decided(system, y, control, by)
+    return _decide(system, y, control, by)
 
 
 def checked_equilibrium(equilibrium: Any, row: Any) -> tuple[System, np.ndarray, np.ndarray, np.ndarray]:
@@ -287,7 +301,7 @@ class _Variation:
                 f"{self.rounding:.2g} EI/L; a rod that is less slender can be decided"
             )
         moves = (self.free @ vectors[:, 0]).reshape(-1, strand_count(system), 6)[self.nodes, :, :3]
-        return Stability(count, least, normalised(moves), self.asymmetry, None, reason, neutral)
+        return Stability(count, least, normalise(moves), self.asymmetry, None, reason, neutral)
 
     def by_motion(self, system: System, y: np.ndarray, control: np.ndarray) -> Stability:
         """Return the stability of a robot whose loads have no potential."""
@@ -310,16 +324,16 @@ def _by_motion(system: System, y: np.ndarray, control: np.ndarray) -> Stability:
             f"a mode's growth rate of {first.real:.2g} 1/s is uncertain by "
             f"{modes.uncertainty[doubtful][0]:.2g} 1/s"
         )
-    moves = normalised(displacements(system, modes.motions[0]))
+    moves = normalise(displacements(system, modes.motions[0]))
     return Stability(directions, np.nan, moves, np.nan, complex(first), reason)
 
 
-def _decided(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:
+def _decide(system: System, y: np.ndarray, control: np.ndarray, by: list[int]) -> Stability:
     """Return the stability if two divisions in a row agree, or if the last ones are all unstable."""
     found: list[_Variation] = []
     sure, parts = False, getattr(strand_of(nominal_model(system)), "parts", {})
     gyroscopic = any(part.gyroscopic for part in parts.values())
-    for pieces in divided(system, y, control, by):
+    for pieces in divide(system, y, control, by):
         _require_rest(system, pieces.ends.base, pieces.moved)
         found.append(_variation(system, pieces))
         asymmetry = [each.asymmetry for each in found[-2:]]
@@ -352,7 +366,7 @@ def _variation(system: System, pieces: Pieces) -> _Variation:
     """Return the second variation in the nodes' poses, or in all pieces' if the nodes hide a direction."""
     elements, part = pieces.stiffness, pieces.part
     nodes = np.searchsorted(pieces.segment, np.arange(system.nodes))
-    whole, hidden = joined(np.split(elements, nodes[1:-1]))
+    whole, hidden = join_segments(np.split(elements, nodes[1:-1]))
     if system.nodes > 2 and not hidden and firm(whole):
         elements, part, nodes = whole, np.full(len(whole), 1.0 / len(whole)), np.arange(system.nodes)
     count, points = 6 * strand_count(system), len(elements) + 1

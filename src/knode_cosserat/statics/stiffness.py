@@ -82,7 +82,7 @@ def wide(strand: System, y: Any) -> Float[Any, "y 12"]:
     layout, scale = strand.y_layout, strand.scales().y
     p, h, n, m = (layout.slice(name) for name in NEEDED)
     found = jnp.zeros((layout.size, 12))
-    found = found.at[p, 0:3].set(jnp.diag(scale[p])).at[h, 3:6].set(_turned(y[h]))
+    found = found.at[p, 0:3].set(jnp.diag(scale[p])).at[h, 3:6].set(_rotation_rates(y[h]))
     found = found.at[n, 6:9].set(jnp.diag(scale[n])).at[m, 9:12].set(jnp.diag(scale[m]))
     return found.at[m, 3:6].set(-0.5 * _hat(y[m]))
 
@@ -91,14 +91,14 @@ def narrow(strand: System, y: Any) -> Float[Any, "12 y"]:
     """Return the inverse of `wide`: pose and stress from δy."""
     layout, scale = strand.y_layout, strand.scales().y
     p, h, n, m = (layout.slice(name) for name in NEEDED)
-    turn = 4.0 * _turned(y[h]).T / jnp.sum(y[h] * y[h])
+    turn = 4.0 * _rotation_rates(y[h]).T / jnp.sum(y[h] * y[h])
     found = jnp.zeros((12, layout.size))
     found = found.at[0:3, p].set(jnp.diag(1.0 / scale[p])).at[3:6, h].set(turn)
     found = found.at[6:9, n].set(jnp.diag(1.0 / scale[n])).at[9:12, m].set(jnp.diag(1.0 / scale[m]))
     return found.at[9:12, h].set(0.5 * _hat(y[m]) @ turn / scale[m][:, None])
 
 
-def _turned(h: Any) -> Float[Any, "4 3"]:
+def _rotation_rates(h: Any) -> Float[Any, "4 3"]:
     """Return ∂h/∂θ of a quaternion under small rotations about the global axes."""
     w, x, y, z = h
     return 0.5 * jnp.array([[-x, -y, -z], [w, z, -y], [-z, w, x], [y, -x, w]])
@@ -112,7 +112,7 @@ def _hat(v: Any) -> Float[Any, "3 3"]:
 # integration along the rod
 
 
-def _carried(rates: Any, begin: Any, end: Any, y: Any) -> Any:
+def _integrate_interval(rates: Any, begin: Any, end: Any, y: Any) -> Any:
     """Return y at the end of a short interval, by the classical Runge-Kutta scheme, evaluated inside it."""
     ds = end - begin
 
@@ -157,7 +157,7 @@ def _along(
 
         def on(y: Any, step: Any) -> Any:
             begin, end = low + step * (high - low)
-            y = _carried(rates, begin, end, y)
+            y = _integrate_interval(rates, begin, end, y)
             ways = wide(strand, y)
             y_s, pushed = jax.linearize(lambda y: rates(end, y), y)
             ways_s = jax.vmap(pushed, in_axes=-1, out_axes=-1)(ways)
@@ -173,7 +173,7 @@ def _along(
     return jax.vmap(of_strands)(y, *bounds, acting)
 
 
-def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator[Pieces]:
+def divide(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator[Pieces]:
     """Yield the pieces, with each interval between nodes and cuts divided by each of the numbers.
 
     Newton's method first solves the equilibrium of the pieces. The equilibrium of the nodes' scheme differs a
@@ -196,7 +196,7 @@ def divided(system: System, y: Any, control: Any, by: Sequence[int]) -> Iterator
             low = bounds[:, 0] + k * ds
             acting = points.acting if k == 0 else np.zeros_like(points.acting)
             at, jump, H, also = _along(system, at, control, (low, low + ds), acting)
-            F.append(_integrated(np.asarray(H), ds) @ np.asarray(jump))
+            F.append(_integrate_pieces(np.asarray(H), ds) @ np.asarray(jump))
             moved.append(np.asarray(also).max(axis=(0, 1, 2)))
         return np.stack(F, axis=1), np.asarray(at).reshape(y[1:].shape) - y[1:], np.max(moved, axis=0)
 
@@ -247,7 +247,7 @@ def _correction(
     return np.asarray(moved.reshape(y.shape))
 
 
-def _integrated(H: np.ndarray, ds: np.ndarray) -> np.ndarray:
+def _integrate_pieces(H: np.ndarray, ds: np.ndarray) -> np.ndarray:
     """Return the map of w from the beginning to the end of each piece, from H at Gauss's places."""
     lead, size = H.shape[:2], len(PLACES) * 12
     H = H * ds[:, None, None, None, None]
@@ -272,7 +272,7 @@ def firm(stiffness: np.ndarray) -> bool:
     return all(bool(np.all(np.linalg.eigvalsh(symmetric(end)) > 0.0)) for end in ends)
 
 
-def joined(segments: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
+def join_segments(segments: Sequence[np.ndarray]) -> tuple[np.ndarray, int]:
     """Return the stiffness of segments of several pieces in their end poses, and the hidden negative count.
 
     The inner poses are eliminated; by Haynsworth's theorem the numbers of negative eigenvalues add up.

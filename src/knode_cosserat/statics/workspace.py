@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
-from knode_cosserat._reprs import quantity, robot_text, wrapped
+from knode_cosserat._reprs import quantity, robot_text, wrap_lines
 from knode_cosserat.controls import titles
 from knode_cosserat.io import container
 from knode_cosserat.io.container import Variable
@@ -22,7 +22,7 @@ from knode_cosserat.schemes.result import Result, ResultCodes
 from knode_cosserat.schemes.settings import NewtonOptions, Settings
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibrium
-from knode_cosserat.solvers.refinement import fixed
+from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.solvers.run import usable_cores
 from knode_cosserat.statics import arguments
 from knode_cosserat.statics.response import Pose, equilibrium_poses, tip_pose
@@ -58,7 +58,7 @@ class Workspace:
             f"{axis} {quantity([low, high], 'm')}"
             for axis, low, high in zip("xyz", solved.min(axis=0), solved.max(axis=0), strict=False)
         ] if len(solved) else []  # fmt: skip
-        return wrapped(
+        return wrap_lines(
             f"Workspace of a {robot_text(self.system)}: {len(self.result)} samples, "
             f"{self.unsolved} without a solution; {', '.join(spans)}"
         )
@@ -126,7 +126,7 @@ class Workspace:
             )
             for name, array in arrays.items()
         }
-        return container.encoded(KIND, {"system": type(self.system).__name__}, variables=variables)
+        return container.encode(KIND, {"system": type(self.system).__name__}, variables=variables)
 
     def _table(self, path: Any, arrays: dict[str, np.ndarray]) -> None:
         """Write controls with names and units, as in files of controls; other columns numbered from 0."""
@@ -212,10 +212,12 @@ def workspace(
         if samples.ndim != 2:
             raise ValueError(f"controls have shape {samples.shape}; allowed is (B, {size})")
         arguments.within_limits(robot, samples, "controls")
-    return _found(robot, settings, pose, samples, progress)
+    return _samples(robot, settings, pose, samples, progress)
 
 
-def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray, progress: bool) -> Workspace:
+def _samples(
+    system: System, settings: Settings, pose: Pose, controls: np.ndarray, progress: bool
+) -> Workspace:
     total = len(controls)
     chunk = min(CHUNK, 2 ** int(np.ceil(np.log2(max(1, -(-total // usable_cores()))))))
     #: samples and their poses, residuals and strains, by the number of the first
@@ -242,17 +244,17 @@ def _found(system: System, settings: Settings, pose: Pose, controls: np.ndarray,
                 except KeyboardInterrupt:
                     pool.shutdown(cancel_futures=True)
                     raise
-            found = _joined(system, settings, controls, chunks)
+            found = _join(system, settings, controls, chunks)
             for i in np.flatnonzero(~found.valid):
-                _recovered(found, int(i), settings, pose)
+                _recover(found, int(i), settings, pose)
         except KeyboardInterrupt as stop:
             if chunks:
-                stop.best = found or _joined(system, settings, controls, chunks)  # type: ignore[attr-defined]
+                stop.best = found or _join(system, settings, controls, chunks)  # type: ignore[attr-defined]
             raise
     return found
 
 
-def _joined(
+def _join(
     system: System, settings: Settings, controls: np.ndarray, chunks: dict[int, list[Any]]
 ) -> Workspace:
     """Return the samples of all chunks that were computed."""
@@ -265,10 +267,10 @@ def _joined(
     return Workspace(system, controls[index], position, quaternion, ResultCodes.of(result), residual, strain)
 
 
-def _recovered(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:
+def _recover(found: Workspace, i: int, settings: Settings, pose: Pose) -> None:
     """Replace sample i by the result of `kc.equilibrium` with its recoveries, solved or not."""
     rest = equilibrium(
-        fixed(found.system),
+        fix_grid(found.system),
         found.controls[i],
         space=settings.space,
         newton=settings.newton,

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat._reprs import count_of, quantity, wrapped
+from knode_cosserat._reprs import count_of, quantity, wrap_lines
 from knode_cosserat.errors import first_line
 from knode_cosserat.schemes.result import ResultCodes
 from knode_cosserat.sweeps._description import SweepError
@@ -187,7 +187,7 @@ class SweepData:
         if failed:
             first = next(self.failed())
             lines.append(f"failed case {first.case}: {first.reason}")
-        return "\n".join(map(wrapped, lines))
+        return "\n".join(map(wrap_lines, lines))
 
 
 def load_sweep(folder: str | Path) -> SweepData:

@@ -11,7 +11,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, mapping_of, read_yaml, shown
+from knode_cosserat._files.yaml_text import YAMLTextError, did_you_mean, excerpt, mapping_of, read_yaml
 from knode_cosserat._reprs import quantity
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.system import System
@@ -61,7 +61,7 @@ def _require_keys(mapping: Mapping[Any, Any], cls: type) -> None:
     """Raise `SweepError` unless a mapping has keys of a dataclass, among them all without a default."""
     fields = dataclasses.fields(cls)
     for key in mapping:
-        _require_known(f"the key {shown(key)} is unknown", key, [field.name for field in fields])
+        _require_known(f"the key {excerpt(key)} is unknown", key, [field.name for field in fields])
     missing = dataclasses.MISSING
     required = [it.name for it in fields if it.default is missing and it.default_factory is missing]
     for key in required:
@@ -109,7 +109,7 @@ class RobotEntry:
     @property
     def label(self) -> str:
         """Name of the robot in tables, with its changes."""
-        return self.name + "".join(f", {key}={shown(value)}" for key, value in self.changes.items())
+        return self.name + "".join(f", {key}={excerpt(value)}" for key, value in self.changes.items())
 
 
 @dataclasses.dataclass(frozen=True)
@@ -165,7 +165,7 @@ class Sweep:
         check_arguments(Sweep.__init__, vars(self), SweepError)
         _require_least(self)
         if min(self.seeds, default=0) < 0:
-            raise SweepError(f"seeds is {shown(self.seeds)}; allowed is a list of whole numbers from 0 on")
+            raise SweepError(f"seeds is {excerpt(self.seeds)}; allowed is a list of whole numbers from 0 on")
         _require_known(f"sampler is {self.sampler!r}", self.sampler, SAMPLERS)
         store = _words("store", self.store) if self.store else ()
         for name in store:
@@ -187,7 +187,7 @@ class Sweep:
         if self.sampler == "grid":
             if self.samples is not None:
                 raise SweepError(
-                    f"samples is {shown(self.samples)}; a grid has all combinations, and no samples; leave "
+                    f"samples is {excerpt(self.samples)}; a grid has all combinations, and no samples; leave "
                     "it out, or use the sampler sobol"
                 )
             for name, values in self.vary.items():
@@ -211,7 +211,7 @@ class Sweep:
             SweepError: a key is unknown or missing, or a value is not allowed.
         """
         if not isinstance(mapping, Mapping):
-            raise SweepError(f"{source}: the sweep is {shown(mapping)}; allowed is a mapping of settings")
+            raise SweepError(f"{source}: the sweep is {excerpt(mapping)}; allowed is a mapping of settings")
         try:
             _require_keys(mapping, cls)
             return cls(**mapping)
@@ -290,7 +290,7 @@ def values_at(variation: Range | tuple[Any, ...], fraction: np.ndarray) -> np.nd
 def _words(name: str, value: Any) -> tuple[str, ...]:
     words = (value,) if isinstance(value, str) else tuple(value) if isinstance(value, list | tuple) else ()
     if not words or not all(isinstance(word, str) for word in words):
-        raise SweepError(f"{name} is {shown(value)}; allowed is a word or a list of words")
+        raise SweepError(f"{name} is {excerpt(value)}; allowed is a word or a list of words")
     return words
 
 
@@ -301,18 +301,18 @@ def _robot(entry: Any) -> RobotEntry:
         return RobotEntry(entry)
     if not isinstance(entry, Mapping) or not {"robot"} <= entry.keys() <= {"robot", "set"}:
         raise SweepError(
-            f"robots: {shown(entry)} is not understood; allowed is a name, a file, or robot: NAME with "
+            f"robots: {excerpt(entry)} is not understood; allowed is a name, a file, or robot: NAME with "
             "set: {PARAMETER: VALUE}"
         )
     changes = entry.get("set") or {}
     if not isinstance(entry["robot"], str | System) or not isinstance(changes, Mapping):
-        raise SweepError(f"robots: {shown(entry)} is not understood; allowed is a name and a mapping")
+        raise SweepError(f"robots: {excerpt(entry)} is not understood; allowed is a name and a mapping")
     return RobotEntry(entry["robot"], dict(changes))
 
 
 def _variation(name: Any, values: Any) -> Range | tuple[Any, ...]:
     if not isinstance(name, str):
-        raise SweepError(f"vary: the name {shown(name)} is not text")
+        raise SweepError(f"vary: the name {excerpt(name)} is not text")
     if isinstance(values, Range):
         return values
     try:
@@ -322,14 +322,14 @@ def _variation(name: Any, values: Any) -> Range | tuple[Any, ...]:
         values = values.tolist() if isinstance(values, np.ndarray) else values
         if not isinstance(values, list | tuple) or not values:
             raise SweepError(
-                f"{shown(values)} is not understood; allowed is low and high, or a list of values"
+                f"{excerpt(values)} is not understood; allowed is low and high, or a list of values"
             )
         try:
             array = np.asarray(values, dtype=float)
         except (TypeError, ValueError):
             array = np.array(np.nan)
         if not np.all(np.isfinite(array)):
-            raise SweepError(f"{shown(values)} is not a list of finite numbers, or of vectors of one size")
+            raise SweepError(f"{excerpt(values)} is not a list of finite numbers, or of vectors of one size")
         return tuple(array.tolist())
     except SweepError as error:
         raise SweepError(f"vary: {name}: {error}") from None

@@ -28,7 +28,7 @@ from knode_cosserat._files.json_text import json_checksum, parse_json
 from knode_cosserat._files.limits import excess
 from knode_cosserat._files.reading import ReadError, read_bytes
 from knode_cosserat._files.writing import package_version, replacing
-from knode_cosserat._files.yaml_text import shown
+from knode_cosserat._files.yaml_text import excerpt
 from knode_cosserat._jax import machine_name
 from knode_cosserat.controls import titles
 from knode_cosserat.errors import KnodeCosseratError
@@ -169,7 +169,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     stated = manifest.pop(CHECKSUM, None)
     if manifest.get("version") != VERSION:
         raise SweepError(
-            f"{path}: the sweep has the version {shown(manifest.get('version'))}; allowed is {VERSION}, "
+            f"{path}: the sweep has the version {excerpt(manifest.get('version'))}; allowed is {VERSION}, "
             "which this version of the package reads. Nothing was changed"
         )
     if stated != json_checksum(manifest):
@@ -215,7 +215,7 @@ def open_folder(plan: Plan, folder: Path) -> None:
         changed = [key for key, value in manifest["sweep"].items() if other["sweep"].get(key) != value]
         reason = "a robot or a file of controls was changed"
         if changed:
-            reason = f"its {changed[0]} is {shown(other['sweep'].get(changed[0]))}"
+            reason = f"its {changed[0]} is {excerpt(other['sweep'].get(changed[0]))}"
         raise SweepError(
             f"{folder}: another sweep is here: {reason}; allowed is the same description, or another folder"
         )

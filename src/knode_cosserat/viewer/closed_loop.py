@@ -26,7 +26,7 @@ from jaxtyping import Float
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.control import Controller, LoopLog, Plant, constant
 from knode_cosserat.control.commands import Status
-from knode_cosserat.control.loop import Loop, Period, estimated, joined
+from knode_cosserat.control.loop import Loop, Period, estimated_state, join_rows
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.parameters import parameter_at
@@ -145,7 +145,7 @@ def shapes(plant: Plant, controller: Controller) -> dict[str, Trajectory]:
         ValueError: there is neither of them.
     """
     true: Trajectory | None = getattr(plant, "state", None)
-    estimate = estimated(controller)
+    estimate = estimated_state(controller)
     if true is not None:
         return {TRUE: true} if estimate is None else {TRUE: true, ESTIMATED: estimate}
     if estimate is not None:
@@ -213,7 +213,7 @@ class FollowedTarget:
         if not moments:
             raise ValueError("no period has passed; there is nothing to export")
         motions = {
-            name: joined([moment.shapes[name] for moment in moments], [moment.time for moment in moments])
+            name: join_rows([moment.shapes[name] for moment in moments], [moment.time for moment in moments])
             for name in moments[0].shapes
         }
         numbers = np.array([moment.numbers for moment in moments])

@@ -34,11 +34,11 @@ CLASSES["Thing"] = Thing
 
 def contained():
     facts = {"things": [Thing(k) for k in range(5)], "values": np.arange(9.0)}
-    return container.encoded(KIND, facts, classes=CLASSES)
+    return container.encode(KIND, facts, classes=CLASSES)
 
 
 def decoded(data):
-    return lambda: container.decoded(data, KIND, "it", CLASSES)
+    return lambda: container.decode(data, KIND, "it", CLASSES)
 
 
 @READERS

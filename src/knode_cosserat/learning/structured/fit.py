@@ -55,13 +55,13 @@ from knode_cosserat.solvers.segments import (
     Samples,
     TipSamples,
     end_point,
+    is_undivided,
     predict_segment,
     rows_are_states,
     samples,
     start_point,
     strand_samples,
     tip_point,
-    undivided,
 )
 from knode_cosserat.trajectory import Trajectory
 
@@ -230,7 +230,7 @@ class _Regression:
         if not self.linear:
             return np.asarray(segments.slope) / length, self.counting
         # y at the ends gives the mean rate only where no discontinuity is inside
-        counting, counts = self.counting, self.counting.shares * undivided(self.strand, segments.place)
+        counting, counts = self.counting, self.counting.shares * is_undivided(self.strand, segments.place)
         if np.any(counts):
             counting = counting._replace(shares=counts / np.mean(counts))
         return (segments.y_next - segments.y) * ((nodes - 1) / length), counting

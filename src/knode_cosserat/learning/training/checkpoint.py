@@ -136,7 +136,7 @@ class Checkpoints:
         """Write the state of a part; replaces its earlier file. Raises `CheckpointError`."""
         identity = json.loads(json.dumps(dataclasses.asdict(self.identity))) if self.identity else {}
         with KIND.naming(self.path(name)):
-            content = container.encoded(KIND, {"identity": identity, "name": name, "snapshot": snapshot})
+            content = container.encode(KIND, {"identity": identity, "name": name, "snapshot": snapshot})
         container.write(self.path(name), content, KIND)
 
     def load(self, name: str) -> dict[str, Any] | None:

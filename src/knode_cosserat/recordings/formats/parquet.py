@@ -7,7 +7,7 @@ from typing import Any
 
 from knode_cosserat._files import parquet_file
 from knode_cosserat._files.writing import replacing
-from knode_cosserat._files.yaml_text import shown
+from knode_cosserat._files.yaml_text import excerpt
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import RecordingFormat, register
 from knode_cosserat.recordings.streams import Outgoing
@@ -37,7 +37,7 @@ def read_parquet(path: Path) -> Table:
             if not flat or column.physical_type not in _NUMBERS or logical not in _PLAIN:
                 kind = (column.physical_type if logical in _PLAIN else logical).lower()
                 raise RecordingError(
-                    f"the column {shown(column.path)} has {kind if flat else 'lists'}; allowed are numbers"
+                    f"the column {excerpt(column.path)} has {kind if flat else 'lists'}; allowed are numbers"
                 )
         parquet_file.require_limited_expansion(file.metadata, path)
         table = file.read()
@@ -45,7 +45,7 @@ def read_parquet(path: Path) -> Table:
     numbers = (types.is_integer, types.is_floating, types.is_boolean, types.is_null)
     for field in table.schema:
         if not any(is_kind(field.type) for is_kind in numbers):
-            raise RecordingError(f"the column {shown(field.name)} has {field.type}; allowed are numbers")
+            raise RecordingError(f"the column {excerpt(field.name)} has {field.type}; allowed are numbers")
     frame = pd.DataFrame({name: table.column(k).to_numpy() for k, name in enumerate(table.column_names)})
     if frame.empty:
         raise RecordingError("no rows")
