@@ -41,9 +41,14 @@ def rod(
         kc.robots.loads.DistributedWrench(force=np.multiply(even, FORCE / LENGTH)),
     )
     parameters = {
-        "length": LENGTH, "radius": RADIUS, "youngs_modulus": YOUNGS_MODULUS, "density": DENSITY,
-        "gravity": (0, 0, 0), "shear_stiffness": (RIGID, RIGID, RIGID), "bending_stiffness": (EI, EI, EI),
-    }  # fmt: skip
+        "length": LENGTH,
+        "radius": RADIUS,
+        "youngs_modulus": YOUNGS_MODULUS,
+        "density": DENSITY,
+        "gravity": (0, 0, 0),
+        "shear_stiffness": (RIGID, RIGID, RIGID),
+        "bending_stiffness": (EI, EI, EI),
+    }
     return kc.robots.SlenderRod(nodes=nodes, loads=loads, **{**parameters, **changes})
 
 
@@ -105,9 +110,15 @@ TENDON_TENSION, TENDON_OFFSET = 3.0, 0.02
 def tendon_circle(nodes: int, space: str) -> float:
     """Distance from the circle that one straight tendon makes of a rod."""
     robot = kc.robots.RoutedTendonRobot(
-        length=LENGTH, radius=4e-3, youngs_modulus=YOUNGS_MODULUS, density=DENSITY, gravity=(0, 0, 0),
-        tendon_offset=TENDON_OFFSET, tendon_angles=(0.0, np.pi / 2), nodes=nodes,
-    )  # fmt: skip
+        length=LENGTH,
+        radius=4e-3,
+        youngs_modulus=YOUNGS_MODULUS,
+        density=DENSITY,
+        gravity=(0, 0, 0),
+        tendon_offset=TENDON_OFFSET,
+        tendon_angles=(0.0, np.pi / 2),
+        nodes=nodes,
+    )
     s = np.linspace(0, LENGTH, nodes)
     stiffness = float(robot.Kbt[0, 0]), float(robot.Kse[2, 2])
     exact = closed_forms.tendon_circle(TENDON_TENSION, TENDON_OFFSET, s, *stiffness)
@@ -139,12 +150,18 @@ def hanging(nodes: int, curved: bool = True) -> tuple[Any, kc.Trajectory]:
     h *= np.where(h @ h[0] < 0, -1.0, 1.0)[:, None]
     stretch = 1 + np.hypot(CATENARY.tension, CATENARY.rise(s)) / CATENARY.EA
     robot = kc.robots.SlenderRod(
-        length=LENGTH, radius=RADIUS, youngs_modulus=YOUNGS_MODULUS, density=DENSITY,
-        gravity=(0, 0, -CATENARY.weight / (DENSITY * AREA)), shear_stiffness=(RIGID, RIGID, CATENARY.EA),
-        bending_stiffness=(EI, EI, EI), nodes=nodes,
+        length=LENGTH,
+        radius=RADIUS,
+        youngs_modulus=YOUNGS_MODULUS,
+        density=DENSITY,
+        gravity=(0, 0, -CATENARY.weight / (DENSITY * AREA)),
+        shear_stiffness=(RIGID, RIGID, CATENARY.EA),
+        bending_stiffness=(EI, EI, EI),
+        nodes=nodes,
         sections=(FunctionSection(function=_curved_like_the_catenary),) if curved else (),
-        base_end=kc.robots.ends.Pinned(position=p[0]), tip_end=kc.robots.ends.Pinned(position=p[-1]),
-    )  # fmt: skip
+        base_end=kc.robots.ends.Pinned(position=p[0]),
+        tip_end=kc.robots.ends.Pinned(position=p[-1]),
+    )
     return robot, resting(robot, p, h, stretch[:, None] * [0.0, 0.0, 1.0], np.zeros((nodes, 3)))
 
 
@@ -242,9 +259,15 @@ def swinging(mode: int, nodes: int, space: str = "lobatto4", scheme: Any = BDF2)
     bent = np.stack([np.zeros(nodes), np.gradient(slope, part) / LENGTH, np.zeros(nodes)], axis=1)
     dt = 2 * np.pi / closed_forms.frequency(mode, LENGTH, EI, DENSITY * AREA) / PERIOD_STEPS
     moving = kc.simulate(
-        robot, np.zeros((STEPS, 0)), dt, time=scheme, space=space, newton=NEWTON, start="consistent",
+        robot,
+        np.zeros((STEPS, 0)),
+        dt,
+        time=scheme,
+        space=space,
+        newton=NEWTON,
+        start="consistent",
         initial=resting(robot, p, h, along, bent),
-    )  # fmt: skip
+    )
     return np.trapezoid(np.asarray(moving.position)[:, :, 0] * shape, part, axis=1), dt
 
 

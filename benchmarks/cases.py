@@ -109,9 +109,14 @@ def cantilever() -> dict[str, Any]:
     import knode_cosserat as kc
 
     rod = kc.robots.SlenderRod(
-        length=0.4, radius=0.0012, density=8000.0, youngs_modulus=207e9, nodes=41, bending_damping=2e-3,
+        length=0.4,
+        radius=0.0012,
+        density=8000.0,
+        youngs_modulus=207e9,
+        nodes=41,
+        bending_damping=2e-3,
         gravity=(-9.81, 0.0, 0.0),
-    )  # fmt: skip
+    )
     controls = np.zeros((500, 0))
     taken = medians(
         {"run": lambda: kc.simulate(rod, controls, 0.002, time="bdf-alpha", initial="unstressed")}, rounds=25

@@ -72,8 +72,10 @@ def command(sources: Path, name: str, tested: bool, cache: str) -> tuple[float, 
     given = json.dumps([name, RESTS.get(name, ""), tested])
     process = subprocess.Popen(
         [sys.executable, "-c", COMMAND, given],
-        stdout=subprocess.PIPE, text=True, env=environment_of(sources, cache),
-    )  # fmt: skip
+        stdout=subprocess.PIPE,
+        text=True,
+        env=environment_of(sources, cache),
+    )
     with process, process.stdout as printed:
         said = printed.read()
         _, status, used = os.wait4(process.pid, 0)
@@ -101,8 +103,11 @@ def first_result(sources: Path, name: str, control: float, cache: str) -> tuple[
     environment = environment_of(sources, cache)
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM, json.dumps([name, control, STEPS, DT])],
-        capture_output=True, text=True, check=True, env=environment,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=True,
+        env=environment,
+    )
     return tuple(json.loads(done.stdout))
 
 

@@ -153,9 +153,12 @@ def periods(against: str | None) -> str:
             for label, source in sources.items():
                 environment = os.environ | {"PYTHONPATH": f"{source}/src:{source}"}
                 worker = subprocess.Popen(
-                    [sys.executable, __file__, "--loops", source], stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE, text=True, env=environment,
-                )  # fmt: skip
+                    [sys.executable, __file__, "--loops", source],
+                    stdin=subprocess.PIPE,
+                    stdout=subprocess.PIPE,
+                    text=True,
+                    env=environment,
+                )
                 ready, said = _asked(worker, json.dumps({"name": controller, "dt": dt}))
                 if ready:
                     workers[name, label] = worker
@@ -254,9 +257,12 @@ def main() -> None:
             name: json.loads((Path(folder) / f"{name}.json").read_text()) for name in ("control", "tracking")
         }
     found = {
-        "machine": machine(), "quick": not given.full, "costs": timed, "checks": read["control"],
+        "machine": machine(),
+        "quick": not given.full,
+        "costs": timed,
+        "checks": read["control"],
         "tracking": read["tracking"],
-    }  # fmt: skip
+    }
     given.out.write_text(json.dumps(found, indent=1) + "\n")
     print(f"{found['machine']}\n\n{table(found)}\n\nwritten: {given.out}")
 

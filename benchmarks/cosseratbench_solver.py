@@ -249,9 +249,15 @@ def _motion(
     states, going = [np.asarray(start.y)], start
     for first in range(0, len(controls), CHUNK):
         going = kc.simulate(
-            start.system, controls[first : first + CHUNK], dt, time=SCHEME, space="lobatto4",
-            start="consistent", initial=going, newton=newton,
-        )  # fmt: skip
+            start.system,
+            controls[first : first + CHUNK],
+            dt,
+            time=SCHEME,
+            space="lobatto4",
+            start="consistent",
+            initial=going,
+            newton=newton,
+        )
         states.append(np.asarray(going.y)[1:])
     return np.concatenate(states)[::steps]
 

@@ -70,10 +70,19 @@ def reel() -> dict[str, Any]:
 
     length, radius = 0.7144, 0.675e-3
     robot = kc.robots.RoutedTendonRobot(
-        length=length, radius=radius, density=0.034 / (length * np.pi * radius**2), youngs_modulus=207e9,
-        bending_damping=5e-4, drag=1e-4, gravity=(9.81, 0.0, 0.0), tendon_offset=0.01506,
-        tendon_angles=(np.pi / 2,), tendon_compliance=1e-4, drive="reel", nodes=200,
-    )  # fmt: skip
+        length=length,
+        radius=radius,
+        density=0.034 / (length * np.pi * radius**2),
+        youngs_modulus=207e9,
+        bending_damping=5e-4,
+        drag=1e-4,
+        gravity=(9.81, 0.0, 0.0),
+        tendon_offset=0.01506,
+        tendon_angles=(np.pi / 2,),
+        tendon_compliance=1e-4,
+        drive="reel",
+        nodes=200,
+    )
     pulled = kc.controls.parse("reel=ramp:0.01619,start=1,end=1.3", 500, DT, robot)
     released = kc.controls.parse("reel=ramp:0.01619,start=13,end=13.3", 500, DT, robot)
     hanging = kc.equilibrium(robot, np.zeros(1))
@@ -130,9 +139,11 @@ def assembled() -> dict[str, float]:
     gripper, t = kc.load_robot("three-finger-gripper"), 0.01 * np.arange(1, 201)[:, None]
     control = 1.0 + np.sin(2.0 * np.pi * t + np.arange(6))
     alone = {
-        "base_end": kc.robots.ends.Clamped(), "tip_end": kc.robots.ends.Free(), "nodes": gripper.nodes,
+        "base_end": kc.robots.ends.Clamped(),
+        "tip_end": kc.robots.ends.Free(),
+        "nodes": gripper.nodes,
         "gravity": gripper.gravity,
-    }  # fmt: skip
+    }
     runs = [functools.partial(kc.simulate, gripper, control, 0.01)]
     for rod, first, last in zip(gripper.rods, (0, 3, 4, 5), (3, 4, 5, 6), strict=True):
         runs.append(functools.partial(kc.simulate, rod.replace(**alone), control[:, first:last], 0.01))

@@ -71,9 +71,14 @@ def _our_rod(nodes: int, factor: float = 1.0) -> Any:
     import knode_cosserat as kc
 
     return kc.robots.SlenderRod(
-        length=LENGTH, radius=RADIUS, density=DENSITY, youngs_modulus=factor * YOUNGS_MODULUS, nodes=nodes,
-        shear_modulus=factor * SHEAR_MODULUS, gravity=GRAVITY,
-    )  # fmt: skip
+        length=LENGTH,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=factor * YOUNGS_MODULUS,
+        nodes=nodes,
+        shear_modulus=factor * SHEAR_MODULUS,
+        gravity=GRAVITY,
+    )
 
 
 # PyElastica: elements, part of the largest stable step. Its clamp fixes the whole first element, so the rod
@@ -95,9 +100,16 @@ def elastica(elements: int, part: float) -> Tips:
     def run() -> np.ndarray:
         simulator = Simulator()
         rod = ea.CosseratRod.straight_rod(
-            elements, np.array([0.0, 0.0, -0.5 * size]), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]),
-            elements * size, RADIUS, DENSITY, youngs_modulus=YOUNGS_MODULUS, shear_modulus=SHEAR_MODULUS,
-        )  # fmt: skip
+            elements,
+            np.array([0.0, 0.0, -0.5 * size]),
+            np.array([0.0, 0.0, 1.0]),
+            np.array([1.0, 0.0, 0.0]),
+            elements * size,
+            RADIUS,
+            DENSITY,
+            youngs_modulus=YOUNGS_MODULUS,
+            shear_modulus=SHEAR_MODULUS,
+        )
         simulator.append(rod)
         simulator.constrain(rod).using(
             ea.OneEndFixedBC, constrained_position_idx=(0,), constrained_director_idx=(0,)
@@ -145,9 +157,13 @@ def _soromox_program(order: int, solver: str, size: float) -> Any:
 
     jax.config.update("jax_enable_x64", True)
     link = sx.LinkSpec.circular(
-        length=LENGTH, radius=RADIUS, density=DENSITY, young_modulus=YOUNGS_MODULUS,
-        shear_modulus=SHEAR_MODULUS, reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
-    )  # fmt: skip
+        length=LENGTH,
+        radius=RADIUS,
+        density=DENSITY,
+        young_modulus=YOUNGS_MODULUS,
+        shear_modulus=SHEAR_MODULUS,
+        reference_strain=[0.0, 0.0, 0.0, 1.0, 0.0, 0.0],
+    )
     basis = sx.StrainBasisSpec("legendre", ("kappa_x", "kappa_y", "kappa_z"), order)
     segment = sx.GVSSegment(link, sx.JointSpec.fixed(), basis, max(5, order + 4))
     robot = sx.GVS.from_segments([segment], gravity=jnp.array(GRAVITY))
@@ -159,10 +175,14 @@ def _soromox_program(order: int, solver: str, size: float) -> Any:
         moved = robot.with_isotropic_material(material)
         steps = diffrax.PIDController(rtol=size, atol=0.1 * size) if adaptive else diffrax.ConstantStepSize()
         found = moved.rollout_to(
-            sx.SystemState(t=jnp.zeros(()), y=jnp.zeros(2 * count)), t1=SECONDS, save_ts=rows,
-            max_steps=200_000, solver_dt=1e-4 if adaptive else size, stepsize_controller=steps,
+            sx.SystemState(t=jnp.zeros(()), y=jnp.zeros(2 * count)),
+            t1=SECONDS,
+            save_ts=rows,
+            max_steps=200_000,
+            solver_dt=1e-4 if adaptive else size,
+            stepsize_controller=steps,
             solver=sx.SemiImplicitEuler(moved) if solver == "semi-implicit Euler" else diffrax.Tsit5(),
-        )  # fmt: skip
+        )
         poses = jax.vmap(lambda q: moved.forward_kinematics(q, jnp.asarray(LENGTH)))(found.y[:, :count])
         return poses[:, :3, 3]
 

@@ -23,10 +23,15 @@ FINEST = 160
 def soft_rod(*ends: float) -> kc.robots.SlenderRod:
     """A damped rod that falls to one side; up to each of these places it is twice as stiff as beyond."""
     return kc.robots.SlenderRod(
-        length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, bending_damping=1e-3,
-        linear_drag=(0.01, 0.01, 0.01), gravity=(2.0, 0.0, -2.0),
+        length=0.5,
+        radius=0.005,
+        density=1200.0,
+        youngs_modulus=5e6,
+        bending_damping=1e-3,
+        linear_drag=(0.01, 0.01, 0.01),
+        gravity=(2.0, 0.0, -2.0),
         sections=tuple(kc.robots.Stretch(end=end, stiffness=[2.0]) for end in ends),
-    )  # fmt: skip
+    )
 
 
 def _falling(*ends: float) -> Callable[[], tuple[Any, np.ndarray, float]]:

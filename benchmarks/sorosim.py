@@ -53,10 +53,17 @@ def rod(name: str, gravity: Any, wrenches: np.ndarray, damping_time: float = 0.0
         for wrench, at in zip(wrenches, (0.5, 1.0), strict=True)
     )
     return SlenderRod(
-        length=length, radius=radius, density=density, youngs_modulus=modulus,
-        shear_modulus=0.5 * modulus / (1.0 + ratio), gravity=gravity, loads=acting, base_end=BASE,
-        nodes=NODES, bending_damping=max(damping_time, 1e-3) * modulus * np.pi * radius**4 / 4.0,
-    )  # fmt: skip
+        length=length,
+        radius=radius,
+        density=density,
+        youngs_modulus=modulus,
+        shear_modulus=0.5 * modulus / (1.0 + ratio),
+        gravity=gravity,
+        loads=acting,
+        base_end=BASE,
+        nodes=NODES,
+        bending_damping=max(damping_time, 1e-3) * modulus * np.pi * radius**4 / 4.0,
+    )
 
 
 def lines_of(path: Path) -> list[str]:

@@ -43,12 +43,20 @@ PATIENCE = 600.0
 def sweep_of(rollouts: int, seed: int = 0) -> Sweep:
     """Return a sweep over a robot's stiffness and its tensions."""
     return Sweep(
-        "delrin-tendon-robot", "sine:{period},amplitude={amplitude}", STEPS, DT,
+        "delrin-tendon-robot",
+        "sine:{period},amplitude={amplitude}",
+        STEPS,
+        DT,
         vary={
-            "period": Range(0.8, 3.0), "amplitude": Range(0.5, 2.0), "youngs_modulus": Range(2e9, 3e9),
+            "period": Range(0.8, 3.0),
+            "amplitude": Range(0.5, 2.0),
+            "youngs_modulus": Range(2e9, 3e9),
         },
-        sampler="sobol", samples=rollouts, seed=seed, shard=min(SHARD, max(16, rollouts // 16)),
-    )  # fmt: skip
+        sampler="sobol",
+        samples=rollouts,
+        seed=seed,
+        shard=min(SHARD, max(16, rollouts // 16)),
+    )
 
 
 def measure_sweep(
@@ -152,9 +160,11 @@ def _run(folder: Path, sweep: Sweep, workers: int) -> dict[str, float]:
     rows = Plan.of(sweep).shard_cases
     steady = rows * (len(ends) - skipped) / (ends[-1] - ends[skipped - 1])
     return {
-        "seconds": seconds, "steady_per_second": steady, "cpu": runs[-1]["case_cpu_seconds"],
+        "seconds": seconds,
+        "steady_per_second": steady,
+        "cpu": runs[-1]["case_cpu_seconds"],
         "megabytes": megabytes,
-    }  # fmt: skip
+    }
 
 
 def _largest_process(root: int) -> float:

@@ -239,17 +239,24 @@ def beam_rod(beam: Beam, load: float, nodes: int) -> SlenderRod:
     Kbt = np.diag([E * second_moment, E * second_moment, G * torsion_constant()])
     half = 0.5 * beam.tilt
     return SlenderRod(
-        length=LENGTH, radius=WIDTH / np.sqrt(np.pi), density=DENSITY, youngs_modulus=E, shear_modulus=G,
-        shear_stiffness=Kse, bending_stiffness=Kbt, shear_damping=beam.damping_time * Kse,
+        length=LENGTH,
+        radius=WIDTH / np.sqrt(np.pi),
+        density=DENSITY,
+        youngs_modulus=E,
+        shear_modulus=G,
+        shear_stiffness=Kse,
+        bending_stiffness=Kbt,
+        shear_damping=beam.damping_time * Kse,
         bending_damping=beam.damping_time * Kbt,
         effects=(Relaxation(beam.branch_stiffness, beam.relaxation_time, shear=True),),
-        gravity=(-GRAVITY, 0.0, 0.0), nodes=nodes,
+        gravity=(-GRAVITY, 0.0, 0.0),
+        nodes=nodes,
         base_end=Clamped(orientation=(np.cos(half), 0.0, -np.sin(half), 0.0)),
         loads=(
             AttachedMass(mass=load, offset=UPPER_EDGE),
             PointWrench(force=(1.0, 0.0, 0.0), controlled=True),
         ),
-    )  # fmt: skip
+    )
 
 
 def tip_height(recording: BeamRecording) -> float:

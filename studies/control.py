@@ -210,8 +210,9 @@ def checks(facts: Mapping[str, Any], cells: Sequence[Mapping[str, Any]]) -> list
 
     modulus = [
         abs(cell["parameters"]["youngs_modulus"] / cell["true_modulus"] - 1.0)
-        for cell in own if cell["robot"].startswith("stiffness") and "steps" not in cell["reference"]
-    ]  # fmt: skip
+        for cell in own
+        if cell["robot"].startswith("stiffness") and "steps" not in cell["reference"]
+    ]
     slow, fast = facts["times"]["0.05"], facts["times"]["0.02"]
     smooth = facts["smoother"]["shape_error_percent"]
     observed = []
@@ -259,16 +260,19 @@ def as_markdown(cells: Sequence[Mapping[str, Any]], made: Sequence[Mapping[str, 
             if own:
                 tracked = [f"{own[path]['rmse_percent']:.3g}" if path in own else "not run" for path in paths]
                 rows.append([name, controller, *tracked])
-    return "\n\n".join(
-        [
-            "# Closed-loop control",
-            f"Simulated robots, exact measurements of the tip, control at {1.0 / DT:.0f} Hz. Tip RMSE in "
-            f"% of the length from {SETTLED:g} to {SECONDS:g} s; after a step from {TRANSIT:g} s on.",
-            markdown_table(["robot", "controller", *paths], rows),
-            checks_table(made),
-            *([] if any(cell["robot"] == stand_in.ROBOT for cell in cells) else [stand_in.MISSING]),
-        ]
-    ) + "\n"  # fmt: skip
+    return (
+        "\n\n".join(
+            [
+                "# Closed-loop control",
+                f"Simulated robots, exact measurements of the tip, control at {1.0 / DT:.0f} Hz. Tip RMSE in "
+                f"% of the length from {SETTLED:g} to {SECONDS:g} s; after a step from {TRANSIT:g} s on.",
+                markdown_table(["robot", "controller", *paths], rows),
+                checks_table(made),
+                *([] if any(cell["robot"] == stand_in.ROBOT for cell in cells) else [stand_in.MISSING]),
+            ]
+        )
+        + "\n"
+    )
 
 
 #: observers by name
@@ -309,11 +313,14 @@ def limits(settings: Any) -> Product:
         late += int(np.sum(log.feedback + log.preparation > DT))
     return Product(
         {
-            "runs": settings["runs"], "exceeded": exceeded, "fallbacks": fallbacks, "periods": periods,
+            "runs": settings["runs"],
+            "exceeded": exceeded,
+            "fallbacks": fallbacks,
+            "periods": periods,
             "late": late,
         },
         {},
-    )  # fmt: skip
+    )
 
 
 def observers(settings: Any) -> Product:
@@ -386,12 +393,16 @@ def smoother(settings: Any) -> Product:
             plant.apply(control)
         position, quaternion = np.array(seen), np.array(turned)
         measured = Measurements(
-            time=DT * np.arange(len(controls)), tension=controls, fractions=np.array(BODIES),
+            time=DT * np.arange(len(controls)),
+            tension=controls,
+            fractions=np.array(BODIES),
             position=position + TipPosition().sigma * rng.normal(size=position.shape),
             quaternion=quaternion + TURN_NOISE * rng.normal(size=quaternion.shape),
-            measured=np.ones(position.shape[:2], dtype=bool), simulated=True, source="study of control",
+            measured=np.ones(position.shape[:2], dtype=bool),
+            simulated=True,
+            source="study of control",
             initial_tension=STILL,
-        )  # fmt: skip
+        )
         apart = np.asarray(estimate_states(measured, robot).position) - np.array(true)
         errors = np.sqrt(np.mean(np.sum(apart**2, axis=-1), axis=-1)) / float(robot.length)
         worst.append(max(errors[20:25]))

@@ -144,9 +144,9 @@ def rate(settings: Any) -> Product:
     environment, robot = make("follow"), load_robot("delrin-tendon-robot")
     vector, random = VectorEnv(environment, count), np.random.default_rng(0)
     period, scale = random.uniform(0.8, 3.0, count), random.uniform(0.8, 1.2, count)
-    tension = np.stack([
-        a * controls.sine(p, PERIODS, environment.dt) for p, a in zip(period, scale, strict=True)
-    ])  # fmt: skip
+    tension = np.stack(
+        [a * controls.sine(p, PERIODS, environment.dt) for p, a in zip(period, scale, strict=True)]
+    )
     actions = 2.0 * tension / 10.0 - 1.0
 
     def stepped(seed: int) -> tuple[float, bytes]:
@@ -171,11 +171,14 @@ def rate(settings: Any) -> Product:
     vector.close()
     return Product(
         {
-            "rate": steps / ours, "raw": steps / raw, "ratio": raw / ours, "compiled": compiled,
+            "rate": steps / ours,
+            "raw": steps / raw,
+            "ratio": raw / ours,
+            "compiled": compiled,
             "different": different,
         },
         {},
-    )  # fmt: skip
+    )
 
 
 def task(settings: Any) -> Product:
@@ -218,9 +221,12 @@ def ppo(settings: Any) -> Product:
     score = float(policy_scores(environment, training.policy, held_out).mean())
     curve = [list(history[k]) for k in np.unique(np.linspace(0, len(history) - 1, 200).astype(int))]
     facts = {
-        "reference": reference, "score": score, "ratio": score / reference,
-        "until": until if np.isfinite(until) else 1e9, "curve": curve,
-    }  # fmt: skip
+        "reference": reference,
+        "score": score,
+        "ratio": score / reference,
+        "until": until if np.isfinite(until) else 1e9,
+        "curve": curve,
+    }
     gif = file_bytes(
         "episode.gif", lambda path: animate_episode(environment, training.policy, held_out[0], path)
     )

@@ -95,9 +95,15 @@ def as_markdown(cells: Sequence[Mapping[str, Any]]) -> str:
             paper, best = (own[method, quantity] for method in METHODS)
             said = f"{factor * known[quantity]:.3g}" if quantity in known else ""
             rows.append(
-                [f"{title} [{unit}]", f"{factor * paper['size']:.3g}", said, f"{factor * paper['rms']:.3g}",
-                 f"{factor * best['rms']:.3g}", f"{paper['rms'] / best['rms']:.1f}"]
-            )  # fmt: skip
+                [
+                    f"{title} [{unit}]",
+                    f"{factor * paper['size']:.3g}",
+                    said,
+                    f"{factor * paper['rms']:.3g}",
+                    f"{factor * best['rms']:.3g}",
+                    f"{paper['rms'] / best['rms']:.1f}",
+                ]
+            )
         heads = ["quantity", "its size", "markers' noise", "paper", "best", "paper / best"]
         parts += [f"## {signal}, with {TRUE} balance", markdown_table(heads, rows)]
     rows = []

@@ -124,8 +124,14 @@ def measured_tip(robot: EmulatedRobot, random: np.random.Generator) -> tuple[flo
 
 #: faults of robot, board and host
 KINDS = (
-    "sensor-rail", "sensor-stuck", "over-tension", "watchdog", "stopped", "restarted", "emergency-stop",
-)  # fmt: skip
+    "sensor-rail",
+    "sensor-stuck",
+    "over-tension",
+    "watchdog",
+    "stopped",
+    "restarted",
+    "emergency-stop",
+)
 #: burst of bit errors: its duration (s), and bounds of the part of flipped bits. With the least, half of the
 #: lines come through, and the loop goes on; with the greatest none, and the watchdog latches
 BURST, BURST_RATES = 0.4, (2e-3, 2e-2)
@@ -134,9 +140,13 @@ NOISE_BURST = "line-noise"
 HOST = ("watchdog", "stopped")
 #: time after a fault within which no motor may reel in any more (s): conversions, three readings, one line
 REACTION = {
-    "emergency-stop": 2 / 256, "sensor-rail": 6 / 256, "over-tension": 6 / 256, "restarted": 2 / 256,
-    "stopped": 4 / 256, "watchdog": 0.1,
-}  # fmt: skip
+    "emergency-stop": 2 / 256,
+    "sensor-rail": 6 / 256,
+    "over-tension": 6 / 256,
+    "restarted": 2 / 256,
+    "stopped": 4 / 256,
+    "watchdog": 0.1,
+}
 #: over-tension limit of the board (N), and the time after a fault in which it releases tendons (s): 0.5 s,
 #: which begin anew with the driver's stop in the next period
 BOARD_LIMIT, RELEASE = 2300 * GRAM_FORCE, 0.5 + 2 * DT
@@ -422,13 +432,16 @@ def build(settings: Any) -> Product:
         began = clock.perf_counter()
         subprocess.run(
             ["make", "-s", "-C", str(firmware_folder()), f"OUT={folder}", "all"],
-            check=True, capture_output=True,
-        )  # fmt: skip
+            check=True,
+            capture_output=True,
+        )
         seconds = clock.perf_counter() - began
     shown = subprocess.run(
         ["avr-size", "-C", "--mcu=atmega2560", built() / "tension.elf"],
-        check=True, capture_output=True, text=True,
-    ).stdout  # fmt: skip
+        check=True,
+        capture_output=True,
+        text=True,
+    ).stdout
     flash, ram = (int(each) for each in re.findall(r":\s+(\d+) bytes", shown))
     return Product({"seconds": seconds, "flash": flash, "ram": ram}, {})
 
@@ -527,9 +540,14 @@ def loop(settings: Any) -> Product:
             board.disarm()
     worst = max(errors.values(), default=float("inf"))
     facts = {
-        "rmse": worst if np.isfinite(worst) else 1e9, "errors": errors, "lag": lag, "unsafe": unsafe,
-        "faults": failed, "fallbacks": missing_rows, "damaged_lines": dict(board.line_counts),
-    }  # fmt: skip
+        "rmse": worst if np.isfinite(worst) else 1e9,
+        "errors": errors,
+        "lag": lag,
+        "unsafe": unsafe,
+        "faults": failed,
+        "fallbacks": missing_rows,
+        "damaged_lines": dict(board.line_counts),
+    }
     return Product(facts, {})
 
 

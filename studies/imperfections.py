@@ -61,11 +61,20 @@ LEFT = 0.05
 KINDS: dict[str, type[TendonRobot]] = {
     kind.__name__: kind
     for kind in (
-        TendonRobot, truths.Stiffening, truths.Precurved, truths.Tapered, truths.InternalFriction,
-        truths.ExternalFriction, truths.Wind, truths.TurningTendons, truths.FadingTendons, truths.TipMass,
-        truths.FollowerLoad, truths.TipFriction,
+        TendonRobot,
+        truths.Stiffening,
+        truths.Precurved,
+        truths.Tapered,
+        truths.InternalFriction,
+        truths.ExternalFriction,
+        truths.Wind,
+        truths.TurningTendons,
+        truths.FadingTendons,
+        truths.TipMass,
+        truths.FollowerLoad,
+        truths.TipFriction,
     )
-}  # fmt: skip
+}
 
 
 def _is(kind: str = "TendonRobot", **truth: Any) -> dict[str, Any]:
@@ -310,9 +319,14 @@ def figure(cells: Cells) -> Figure:
                 known = {line: max(ratio, LEAST) for line, ratio in at.items() if ratio is not None}
                 far = control in FAR
                 axes.plot(
-                    list(known.values()), list(known), "^" if far else "o", label=control, markersize=4.5,
-                    color=PALETTE[k % len(PALETTE)], markerfacecolor="white" if far else None,
-                )  # fmt: skip
+                    list(known.values()),
+                    list(known),
+                    "^" if far else "o",
+                    label=control,
+                    markersize=4.5,
+                    color=PALETTE[k % len(PALETTE)],
+                    markerfacecolor="white" if far else None,
+                )
                 broken = [line for line in at if line not in known]
                 edge = axes.get_yaxis_transform()
                 axes.plot([0.985] * len(broken), broken, "x", color=PALETTE[k % len(PALETTE)], transform=edge)

@@ -219,9 +219,10 @@ class PolicyTraining:
         policy_key, value_key, self._key = jax.random.split(jax.random.PRNGKey(seed), 3)
         sizes = (size, *settings.hidden)
         networks = Networks(
-            network(policy_key, (*sizes, actions), 0.01), network(value_key, (*sizes, 1), 1.0),
+            network(policy_key, (*sizes, actions), 0.01),
+            network(value_key, (*sizes, 1), 1.0),
             jnp.full(actions, np.log(settings.deviation), dtype=jnp.float32),
-        )  # fmt: skip
+        )
         steps_of_optimiser = self._updates * settings.epochs * (per_update // settings.batch)
         self._optimiser = optax.chain(
             optax.clip_by_global_norm(0.5),

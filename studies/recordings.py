@@ -220,9 +220,11 @@ def measured(settings: Any) -> Product:
         # the rows that the paper keeps: rest, and the states after all controls but the last
         rows = read.rows(name).rows(0, round(read.window(name).seconds / DT))
         facts[name] = {
-            "time": _plain(rows.time, 6), "tip": _plain(rows.tip_position, 6), "simulated": rows.simulated,
+            "time": _plain(rows.time, 6),
+            "tip": _plain(rows.tip_position, 6),
+            "simulated": rows.simulated,
             "findings": [f"{it.topic}: {it.message}" for it in read[name].findings if it.severity != "note"],
-        }  # fmt: skip
+        }
     return Product(facts, {})
 
 
@@ -377,9 +379,7 @@ def _outcome(
     return compared(system, moved, measured, every=learned.finer, last=rows)
 
 
-def _paper_motion(
-    system: System, resting: System, measured: Measurements, recovery: float
-) -> Trajectory:  # fmt: skip
+def _paper_motion(system: System, resting: System, measured: Measurements, recovery: float) -> Trajectory:
     """Return a motion by the paper's schemes: as in its simulations, all models start in the same rest.
 
     That is the equilibrium of the nominal robot: the paper's robot points up there, others may sag.
@@ -388,10 +388,15 @@ def _paper_motion(
     rest = None if before is None else equilibrium(resting, before, space=PAPER_SPACE)
     acting = remove_delay(system, measured.tension[:-1], measured.dt, before)
     return simulate(
-        system, acting, measured.dt, time="bdf2", space=PAPER_SPACE, start="paper",
+        system,
+        acting,
+        measured.dt,
+        time="bdf2",
+        space=PAPER_SPACE,
+        start="paper",
         initial="unstressed" if rest is None else rest,
         recovery_budget=recovery,
-    )  # fmt: skip
+    )
 
 
 TIP = {"tip_rmse": ("Tip RMSE [cm]", 100.0)}
@@ -645,9 +650,13 @@ def horizon(recordings: Mapping[str, Predicted]) -> Figure:
             look = LINES.get(method, {})
             axes.plot(time, 100.0 * means, label=method, **look)
             axes.fill_between(
-                time, 100.0 * np.nanmin(off, axis=0), 100.0 * np.nanmax(off, axis=0),
-                color=look.get("color"), alpha=0.12, linewidth=0,
-            )  # fmt: skip
+                time,
+                100.0 * np.nanmin(off, axis=0),
+                100.0 * np.nanmax(off, axis=0),
+                color=look.get("color"),
+                alpha=0.12,
+                linewidth=0,
+            )
         axes.set(
             xlabel="time since the prediction began [s]", ylabel="distance of the tips [cm]", yscale="log"
         )

@@ -88,9 +88,21 @@ def spreads(
 
 
 _COLUMNS = (
-    "imperfection", "control", "measure", "method", "mean", "deviation", "least", "most", "seeds", "failed",
-    "paper_baseline", "paper_knode", "rerun_knode", "ratio_to_paper_knode",
-)  # fmt: skip
+    "imperfection",
+    "control",
+    "measure",
+    "method",
+    "mean",
+    "deviation",
+    "least",
+    "most",
+    "seeds",
+    "failed",
+    "paper_baseline",
+    "paper_knode",
+    "rerun_knode",
+    "ratio_to_paper_knode",
+)
 
 
 def as_csv(cells: Cells, published: Mapping[Case, Published]) -> str:

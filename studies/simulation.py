@@ -126,8 +126,12 @@ def jobs(seeds: Sequence[int], methods: Sequence[str], robot: str = ROBOT) -> li
     """One job for each imperfection and method, with all seeds and both controls, and one for the truth."""
     setting = SETTINGS[robot]
     common = {
-        "robot": robot, "dt": DT, "rows": ROWS, "controls": dict(setting.controls), "space": setting.space,
-    }  # fmt: skip
+        "robot": robot,
+        "dt": DT,
+        "rows": ROWS,
+        "controls": dict(setting.controls),
+        "space": setting.space,
+    }
     learning = {"training": list(setting.training), "training_rows": TRAINING_ROWS, "seeds": list(seeds)}
     made = [
         Job(

@@ -111,9 +111,13 @@ def controller_of(model: Model, name: str, dt: float, limits: ControlLimits, ada
 
 
 def tracked(
-    settings: Mapping[str, Any], paths: Mapping[str, Reference], dt: float, limits: ControlLimits,
-    seconds: float, error: Callable[[LoopLog, str], float],
-) -> dict[str, Any]:  # fmt: skip
+    settings: Mapping[str, Any],
+    paths: Mapping[str, Reference],
+    dt: float,
+    limits: ControlLimits,
+    seconds: float,
+    error: Callable[[LoopLog, str], float],
+) -> dict[str, Any]:
     """Return cells of the study's table for all controllers, and facts of the model.
 
     Args:

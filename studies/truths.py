@@ -168,9 +168,13 @@ class Wind(TendonRobot):
     """Drag in moving air: it depends on the velocity relative to the wind."""
 
     wind: Any = parameter(
-        "m/s", "velocity of the air, global frame", shape="vector", low=-100.0, high=100.0,
+        "m/s",
+        "velocity of the air, global frame",
+        shape="vector",
+        low=-100.0,
+        high=100.0,
         default=(3.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
 
     def balance(self, s, t, y, y_t, z, z_t, control):  # type: ignore[no-untyped-def]
         """Return the rates with this robot's additional effect."""
@@ -229,9 +233,13 @@ class TipMass(LoadedTip):
         "kg m2", "inertia about its centre", shape="matrix", low=0.0, high=100.0, default=0.0
     )
     tip_offset: Any = parameter(
-        "m", "its centre as seen from the tip, material frame", shape="vector", low=-1.0, high=1.0,
+        "m",
+        "its centre as seen from the tip, material frame",
+        shape="vector",
+        low=-1.0,
+        high=1.0,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
 
     def load_at_tip(self, R: Any, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> tuple[Any, Any]:
         """Return the body's weight minus its inertia force, and the moment about the tip."""

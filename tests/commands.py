@@ -9,10 +9,33 @@ from knode_cosserat.cli import app
 from studies.__main__ import app as studies
 
 ROBOT = "delrin-tendon-robot"
-COMMANDS = ("simulate", "equilibrium", "info", "reach", "modes", "workspace", "fit", "evaluate", "plot",
-            "animate", "inspect", "sweep", "record-virtual", "schema", "doctor", "view",
-            "robot connect", "robot reset", "robot tare", "robot calibrate", "robot jog", "robot record",
-            "robot run", "robot steer", "robot commission")  # fmt: skip
+COMMANDS = (
+    "simulate",
+    "equilibrium",
+    "info",
+    "reach",
+    "modes",
+    "workspace",
+    "fit",
+    "evaluate",
+    "plot",
+    "animate",
+    "inspect",
+    "sweep",
+    "record-virtual",
+    "schema",
+    "doctor",
+    "view",
+    "robot connect",
+    "robot reset",
+    "robot tare",
+    "robot calibrate",
+    "robot jog",
+    "robot record",
+    "robot run",
+    "robot steer",
+    "robot commission",
+)
 
 
 def run(*arguments):

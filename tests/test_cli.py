@@ -58,9 +58,15 @@ def test_simulate_writes_what_the_package_computes(tmp_path):
 
 def test_a_robot_that_sags_is_simulated_from_its_equilibrium(tmp_path):
     rod = kc.robots.SlenderRod(
-        length=0.3, radius=0.004, density=1200.0, youngs_modulus=2e8, bending_damping=1e-3, nodes=6,
-        gravity=[9.81, 0.0, 0.0], base_end=kc.robots.ends.Driven(axes=("x",)),
-    )  # fmt: skip
+        length=0.3,
+        radius=0.004,
+        density=1200.0,
+        youngs_modulus=2e8,
+        bending_damping=1e-3,
+        nodes=6,
+        gravity=[9.81, 0.0, 0.0],
+        base_end=kc.robots.ends.Driven(axes=("x",)),
+    )
     kc.save_robot(rod, tmp_path / "rod.yaml")
     words = ("simulate", tmp_path / "rod.yaml", "--controls", "none", "--steps", 4, "--dt", 0.02, "--out")
     told(*words, tmp_path / "a.nc")
@@ -80,8 +86,13 @@ def test_a_robot_that_sags_is_simulated_from_its_equilibrium(tmp_path):
 def test_simulate_takes_schemes_and_parameters(tmp_path):
     facts = told(
         *simulated(tmp_path / "a.nc", "--dt", 0.02, "--time", "bdf1", "--space", "lobatto4", "--nodes", 7),
-        "--set", "youngs_modulus=10e9", "--set", "gravity=[0, 0, -1e0]", "--set", "drag=0",
-    )  # fmt: skip
+        "--set",
+        "youngs_modulus=10e9",
+        "--set",
+        "gravity=[0, 0, -1e0]",
+        "--set",
+        "drag=0",
+    )
     made = kc.load_trajectory(tmp_path / "a.nc")
     assert (type(made.settings.time), type(made.settings.space)) == (kc.solvers.BDF1, kc.solvers.Lobatto4)
     assert made.system.youngs_modulus == 10e9
@@ -337,9 +348,24 @@ def test_fit_tells_what_it_did(data, tmp_path):
 def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
     out = tmp_path / "models"
     facts = told(
-        "fit", ROBOT, data / "a.nc", "--set", "length=0.6", "--preset", "paper", "--seeds", "3,1",
-        "--epochs", 20, "--checkpoint", tmp_path / "kept", "--log", tmp_path / "log", "--out", out,
-    )  # fmt: skip
+        "fit",
+        ROBOT,
+        data / "a.nc",
+        "--set",
+        "length=0.6",
+        "--preset",
+        "paper",
+        "--seeds",
+        "3,1",
+        "--epochs",
+        20,
+        "--checkpoint",
+        tmp_path / "kept",
+        "--log",
+        tmp_path / "log",
+        "--out",
+        out,
+    )
     assert [model["seed"] for model in facts["models"]] == [3, 1]
     one, other = (model["segments"] for model in facts["models"])
     assert one["steps"] == other["steps"] == 20
@@ -377,9 +403,14 @@ def python(*arguments, cwd):
     """Python in a process of its own, with the package that is tested here."""
     source = str(Path(importlib.util.find_spec("knode_cosserat").origin).parents[1])
     return subprocess.run(
-        [sys.executable, *map(str, arguments)], cwd=cwd, env=os.environ | {"PYTHONPATH": source},
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+        [sys.executable, *map(str, arguments)],
+        cwd=cwd,
+        env=os.environ | {"PYTHONPATH": source},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
 
 
 def program(*arguments, cwd):
@@ -409,8 +440,14 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     assert (done.returncode, done.stderr) == (0, "")
     written = {path.name for path in (tmp_path / "pictures").iterdir()}
     assert written == {
-        "truth.nc", "overview.png", "model", "learning.png", "scene.html", "calibrated.yaml", "recording.png",
-    }  # fmt: skip
+        "truth.nc",
+        "overview.png",
+        "model",
+        "learning.png",
+        "scene.html",
+        "calibrated.yaml",
+        "recording.png",
+    }
     rows = {line[3:33].strip(): line[33:].split() for line in done.stdout.splitlines()}
     before, published, ours = (
         [float(word) for word in rows[label]]

@@ -416,9 +416,12 @@ def test_functions_may_return_a_signal_without_effect():
 # controls by name
 
 ROD = kc.robots.SlenderRod(
-    length=0.5, radius=0.005, density=1000.0, youngs_modulus=2e7,
+    length=0.5,
+    radius=0.005,
+    density=1000.0,
+    youngs_modulus=2e7,
     base_end=kc.robots.ends.Driven(axes=("x", "z", "ry")),
-)  # fmt: skip
+)
 NAMED = "time [s],base_z [m],base_ry [rad]\n"
 
 

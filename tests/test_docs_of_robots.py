@@ -46,9 +46,11 @@ ABSENCE = re.compile(
 )
 #: claims that name a part of the package and are right: what they say is not there is another thing
 RIGHT = (
-    "inertia by the speed of insertion are not modelled", "The fluid's own mass and its flow resistance",
-    "parts with states, or at places within it, are refused", "Friction has no linearisation",
-)  # fmt: skip
+    "inertia by the speed of insertion are not modelled",
+    "The fluid's own mass and its flow resistance",
+    "parts with states, or at places within it, are refused",
+    "Friction has no linearisation",
+)
 #: words of users for what a control or a kind is called
 SYNONYMS = {
     "insertion": ("fed", "feed", "feeding"),
@@ -86,11 +88,12 @@ def wrong_claims(page: str) -> list[str]:
     sentences = (" ".join(it.split()) for it in re.split(r"(?<=[.;|])\s+", page))
     words = there()
     return [
-        it for it in sentences
+        it
+        for it in sentences
         if ABSENCE.search(it)
         and words & set(re.findall(r"[a-z]+", it.lower()))
         and not any(right in it for right in RIGHT)
-    ]  # fmt: skip
+    ]
 
 
 def test_no_page_on_robots_denies_what_is_there():
@@ -110,9 +113,11 @@ def test_no_page_on_robots_denies_what_is_there():
 def test_claims_of_absence_are_found():
     for claim in (
         "A rod whose length is a control (a rod fed through a hole) is not available; it is pushed.",
-        "Robots on reels are refused.", "There is no support for a magnetic field.",
-        "Concentric tubes are not yet supported.", "Pneumatic drives are not implemented.",
-    ):  # fmt: skip
+        "Robots on reels are refused.",
+        "There is no support for a magnetic field.",
+        "Concentric tubes are not yet supported.",
+        "Pneumatic drives are not implemented.",
+    ):
         assert wrong_claims(claim), claim
     assert not wrong_claims(
         "Robots on reels are decided by their motion. A wall that is too thin is refused."

@@ -38,9 +38,13 @@ class Cane(kc.System):
     """A rod of a user: the paper's equations in the general form, pushed across by two forces."""
 
     y_layout: ClassVar = kc.robots.Layout(
-        ("p", 3, "m", "position"), ("h", 4, "1", "orientation"), ("n", 3, "N", "force", "h", "N/m"),
-        ("m", 3, "N m", "moment", "h", "N"), ("q", 3, "m/s", "velocity"), ("w", 3, "rad/s", "spin"),
-    )  # fmt: skip
+        ("p", 3, "m", "position"),
+        ("h", 4, "1", "orientation"),
+        ("n", 3, "N", "force", "h", "N/m"),
+        ("m", 3, "N m", "moment", "h", "N"),
+        ("q", 3, "m/s", "velocity"),
+        ("w", 3, "rad/s", "spin"),
+    )
     z_layout: ClassVar = kc.robots.Layout(("v", 3, "1", "stretch"), ("u", 3, "1/m", "curvature"))
     control_layout: ClassVar = kc.robots.Layout(("tension", 2, "N", "pulls along x and y"))
     base_unknowns: ClassVar = ("n", "m")
@@ -64,9 +68,13 @@ class Cane(kc.System):
         q, w, q_t, w_t = get(y, "q"), get(y, "w"), get(y_t, "q"), get(y_t, "w")
         push = jnp.concatenate([control, jnp.zeros(1)])
         f = [
-            R @ v, quaternion_rate(get(y, "h"), u), self.mass * (R @ (cross(w, q) + q_t)) - push,
-            1e-6 * w_t - cross(R @ v, get(y, "n")), v_t - cross(u, q) + cross(w, v), u_t - cross(u, w),
-        ]  # fmt: skip
+            R @ v,
+            quaternion_rate(get(y, "h"), u),
+            self.mass * (R @ (cross(w, q) + q_t)) - push,
+            1e-6 * w_t - cross(R @ v, get(y, "n")),
+            v_t - cross(u, q) + cross(w, v),
+            u_t - cross(u, w),
+        ]
         return jnp.concatenate(f)
 
     def rest(self, s):
@@ -109,9 +117,12 @@ MEANS = {
 }  # fmt: skip
 #: identified parameters of robots of which it is not Young's modulus
 PARAMETERS = {
-    "own": "bending", "model of own": "bending", "arm": "effects.0.offset", "tubes": "tubes.1.curvature",
+    "own": "bending",
+    "model of own": "bending",
+    "arm": "effects.0.offset",
+    "tubes": "tubes.1.curvature",
     "gripper": "rods.thumb.youngs_modulus",
-}  # fmt: skip
+}
 
 
 class Made(NamedTuple):
@@ -242,8 +253,13 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
 }
 #: they compile for long
 SLOW = {
-    "stability", "equilibrium_path", "identify, poses", "fit, passive", "fit, network", "predictive control",
-}  # fmt: skip
+    "stability",
+    "equilibrium_path",
+    "identify, poses",
+    "fit, passive",
+    "fit, network",
+    "predictive control",
+}
 #: kinds for which every other function is called each time
 OFTEN = {"model of a model"}
 #: functions that are not called each time for a model of a model: they compile as long again

@@ -160,8 +160,11 @@ def test_one_load_does_for_a_list_of_one():
 def test_the_doctor_finds_this_installation_well():
     found = kc.diagnosis.doctor()
     assert found.well and {check.name for check in found.checks} == {
-        "precision", "cache", "simulation", "balance",
-    }  # fmt: skip
+        "precision",
+        "cache",
+        "simulation",
+        "balance",
+    }
     assert "all checks passed" in str(found) and found.versions["jax"]
 
 
@@ -205,8 +208,11 @@ def test_recovered_steps_are_told_to_the_logger(caplog):
 def test_the_shell_completes_robots_and_commands():
     line = "knode-cosserat simulate delrin-"
     env = {
-        **os.environ, "COMP_WORDS": line, "COMP_CWORD": "2", "_KNODE_COSSERAT_COMPLETE": "complete_bash",
-    }  # fmt: skip
+        **os.environ,
+        "COMP_WORDS": line,
+        "COMP_CWORD": "2",
+        "_KNODE_COSSERAT_COMPLETE": "complete_bash",
+    }
     program = "from knode_cosserat.cli import main; main()"
     done = subprocess.run([sys.executable, "-c", program], env=env, capture_output=True, text=True)
     assert done.stdout.split() == ["delrin-routed-tendon-robot", "delrin-tendon-robot"], done.stderr
@@ -226,8 +232,10 @@ def test_a_type_checker_sees_the_types_from_outside(tmp_path):
     assert marker.exists()
     done = subprocess.run(
         [sys.executable, "-m", "mypy", "--follow-imports=silent", "user.py"],
-        cwd=tmp_path, capture_output=True, text=True,
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
         env={**os.environ, "MYPYPATH": str(marker.parent.parent)},
-    )  # fmt: skip
+    )
     assert 'Revealed type is "knode_cosserat.trajectory.Trajectory"' in done.stdout, done.stdout + done.stderr
     assert 'Argument "dt" to "simulate" has incompatible type "str"' in done.stdout

@@ -190,9 +190,18 @@ FUNCTIONS: dict[Any, dict[str, str]] = {
 }
 #: functions without arguments, for who extends the package, or of anything that is drawn
 OTHERS = {
-    "catalog", "load_example", "robot_schema", "register", "register_controller",
-    "parameter", "effects_of", "make", "curves", "error", "path",
-}  # fmt: skip
+    "catalog",
+    "load_example",
+    "robot_schema",
+    "register",
+    "register_controller",
+    "parameter",
+    "effects_of",
+    "make",
+    "curves",
+    "error",
+    "path",
+}
 
 
 def name_of(function: Any) -> str:
@@ -204,9 +213,11 @@ def test_every_public_function_is_tried():
     tried = {getattr(it, "func", it) for it in FUNCTIONS}
     spaces = [it for name in kc.__all__ if isinstance(it := getattr(kc, name), types.ModuleType)]
     public = {
-        (name, thing) for space in (kc, *spaces) for name in getattr(space, "__all__", ())
+        (name, thing)
+        for space in (kc, *spaces)
+        for name in getattr(space, "__all__", ())
         if inspect.isfunction(thing := getattr(space, name))
-    }  # fmt: skip
+    }
     assert {name for name, thing in public if thing not in tried} == OTHERS
 
 
@@ -254,8 +265,11 @@ def nothing_is_compiled(monkeypatch, tmp_path, request):
 
 @pytest.mark.parametrize("function", FUNCTIONS, ids=name_of)
 def test_near_misses_are_refused_in_one_line(function):
-    found = {name: said for arguments, name in misses(FUNCTIONS[function])
-             if (said := complaint(function, arguments))}  # fmt: skip
+    found = {
+        name: said
+        for arguments, name in misses(FUNCTIONS[function])
+        if (said := complaint(function, arguments))
+    }
     assert not found, "\n".join(f"{name}: {said}" for name, said in sorted(found.items()))
 
 

@@ -266,9 +266,12 @@ def test_results_print_words(rest):
     assert str(rest.result) == "[CONVERGED]" and str(rest.result[0]) == f"{rest.result[0]}" == "CONVERGED"
     assert rest.result.dtype.kind == "i" and rest.result.tolist() == [0] and f"{rest.result[0]:d}" == "0"
     failed = kc.equilibrium(
-        ROBOT, [2.0, 0.0, 0.0, 0.0], newton=kc.solvers.NewtonOptions(max_linearisations=1),
-        recovery_budget=0.0, on_failure="return",
-    )  # fmt: skip
+        ROBOT,
+        [2.0, 0.0, 0.0, 0.0],
+        newton=kc.solvers.NewtonOptions(max_linearisations=1),
+        recovery_budget=0.0,
+        on_failure="return",
+    )
     assert str(failed.result) == "[NO_CONVERGENCE]" and failed.result[0] is kc.Result.NO_CONVERGENCE
     assert type(failed.result < 0) is np.ndarray and (failed.result < 0).all()
     assert str(kc.statics.Reach.UNREACHABLE) == "UNREACHABLE"

@@ -196,8 +196,13 @@ def test_labels(tmp_path):
     trajectory.save(tmp_path / "a.nc")
     with xarray.open_dataset(tmp_path / "a.nc") as data:
         assert dict(data.sizes) == {
-            "batch": 2, "time": 3, "node": 5, "axis": 3, "quaternion": 4, "tension_index": 4,
-        }  # fmt: skip
+            "batch": 2,
+            "time": 3,
+            "node": 5,
+            "axis": 3,
+            "quaternion": 4,
+            "tension_index": 4,
+        }
         assert data["p"].dims == ("batch", "time", "node", "axis")
         assert data["h"].dims == ("batch", "time", "node", "quaternion")
         assert data["tension"].dims == ("batch", "time", "tension_index")
@@ -205,8 +210,12 @@ def test_labels(tmp_path):
         assert data["p"].attrs == {"units": "m", "long_name": "position, global frame"}
         assert set(data.coords) == {"time", "arclength", "axis", "quaternion", "tension_index"}
         assert {name: data[name].attrs["units"] for name in ("time", "arclength", "n", "u", "tension")} == {
-            "time": "s", "arclength": "m", "n": "N", "u": "1/m", "tension": "N",
-        }  # fmt: skip
+            "time": "s",
+            "arclength": "m",
+            "n": "N",
+            "u": "1/m",
+            "tension": "N",
+        }
         assert all(data[name].attrs["long_name"] for name in data.data_vars)
         assert np.array_equal(data["time"], trajectory.time)
         assert np.array_equal(data["arclength"], trajectory.arclength)

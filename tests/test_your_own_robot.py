@@ -35,5 +35,10 @@ def test_it_predicts_what_it_has_not_seen(tmp_path, monkeypatch, capsys):
     found = kc.load_robot(tmp_path / "found.yaml")
     assert isinstance(found, kc.robots.RoutedTendonRobot) and found.friction is not None
     assert {file.name for file in tmp_path.iterdir()} == {
-        "sine-1.csv", "unseen.csv", "found.yaml", "health.png", "before.png", "after.png",
-    }  # fmt: skip
+        "sine-1.csv",
+        "unseen.csv",
+        "found.yaml",
+        "health.png",
+        "before.png",
+        "after.png",
+    }

@@ -20,9 +20,14 @@ LIBRARY = ROOT / "src" / "knode_cosserat"
 MOST_PARAMETERS = 5
 #: tokens that are no code
 NO_CODE = {
-    tokenize.ENCODING, tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT,
+    tokenize.ENCODING,
+    tokenize.COMMENT,
+    tokenize.NL,
+    tokenize.NEWLINE,
+    tokenize.INDENT,
+    tokenize.DEDENT,
     tokenize.ENDMARKER,
-}  # fmt: skip
+}
 
 
 class Budget(NamedTuple):

@@ -24,10 +24,15 @@ def box(ax, low, high, title, colour="#f4f6f9", at=None):
     """Box with a title in its middle, or at a place."""
     ax.add_patch(
         FancyBboxPatch(
-            low, high[0] - low[0], high[1] - low[1],
-            boxstyle="round,pad=0,rounding_size=8", fc=colour, ec="#4a5560", lw=1.4,
+            low,
+            high[0] - low[0],
+            high[1] - low[1],
+            boxstyle="round,pad=0,rounding_size=8",
+            fc=colour,
+            ec="#4a5560",
+            lw=1.4,
         )
-    )  # fmt: skip
+    )
     x, y = at or ((low[0] + high[0]) / 2, (low[1] + high[1]) / 2)
     ax.text(x, y, title, ha="center", va="center", fontsize=10, weight="bold", linespacing=1.3)
 
@@ -120,9 +125,12 @@ def draw_board(ax):
 
 def draw_legend(ax):
     rows = [
-        ("supply, 5 V and 12 V", POWER), ("ground", GROUND), ("logic: pulse width, direction", SIGNAL),
-        ("load-cell signal, 0 to 5 V", ANALOG), ("motor", MOTOR),
-    ]  # fmt: skip
+        ("supply, 5 V and 12 V", POWER),
+        ("ground", GROUND),
+        ("logic: pulse width, direction", SIGNAL),
+        ("load-cell signal, 0 to 5 V", ANALOG),
+        ("motor", MOTOR),
+    ]
     for k, (name, colour) in enumerate(rows):
         x, y = 30, 18 + 19 * k
         wire(ax, [(x, y), (x + 28, y)], colour)

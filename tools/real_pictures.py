@@ -58,8 +58,9 @@ def robot_figure(robot: Robot, recording: str):
         tips = {label: moved.tip_position for label, moved in motions.items()}
         return error_figure(
             {label: np.linalg.norm(tip - rows.tip_position, axis=1) for label, tip in tips.items()},
-            "held-out positions, sorted by error", "distance of the tips [mm]",
-        )  # fmt: skip
+            "held-out positions, sorted by error",
+            "distance of the tips [mm]",
+        )
     shown = dataclasses.replace(rows, time=rows.time - rows.time[0])
     return kc.figures.tips({"measured": shown, **motions}, columns=2)
 

@@ -173,10 +173,15 @@ def draw_parts(part):
 def annotate(ax, text, to, at):
     """Label with a line from its text to a point of the picture."""
     ax.annotate(
-        text, to, at, fontsize=10, va="center", ha="center",
+        text,
+        to,
+        at,
+        fontsize=10,
+        va="center",
+        ha="center",
         arrowprops={"arrowstyle": "-", "color": "#333333", "lw": 0.9, "shrinkB": 0},
         bbox={"boxstyle": "round,pad=0.25", "fc": "white", "ec": "#999999", "lw": 0.6},
-    )  # fmt: skip
+    )
 
 
 def draw_robot(part, bodies):

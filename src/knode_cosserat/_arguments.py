@@ -39,9 +39,16 @@ _MAKERS = {
     "Workspace": "workspace",
 }
 _WORDS = {
-    float: "a number", int: "a whole number", bool: "True or False", str: "a text", Path: "a path",
-    type(None): "None", tuple: "a list", list: "a list", type: "a class",
-}  # fmt: skip
+    float: "a number",
+    int: "a whole number",
+    bool: "True or False",
+    str: "a text",
+    Path: "a path",
+    type(None): "None",
+    tuple: "a list",
+    list: "a list",
+    type: "a class",
+}
 _SCALARS: dict[Any, Any] = {float: numbers.Real, int: numbers.Integral, bool: (bool, np.bool_)}
 
 

@@ -28,9 +28,14 @@ def numbers_in(text: str) -> list[float] | None:
 
 #: what NumPy would turn into numbers, by the kind of its type
 _NO_NUMBERS = {
-    "b": "true or false", "c": "complex", "U": "text", "S": "text", "M": "dates", "m": "durations",
+    "b": "true or false",
+    "c": "complex",
+    "U": "text",
+    "S": "text",
+    "M": "dates",
+    "m": "durations",
     "V": "records",
-}  # fmt: skip
+}
 
 
 def real_array(values: Any) -> np.ndarray:

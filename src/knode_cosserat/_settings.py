@@ -204,8 +204,11 @@ class ValidatedSettings:
             if default is dataclasses.MISSING and name not in cls.implied:
                 required.append(name)
         return {
-            "type": "object", "properties": properties, "required": required, "additionalProperties": False,
-        }  # fmt: skip
+            "type": "object",
+            "properties": properties,
+            "required": required,
+            "additionalProperties": False,
+        }
 
 
 def plain(value: Any) -> Any:

@@ -34,8 +34,17 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
 
 __all__ = [
-    "Controls", "ControlsError", "constant", "load", "parse", "ramp", "random", "save", "sine", "step",
-]  # fmt: skip
+    "Controls",
+    "ControlsError",
+    "constant",
+    "load",
+    "parse",
+    "ramp",
+    "random",
+    "save",
+    "sine",
+    "step",
+]
 
 #: factor from a unit that a file may use to newtons
 TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
@@ -98,9 +107,15 @@ def constant(tension: float, steps: int, *, tendons: int = 4) -> Tensions:
 
 
 def sine(
-    period: float, steps: int, dt: float, *, base: float = 6.0, amplitude: float = 1.0, tendons: int = 4,
+    period: float,
+    steps: int,
+    dt: float,
+    *,
+    base: float = 6.0,
+    amplitude: float = 1.0,
+    tendons: int = 4,
     sampled: Sampled = "middle",
-) -> Tensions:  # fmt: skip
+) -> Tensions:
     """Return τ_k = base + amplitude sin(2πt/period + 2πk/tendons) in N, k = 0, 1, …; period in s."""
     check_arguments(sine, locals(), ControlsError)
     _require_numbers(base=base, amplitude=amplitude)
@@ -115,9 +130,16 @@ def sine(
 
 
 def step(
-    height: float, steps: int, dt: float, *, base: float = 5.0, at: float = 1.5,
-    tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
-) -> Tensions:  # fmt: skip
+    height: float,
+    steps: int,
+    dt: float,
+    *,
+    base: float = 5.0,
+    at: float = 1.5,
+    tendons: Sequence[int] = (0, 3),
+    count: int = 4,
+    sampled: Sampled = "middle",
+) -> Tensions:
     """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
     check_arguments(step, locals(), ControlsError)
     _require_numbers(height=height, base=base, at=at)
@@ -126,9 +148,17 @@ def step(
 
 
 def ramp(
-    height: float, steps: int, dt: float, *, base: float = 5.0, start: float = 0.0, end: float | None = None,
-    tendons: Sequence[int] = (0, 3), count: int = 4, sampled: Sampled = "middle",
-) -> Tensions:  # fmt: skip
+    height: float,
+    steps: int,
+    dt: float,
+    *,
+    base: float = 5.0,
+    start: float = 0.0,
+    end: float | None = None,
+    tendons: Sequence[int] = (0, 3),
+    count: int = 4,
+    sampled: Sampled = "middle",
+) -> Tensions:
     """Return `base` (N) in `count` tendons, with a linear rise by `height` (N) in the named tendons.
 
     The rise is from `start` to `end` (s), by default until the last step. The tension is constant after.
@@ -247,9 +277,12 @@ def _is_number(value: Any) -> bool:
 
 
 def _require_effect(
-    signal: str, arguments: Mapping[str, Any], values: Float[np.ndarray, "steps ..."], dt: float,
+    signal: str,
+    arguments: Mapping[str, Any],
+    values: Float[np.ndarray, "steps ..."],
+    dt: float,
     sampled: Sampled = "middle",
-) -> None:  # fmt: skip
+) -> None:
     """Raise `ControlsError` if a signal does nothing during a run: a step or ramp after the end, for example.
 
     Args:
@@ -421,9 +454,12 @@ _SPECIFICATIONS = (
 
 
 def parse(
-    specification: str, steps: int | None, dt: float, robot: System | Layout | int = 4,
+    specification: str,
+    steps: int | None,
+    dt: float,
+    robot: System | Layout | int = 4,
     sampled: Sampled = "middle",
-) -> Array:  # fmt: skip
+) -> Array:
     """Return controls (steps, c) from one word, as on the command line.
 
     Words of tensions are for all tendons: `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`, that

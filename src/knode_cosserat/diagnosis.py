@@ -25,9 +25,12 @@ from knode_cosserat.solvers.simulate import simulate
 NEEDED = ("jax", "jaxlib", "equinox", "numpy", "scipy")
 #: optional packages, with the extra that installs each
 OPTIONAL = {
-    "matplotlib": "viz", "rosbags": "ros", "pyarrow": "parquet", "tensorboardX": "tensorboard",
+    "matplotlib": "viz",
+    "rosbags": "ros",
+    "pyarrow": "parquet",
+    "tensorboardX": "tensorboard",
     "distributed": "dask",
-}  # fmt: skip
+}
 #: largest relative error of the force at the base against the rod's weight
 WEIGHT_ERROR = 1e-9
 
@@ -104,10 +107,14 @@ def doctor() -> Diagnosis:
     # files of this package, and of JAX in a directory that the user set for it
     programs = sum(1 for end in (SUFFIX, "-cache") for _ in cache.glob(f"*{end}"))
     return Diagnosis(
-        versions, f"{platform.system()} {platform.machine()}", usable_cores(),
-        [f"{device.device_kind} ({device.platform})" for device in jax.devices()], str(cache), programs,
+        versions,
+        f"{platform.system()} {platform.machine()}",
+        usable_cores(),
+        [f"{device.device_kind} ({device.platform})" for device in jax.devices()],
+        str(cache),
+        programs,
         checks,
-    )  # fmt: skip
+    )
 
 
 def _version(name: str) -> str | None:

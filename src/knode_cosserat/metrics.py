@@ -22,9 +22,15 @@ from knode_cosserat._arguments import check_arguments, numbers_of
 from knode_cosserat.trajectory import Trajectory
 
 __all__ = [
-    "StateError", "dtw_distance", "node_error", "pose_mse", "rotation_rmse", "state_errors", "tip_dtw",
+    "StateError",
+    "dtw_distance",
+    "node_error",
+    "pose_mse",
+    "rotation_rmse",
+    "state_errors",
+    "tip_dtw",
     "tip_rmse",
-]  # fmt: skip
+]
 
 Array = NDArray[np.float64]
 #: tolerance of equal times (s) and of equal places along the rod (fraction of its length)

@@ -491,9 +491,11 @@ def _numbers(owner: Any, before: str = "") -> Iterator[tuple[str, Parameter, Any
 
 
 def load_trajectory(
-    path: str | Path, *, system: System | None = None,
+    path: str | Path,
+    *,
+    system: System | None = None,
     readers: Mapping[str, Callable[[bytes], System]] | None = None,
-) -> Trajectory:  # fmt: skip
+) -> Trajectory:
     """Read a trajectory that `Trajectory.save` wrote.
 
     Args:

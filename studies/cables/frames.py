@@ -96,9 +96,11 @@ def along_curve(
     w, x, y, z = first.tolist()
     for k, (a, b, c, d) in enumerate(shortest(before, directions).tolist()):
         w, x, y, z = (
-            a * w - b * x - c * y - d * z, a * x + b * w + c * z - d * y,
-            a * y - b * z + c * w + d * x, a * z + b * y - c * x + d * w,
-        )  # fmt: skip
+            a * w - b * x - c * y - d * z,
+            a * x + b * w + c * z - d * y,
+            a * y - b * z + c * w + d * x,
+            a * z + b * y - c * x + d * w,
+        )
         frames[k] = w, x, y, z
     frame, along = frames[-1], directions[-1]
     end = quaternion_product(shortest(along, rotated(last, AXIS)), frame)

@@ -42,12 +42,26 @@ class SearchStage(NamedTuple):
 
 
 FIRST = (
-    "bending", "torsion", "curvature0", "curvature1", "twist", "base_tangent0", "base_tangent1",
-    "tip_tangent0", "tip_tangent1", "drag",
-)  # fmt: skip
+    "bending",
+    "torsion",
+    "curvature0",
+    "curvature1",
+    "twist",
+    "base_tangent0",
+    "base_tangent1",
+    "tip_tangent0",
+    "tip_tangent1",
+    "drag",
+)
 MORE = (
-    *FIRST, "damping_time", "offset0", "offset1", "curvature_change0", "curvature_change1", "stretch",
-)  # fmt: skip
+    *FIRST,
+    "damping_time",
+    "offset0",
+    "offset1",
+    "curvature_change0",
+    "curvature_change1",
+    "stretch",
+)
 #: all but the place of the mass
 MOST = tuple(name for name in NAMES if name != "eccentric")
 #: chosen on DLO1 and DLO2

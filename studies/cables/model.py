@@ -260,9 +260,16 @@ class CableModel:
         none = np.zeros(2, dtype=int)
         # not from time zero: there a trajectory would be taken to start at rest
         return Trajectory(
-            robot, None, DT * np.array([1.0, 2.0]), prepared.y, prepared.z, prepared.first_controls, none,
-            np.zeros(2), none,
-        )  # fmt: skip
+            robot,
+            None,
+            DT * np.array([1.0, 2.0]),
+            prepared.y,
+            prepared.z,
+            prepared.first_controls,
+            none,
+            np.zeros(2),
+            none,
+        )
 
     def free_markers(self, y: Any, beside: Any, stretch: Any = 1.0) -> Any:
         """Return positions (T, M, 3) of the free markers for states y (T, N, 19), as JAX values."""
@@ -278,9 +285,11 @@ class CableModel:
         ta, tb = _turned(ha, axis) * ds, _turned(hb, axis) * ds
         square, cube = part**2, part**3
         centre = (
-            (2 * cube - 3 * square + 1) * a + (cube - 2 * square + part) * ta
-            + (3 * square - 2 * cube) * b + (cube - square) * tb
-        )  # fmt: skip
+            (2 * cube - 3 * square + 1) * a
+            + (cube - 2 * square + part) * ta
+            + (3 * square - 2 * cube) * b
+            + (cube - square) * tb
+        )
         frame = (1.0 - part) * ha + part * hb
         frame = frame / jnp.linalg.norm(frame, axis=-1, keepdims=True)
         return centre + _turned(frame, beside)

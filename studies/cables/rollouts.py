@@ -159,10 +159,16 @@ class Rollouts:
             parts, frames = SUBSTEPS[level], len(prepared.controls) - done
             frames = frames if parts == 1 else min(frames, SPAN // parts)
             moved = simulate(
-                robot, between(done - 1.0 + np.arange(1.0, frames * parts + 1.0) / parts), DT / parts,
-                initial=at, time="bdf2", space=self.space, start="consistent", recovery_budget=0.0,
+                robot,
+                between(done - 1.0 + np.arange(1.0, frames * parts + 1.0) / parts),
+                DT / parts,
+                initial=at,
+                time="bdf2",
+                space=self.space,
+                start="consistent",
+                recovery_budget=0.0,
                 on_failure="return",
-            )  # fmt: skip
+            )
             result = np.asarray(moved.result)
             new = frames if result.min() >= 0 else (int(np.argmax(result < 0)) - 1) // parts
             if parts == 1 or new == frames:

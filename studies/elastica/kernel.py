@@ -28,11 +28,27 @@ ARRAYS = {
     "stress": "internal_stress", "couple": "internal_couple", "forces": "external_forces",
     "torques": "external_torques",
 }  # fmt: skip
-ARRAYS |= {name: name for name in (
-    "mass", "volume", "lengths", "tangents", "radius", "rest_lengths", "dilatation", "dilatation_rate",
-    "sigma", "kappa", "rest_sigma", "rest_kappa", "shear_matrix", "bend_matrix", "internal_forces",
-    "internal_torques",
-)}  # fmt: skip
+ARRAYS |= {
+    name: name
+    for name in (
+        "mass",
+        "volume",
+        "lengths",
+        "tangents",
+        "radius",
+        "rest_lengths",
+        "dilatation",
+        "dilatation_rate",
+        "sigma",
+        "kappa",
+        "rest_sigma",
+        "rest_kappa",
+        "shear_matrix",
+        "bend_matrix",
+        "internal_forces",
+        "internal_torques",
+    )
+}
 #: these arrays, which change in place, and the places of periodic nodes, of which there are none
 Rod: Any = collections.namedtuple("Rod", [*ARRAYS, "ghosts"])  # type: ignore[misc]
 
@@ -95,16 +111,44 @@ def advance(rod: Any, tendons: Tendons, numbers: Constants, command: Any, steps:
 def _internal(rod: Any) -> None:
     """Evaluate the internal forces and torques of PyElastica's rod."""
     _compute_internal_forces(
-        rod.position, rod.volume, rod.lengths, rod.tangents, rod.radius, rod.rest_lengths, rod.joint_lengths,
-        rod.dilatation, rod.joint_dilatation, rod.directors, rod.sigma, rod.rest_sigma, rod.shear_matrix,
-        rod.stress, rod.internal_forces, rod.ghosts,
-    )  # fmt: skip
-    _compute_internal_torques(
-        rod.position, rod.velocity, rod.tangents, rod.lengths, rod.rest_lengths, rod.directors,
-        rod.joint_lengths, rod.bend_matrix, rod.rest_kappa, rod.kappa, rod.joint_dilatation, rod.inertia,
-        rod.omega, rod.stress, rod.couple, rod.dilatation, rod.dilatation_rate, rod.internal_torques,
+        rod.position,
+        rod.volume,
+        rod.lengths,
+        rod.tangents,
+        rod.radius,
+        rod.rest_lengths,
+        rod.joint_lengths,
+        rod.dilatation,
+        rod.joint_dilatation,
+        rod.directors,
+        rod.sigma,
+        rod.rest_sigma,
+        rod.shear_matrix,
+        rod.stress,
+        rod.internal_forces,
         rod.ghosts,
-    )  # fmt: skip
+    )
+    _compute_internal_torques(
+        rod.position,
+        rod.velocity,
+        rod.tangents,
+        rod.lengths,
+        rod.rest_lengths,
+        rod.directors,
+        rod.joint_lengths,
+        rod.bend_matrix,
+        rod.rest_kappa,
+        rod.kappa,
+        rod.joint_dilatation,
+        rod.inertia,
+        rod.omega,
+        rod.stress,
+        rod.couple,
+        rod.dilatation,
+        rod.dilatation_rate,
+        rod.internal_torques,
+        rod.ghosts,
+    )
 
 
 @njit(cache=True)
@@ -226,9 +270,16 @@ def _turn(rod: Any, k: int, force: Any, x: float, y: float) -> None:
 def _accelerate(rod: Any, numbers: Constants) -> None:
     """Move the velocities by a time step; the material's damping is implicit."""
     _update_accelerations(
-        rod.acceleration, rod.internal_forces, rod.forces, rod.mass, rod.alpha, rod.inverse_inertia,
-        rod.internal_torques, rod.torques, rod.dilatation,
-    )  # fmt: skip
+        rod.acceleration,
+        rod.internal_forces,
+        rod.forces,
+        rod.mass,
+        rod.alpha,
+        rod.inverse_inertia,
+        rod.internal_torques,
+        rod.torques,
+        rod.dilatation,
+    )
     for i in range(3):
         for k in range(rod.omega.shape[1]):
             rod.velocity[i, k + 1] += numbers.dt * rod.acceleration[i, k + 1]

@@ -55,9 +55,13 @@ class ElasticaPlant(Plant):
 
     @classmethod
     def like(
-        cls, robot: TendonRod, dt: float, sensor: Sensor, imperfections: Imperfections | None = None,
+        cls,
+        robot: TendonRod,
+        dt: float,
+        sensor: Sensor,
+        imperfections: Imperfections | None = None,
         **changes: float,
-    ) -> Self:  # fmt: skip
+    ) -> Self:
         """Return a plant with the dimensions, material, masses and tendons of a robot.
 
         Its tendons are routed ones: with exact numbers its model is `RoutedTendonRobot.like(robot)`. The
@@ -103,9 +107,14 @@ class ElasticaPlant(Plant):
 
 
 def record_elastica(
-    rod: ElasticaRod, commands: Float[np.ndarray, "K c"], hold: float, *,
-    bodies: Sequence[float] = BODIES, poses: BodyPoses | None = None, seed: int = 0,
-) -> Recorded:  # fmt: skip
+    rod: ElasticaRod,
+    commands: Float[np.ndarray, "K c"],
+    hold: float,
+    *,
+    bodies: Sequence[float] = BODIES,
+    poses: BodyPoses | None = None,
+    seed: int = 0,
+) -> Recorded:
     """Record the robot under commanded tensions, in rows 12.5 ms apart.
 
     The robot first rests under the first command. Tensions are those of its load cells: row i has the reading
@@ -140,11 +149,17 @@ def record_elastica(
         tension.append(reading())
     position = position + sigma.sigma * random.normal(size=np.shape(position))
     measured = Measurements(
-        time=ROW * np.arange(len(commanded)), tension=np.array(tension), fractions=np.array(bodies),
-        position=np.array(position), quaternion=_shaken(np.array(quaternion), sigma.sigma_rotation, random),
-        measured=np.ones((len(commanded), len(bodies)), dtype=bool), simulated=True,
-        source="simulated with PyElastica", initial_tension=initial, continuous=True,
-    )  # fmt: skip
+        time=ROW * np.arange(len(commanded)),
+        tension=np.array(tension),
+        fractions=np.array(bodies),
+        position=np.array(position),
+        quaternion=_shaken(np.array(quaternion), sigma.sigma_rotation, random),
+        measured=np.ones((len(commanded), len(bodies)), dtype=bool),
+        simulated=True,
+        source="simulated with PyElastica",
+        initial_tension=initial,
+        continuous=True,
+    )
     return Recorded(measured, commanded)
 
 

@@ -62,9 +62,13 @@ class ElasticaRod:
     """Rod with tendons, clamped at its base, in PyElastica's explicit time steps."""
 
     def __init__(
-        self, robot: TendonRod, imperfections: Imperfections, *, elements: int = ELEMENTS,
+        self,
+        robot: TendonRod,
+        imperfections: Imperfections,
+        *,
+        elements: int = ELEMENTS,
         rotary_inertia: float = ROTARY_INERTIA,
-    ):  # fmt: skip
+    ):
         """Build the rod, and let it come to rest without tensions.
 
         Args:
@@ -99,10 +103,16 @@ class ElasticaRod:
 
         robot, n = self.robot, self.elements
         found = CosseratRod.straight_rod(
-            n, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), float(robot.length),
-            float(robot.radius), float(robot.density), youngs_modulus=float(robot.youngs_modulus),
+            n,
+            np.zeros(3),
+            np.array([0.0, 0.0, 1.0]),
+            np.array([1.0, 0.0, 0.0]),
+            float(robot.length),
+            float(robot.radius),
+            float(robot.density),
+            youngs_modulus=float(robot.youngs_modulus),
             shear_modulus=float(robot.G),
-        )  # fmt: skip
+        )
         inertia = self._spread * found.mass_second_moment_of_inertia[0, 0, 0]
         found.mass_second_moment_of_inertia[:] = inertia * np.eye(3)[:, :, None]
         found.inv_mass_second_moment_of_inertia[:] = np.eye(3)[:, :, None] / inertia
@@ -125,10 +135,19 @@ class ElasticaRod:
         for k in range(1, self.elements):
             pivots[k] -= link * link / pivots[k - 1]
         return self._kernel.Constants(
-            dt, float(np.exp(-dt / of.lag)) if of.lag > 0.0 else 0.0, 0.0 if sticking else of.friction,
-            of.misalignment * h, of.sliding, np.eye(3), 2.0 * bend / h,
-            np.array(robot.gravity, dtype=float), linear_drag, _isotropic("drag", robot.drag), link, pivots,
-        )  # fmt: skip
+            dt,
+            float(np.exp(-dt / of.lag)) if of.lag > 0.0 else 0.0,
+            0.0 if sticking else of.friction,
+            of.misalignment * h,
+            of.sliding,
+            np.eye(3),
+            2.0 * bend / h,
+            np.array(robot.gravity, dtype=float),
+            linear_drag,
+            _isotropic("drag", robot.drag),
+            link,
+            pivots,
+        )
 
     def _settle(self) -> None:
         """Move to rest without tensions, by drag that damps the first mode critically; keep the state."""

@@ -169,8 +169,13 @@ def test_a_failed_program_is_replaced_by_the_plan_then_held_then_safe(monkeypatc
     log = run_loop(controller(), plant(), circle(0.1, 4.0), 1.0)
     assert log.fallbacks == 20
     assert [log.status[k] for k in (0, 4, 5, 9, 10, 19)] == [
-        "shifted plan", "shifted plan", "held", "held", "going safe", "going safe",
-    ]  # fmt: skip
+        "shifted plan",
+        "shifted plan",
+        "held",
+        "held",
+        "going safe",
+        "going safe",
+    ]
     assert set(log.reason) == {"the quadratic program was not solved"}
     assert np.all(np.isfinite(log.control))
 

@@ -138,10 +138,14 @@ def test_quadratic_programs_agree_with_scipy():
         x = solve(problem)
         within = [{"type": "ineq", "fun": lambda x, s=s, A=A: 0.5 - s * (A @ x)} for s in (1.0, -1.0)]
         expected = minimize(
-            lambda x, H=H, g=g: 0.5 * x @ H @ x + g @ x, np.zeros(n), jac=lambda x, H=H, g=g: H @ x + g,
-            bounds=list(zip(low, high, strict=True)), constraints=within, method="SLSQP",
+            lambda x, H=H, g=g: 0.5 * x @ H @ x + g @ x,
+            np.zeros(n),
+            jac=lambda x, H=H, g=g: H @ x + g,
+            bounds=list(zip(low, high, strict=True)),
+            constraints=within,
+            method="SLSQP",
             options={"ftol": 1e-12, "maxiter": 500},
-        )  # fmt: skip
+        )
         assert np.allclose(x, expected.x, atol=1e-5)
 
 

@@ -24,9 +24,15 @@ from knode_cosserat.robots import Drawing
 
 #: a soft rod that is clamped sideways and sags by a twentieth of its length
 SAGGING = kc.robots.SlenderRod(
-    length=0.3, radius=0.004, density=1200.0, youngs_modulus=2e8, bending_damping=1e-3, nodes=6,
-    gravity=[9.81, 0.0, 0.0], base_end=kc.robots.ends.Driven(axes=("x",)),
-)  # fmt: skip
+    length=0.3,
+    radius=0.004,
+    density=1200.0,
+    youngs_modulus=2e8,
+    bending_damping=1e-3,
+    nodes=6,
+    gravity=[9.81, 0.0, 0.0],
+    base_end=kc.robots.ends.Driven(axes=("x",)),
+)
 DT = 0.01
 
 

@@ -20,9 +20,14 @@ ONE = {
     "logistic": scipy.special.expit,
 }  # fmt: skip
 TWO = {
-    "add": np.add, "sub": np.subtract, "mul": np.multiply, "max": np.maximum, "min": np.minimum,
-    "atan2": np.arctan2, "rem": np.fmod,
-}  # fmt: skip
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "max": np.maximum,
+    "min": np.minimum,
+    "atan2": np.arctan2,
+    "rem": np.fmod,
+}
 
 
 @pytest.mark.parametrize("lanes", [1, 8])

@@ -183,9 +183,13 @@ class Stretching(kc.System):
 
 #: a rod with a base whose pose, and so its velocities, are controls
 DRIVEN = kc.robots.SlenderRod(
-    length=0.5, radius=0.005, density=1200.0, youngs_modulus=1e7, bending_damping=2e-3,
+    length=0.5,
+    radius=0.005,
+    density=1200.0,
+    youngs_modulus=1e7,
+    bending_damping=2e-3,
     base_end=Driven(axes=("x", "ry", "z"), position=[0.1, 0.2, 0.3]),
-)  # fmt: skip
+)
 TIMES = DT * np.arange(1, STEPS + 1)[:, None]
 
 

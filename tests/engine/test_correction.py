@@ -59,9 +59,12 @@ ROBOTS = {
 }
 #: they show all kinds of blocks; compiling the others takes as long
 QUICK = {
-    ("paper", "lobatto2"), ("ribs, a sleeve and masses", "lobatto4"), ("six legs", "lobatto2"),
-    ("position enters", "euler"), ("B is not zero", "lobatto4"),
-}  # fmt: skip
+    ("paper", "lobatto2"),
+    ("ribs, a sleeve and masses", "lobatto4"),
+    ("six legs", "lobatto2"),
+    ("position enters", "euler"),
+    ("B is not zero", "lobatto4"),
+}
 
 
 @functools.partial(jax.jit, static_argnames="space")

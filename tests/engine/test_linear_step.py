@@ -32,9 +32,12 @@ def by_tangents(robot, space, control, y, changes):
     row = np.concatenate([y, np.asarray(still.records)[: len(y), y.shape[1] :]], axis=1)
     solved = row[None], np.asarray(unknowns_of(robot, y))[None]
     moved, _ = tangent_time_loop(
-        StepCoefficients.of(step, 1.0 / C0, step.memory), solved, (robot, control[None]),
-        Changes(np.zeros((1, len(control), changes.shape[1]))), state,
-    )  # fmt: skip
+        StepCoefficients.of(step, 1.0 / C0, step.memory),
+        solved,
+        (robot, control[None]),
+        Changes(np.zeros((1, len(control), changes.shape[1]))),
+        state,
+    )
     return np.asarray(moved.d_records[0]).reshape(changes.shape)
 
 

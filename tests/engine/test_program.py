@@ -153,10 +153,19 @@ def with_friction():
 def with_reel():
     length, radius = 0.7144, 0.675e-3
     return kc.robots.RoutedTendonRobot(
-        length=length, radius=radius, density=0.034 / (length * np.pi * radius**2), youngs_modulus=207e9,
-        bending_damping=5e-4, drag=1e-4, gravity=(9.81, 0.0, 0.0), tendon_offset=0.01506,
-        tendon_angles=(np.pi / 2,), tendon_compliance=1e-4, drive="reel", nodes=200,
-    )  # fmt: skip
+        length=length,
+        radius=radius,
+        density=0.034 / (length * np.pi * radius**2),
+        youngs_modulus=207e9,
+        bending_damping=5e-4,
+        drag=1e-4,
+        gravity=(9.81, 0.0, 0.0),
+        tendon_offset=0.01506,
+        tendon_angles=(np.pi / 2,),
+        tendon_compliance=1e-4,
+        drive="reel",
+        nodes=200,
+    )
 
 
 def with_curved_law():
@@ -174,11 +183,16 @@ def with_passive_residual():
 
 
 SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.catalog()} | {
-    "HangingString": lambda: STRING, "virtual robot": virtual_robot, "friction": with_friction,
-    "reel and slack": with_reel, "curved law": with_curved_law, "passive": with_passive_residual,
-    "network": lambda: with_network(3), "large network": lambda: with_network(64, history=True),
+    "HangingString": lambda: STRING,
+    "virtual robot": virtual_robot,
+    "friction": with_friction,
+    "reel and slack": with_reel,
+    "curved law": with_curved_law,
+    "passive": with_passive_residual,
+    "network": lambda: with_network(3),
+    "large network": lambda: with_network(64, history=True),
     "committee": with_committee,
-}  # fmt: skip
+}
 
 
 def point_of(system, rng):
@@ -266,17 +280,25 @@ def test_simplification():
     apply = program.apply
     p = apply("lt", x, y)
     for a, b in [
-        (apply("add", x, zero), x), (apply("sub", x, zero), x), (apply("mul", x, one), x),
-        (apply("mul", x, zero), zero), (apply("sub", x, x), zero), (apply("neg", apply("neg", x)), x),
-        (apply("div", zero, x), zero), (apply("select", p, x, x), x), (apply("not", apply("not", p)), p),
-        (apply("and", p, program.constant(True)), p), (apply("or", p, program.constant(False)), p),
-        (apply("add", x, y), apply("add", y, x)), (apply("sub", x, apply("neg", y)), apply("add", x, y)),
+        (apply("add", x, zero), x),
+        (apply("sub", x, zero), x),
+        (apply("mul", x, one), x),
+        (apply("mul", x, zero), zero),
+        (apply("sub", x, x), zero),
+        (apply("neg", apply("neg", x)), x),
+        (apply("div", zero, x), zero),
+        (apply("select", p, x, x), x),
+        (apply("not", apply("not", p)), p),
+        (apply("and", p, program.constant(True)), p),
+        (apply("or", p, program.constant(False)), p),
+        (apply("add", x, y), apply("add", y, x)),
+        (apply("sub", x, apply("neg", y)), apply("add", x, y)),
         (apply("select", apply("not", p), x, y), apply("select", p, y, x)),
         (apply("add", program.constant(2.0), program.constant(3)), program.constant(5.0)),
         (apply("pow", x, program.constant(2.0)), apply("mul", x, x)),
         (apply("eq", apply("select", p, zero, one), one), p),
         (apply("neg", apply("sub", x, y)), apply("neg", apply("sub", x, y))),
-    ]:  # fmt: skip
+    ]:
         assert a == b
     # x != x tests for NaN
     assert program.operations[apply("ne", x, x)][0] == "ne"
@@ -288,8 +310,11 @@ def test_known_nodes_end_the_search():
     program, _, (out,), _ = evaluated(lambda x: jnp.sin(x * x) + 1.0, 0.5)
     product = program.arguments(program.arguments(int(out))[0])[0]
     assert {program.operations[node][0] for node in program.needed([int(out)], {product})} == {
-        "mul", "sin", "constant", "add"
-    }  # fmt: skip
+        "mul",
+        "sin",
+        "constant",
+        "add",
+    }
 
 
 @pytest.mark.parametrize(
@@ -457,9 +482,17 @@ UNARY = [
     lambda x: 1.0 / (2.0 + jnp.sin(x)), jax.nn.sigmoid, lambda x: x**3, lambda x: jnp.log1p(x * x),
 ]  # fmt: skip
 BINARY = [
-    jnp.add, jnp.subtract, jnp.multiply, jnp.maximum, jnp.minimum, lambda x, y: x / (1.0 + y * y),
-    lambda x, y: jnp.where(x < y, x, 2.0 * y), jnp.arctan2, lambda x, y: x * 0.0 + y, lambda x, y: -x - (-y),
-]  # fmt: skip
+    jnp.add,
+    jnp.subtract,
+    jnp.multiply,
+    jnp.maximum,
+    jnp.minimum,
+    lambda x, y: x / (1.0 + y * y),
+    lambda x, y: jnp.where(x < y, x, 2.0 * y),
+    jnp.arctan2,
+    lambda x, y: x * 0.0 + y,
+    lambda x, y: -x - (-y),
+]
 
 
 @hypothesis.given(

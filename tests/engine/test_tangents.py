@@ -64,9 +64,12 @@ class Motion:
     def __init__(self, name, scheme, space="lobatto2", **changes):
         rng = np.random.default_rng(0)
         own = {
-            NETWORK: functools.partial(with_network, 512, history=True), COMMITTEE: with_committee,
-            STRUCTURED: with_curved_law, BAR: Stretching, CUT_LEGS: cut_legs,
-        }  # fmt: skip
+            NETWORK: functools.partial(with_network, 512, history=True),
+            COMMITTEE: with_committee,
+            STRUCTURED: with_curved_law,
+            BAR: Stretching,
+            CUT_LEGS: cut_legs,
+        }
         robot = own[name]() if name in own else kc.load_robot(name).replace(**changes)
         self.robot, self.settings = robot, Settings.of(scheme, space, "paper", NewtonOptions())
         self.steps = StepCoefficients.of(self.settings, DT)
@@ -88,8 +91,9 @@ class Motion:
         """Return the state after the motion with a part of a column's tangents added, and its rows."""
         system = jax.tree.map(
             lambda leaf, moves: leaf + part * np.tensordot(self.weights[:, column], moves, 1),
-            self.robot, self.directions,
-        )  # fmt: skip
+            self.robot,
+            self.directions,
+        )
         records, rate = np.array(self.past.records), np.array(self.past.rate)
         used = self.d_rate.shape[0]
         records[:, :used] += part * self.d_records[..., column]
@@ -111,10 +115,12 @@ class Motion:
 @pytest.mark.parametrize(
     ("name", "scheme", "space"),
     [
-        (PAPER, "bdf-alpha", "lobatto2"), (CURVED, "bdf-alpha", "lobatto2"),
-        (NETWORK, "bdf-alpha", "lobatto2"), *SPACES,
+        (PAPER, "bdf-alpha", "lobatto2"),
+        (CURVED, "bdf-alpha", "lobatto2"),
+        (NETWORK, "bdf-alpha", "lobatto2"),
+        *SPACES,
     ],
-)  # fmt: skip
+)
 def test_tangents_are_differences_of_motions(name, scheme, space):
     motion, eps = Motion(name, scheme, space), 1e-4
     after, (d_rows, d_unknowns) = tangent_time_loop(*motion.given)
@@ -351,7 +357,9 @@ def test_a_few_numbers_of_rows_have_the_tangents_that_they_have_among_all(monkey
     *before, changes, state = motion.given
     after, (own, unknowns) = tangent_time_loop(*before, changes._replace(kept=kept), state)
     for found, wanted in (
-        (own, d_rows[:, kept]), (unknowns, d_unknowns), (after.d_records, last.d_records),
+        (own, d_rows[:, kept]),
+        (unknowns, d_unknowns),
+        (after.d_records, last.d_records),
         (after.d_rate, last.d_rate),
-    ):  # fmt: skip
+    ):
         np.testing.assert_allclose(found, wanted, rtol=0.0, atol=1e-12 * np.max(np.abs(wanted)))

@@ -23,8 +23,10 @@ def environment(robot):
 
     randomisation = envs.Randomisation(
         {"youngs_modulus": envs.Factor(0.7, 1.3), "drag": envs.Factor(0.5, 2.0)},
-        change=0.5, delay=(0, 2), noise=1e-4,
-    )  # fmt: skip
+        change=0.5,
+        delay=(0, 2),
+        noise=1e-4,
+    )
     return envs.make("follow", robot, randomisation=randomisation, duration=0.05 * STEPS)
 
 

@@ -150,10 +150,14 @@ def test_a_parameter_that_does_not_exist_is_refused(robot):
 @pytest.mark.parametrize(
     "wrong",
     [
-        {"change": 1.5}, {"delay": (2, 1)}, {"delay": (0, 500)}, {"noise": -1.0},
-        {"parameters": {"length": (1, 2)}}, {"parameters": {"length": envs.Factor(2.0, 1.0)}},
+        {"change": 1.5},
+        {"delay": (2, 1)},
+        {"delay": (0, 500)},
+        {"noise": -1.0},
+        {"parameters": {"length": (1, 2)}},
+        {"parameters": {"length": envs.Factor(2.0, 1.0)}},
     ],
-)  # fmt: skip
+)
 def test_wrong_randomisations_are_refused(wrong):
     with pytest.raises(envs.TaskError, match=r"allowed|must not"):
         envs.Randomisation(**wrong)

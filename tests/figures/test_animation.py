@@ -80,9 +80,11 @@ def test_what_lives_in_a_plane_moves_too(tmp_path, trajectory):
     string = HangingString(length=1.0, density=0.1, stiffness=1e3, friction=0.05, nodes=21)
     hanging = kc.equilibrium(string, np.array([0.6, -0.1]), space="lobatto4")
     two = dataclasses.replace(
-        hanging, time=np.array([0.0, 0.2]), y=np.repeat(np.asarray(hanging.y), 2, axis=0),
+        hanging,
+        time=np.array([0.0, 0.2]),
+        y=np.repeat(np.asarray(hanging.y), 2, axis=0),
         result=np.zeros(2, dtype=int),
-    )  # fmt: skip
+    )
     assert len(list(frames_of(kc.figures.animate(two, tmp_path / "string.gif")))) == 6
     with pytest.raises(ValueError, match="some trajectories are in a plane and some in space"):
         kc.figures.animate({"a": two, "b": trajectory}, tmp_path / "no.gif")

@@ -89,9 +89,12 @@ def test_the_watchdog_slackens_the_tendons(robot: EmulatedRobot) -> None:
 @pytest.mark.parametrize("fault", ["torn tendon", "stuck cell", "rail", "over-tension", "power"])
 def test_faults_of_the_robot_are_caught(robot: EmulatedRobot, fault: str) -> None:
     names = {
-        "torn tendon": "slack:2", "stuck cell": "sensor-stuck:2", "rail": "sensor-rail:2",
-        "over-tension": "over-tension:2", "power": "restarted:0",
-    }  # fmt: skip
+        "torn tendon": "slack:2",
+        "stuck cell": "sensor-stuck:2",
+        "rail": "sensor-rail:2",
+        "over-tension": "over-tension:2",
+        "power": "restarted:0",
+    }
     board = board_of(robot)
     board.arm()
     tensions(board, robot, [300.0] * 4, 0.4)

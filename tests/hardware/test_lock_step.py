@@ -120,10 +120,15 @@ class Bytes(Transport):
 
 
 pieces = st.binary(max_size=80) | st.sampled_from(
-    [b"\n", b"0 = hello 2\n", b"1 : 2 armed - 1,2,3\n", b"1,2,3,4,5,6,7,8,9\n",
-     b"# knode-tension 1 protocol 2 tendons 4\n",
-     encode_message(Telemetry((9999,) * 4, (0,) * 4, 4, 1, 2, "armed", ""), True)]
-)  # fmt: skip
+    [
+        b"\n",
+        b"0 = hello 2\n",
+        b"1 : 2 armed - 1,2,3\n",
+        b"1,2,3,4,5,6,7,8,9\n",
+        b"# knode-tension 1 protocol 2 tendons 4\n",
+        encode_message(Telemetry((9999,) * 4, (0,) * 4, 4, 1, 2, "armed", ""), True),
+    ]
+)
 
 
 @settings(deadline=None, max_examples=200)

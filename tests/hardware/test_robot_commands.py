@@ -177,9 +177,20 @@ def test_record_writes_a_bag_that_is_read(folder):
 
 def test_a_fault_while_recording_keeps_the_bag(folder):
     result = run(
-        "robot", "record", "--port", "simulated?fault=slack:2,after=0.5", "--robot", "rod.yaml", "--yes",
-        "--controls", "1,1,1,1", "--seconds", "5", "--out", "a.bag",
-    )  # fmt: skip
+        "robot",
+        "record",
+        "--port",
+        "simulated?fault=slack:2,after=0.5",
+        "--robot",
+        "rod.yaml",
+        "--yes",
+        "--controls",
+        "1,1,1,1",
+        "--seconds",
+        "5",
+        "--out",
+        "a.bag",
+    )
     assert "fault slack at tendon 2" in error(result) and "messages in a.bag" in result.stderr
     recording = kc.load_recording("a.bag", kc.recordings.RecordingConfig.load("a.yaml"))
     assert recording.sampled(0.05).time[-1] > 0.3
@@ -198,10 +209,21 @@ def test_run_closes_the_loop(folder, monkeypatch):
 
 def test_a_fault_while_running_keeps_the_log(folder):
     result = run(
-        "robot", "run", "rod.yaml", "--port", "simulated?fault=over-tension:1,after=0.6", "--robot",
-        "rod.yaml", "--reference", "circle:radius=0.03,period=3", "--method", "kinematic", "--dt", "0.06",
+        "robot",
+        "run",
+        "rod.yaml",
+        "--port",
+        "simulated?fault=over-tension:1,after=0.6",
+        "--robot",
+        "rod.yaml",
+        "--reference",
+        "circle:radius=0.03,period=3",
+        "--method",
+        "kinematic",
+        "--dt",
+        "0.06",
         "--yes",
-    )  # fmt: skip
+    )
     assert "fault over-tension at tendon 1" in error(result)
     (log,) = folder.glob("run-*.csv")
     assert f"kept 10 periods in {log.name}" in result.stderr and len(log.read_text().splitlines()) == 11
@@ -268,9 +290,12 @@ def test_keys_steer_and_stop_and_the_terminal_is_restored(folder):
         "simulated?real_time=1",
     ]
     process = subprocess.Popen(
-        [*program, "--robot", "rod.yaml", "--yes"], stdin=slave, stderr=subprocess.PIPE, text=True,
+        [*program, "--robot", "rod.yaml", "--yes"],
+        stdin=slave,
+        stderr=subprocess.PIPE,
+        text=True,
         start_new_session=True,
-    )  # fmt: skip
+    )
     assert "space, Enter, q or Ctrl-C stops the robot" in process.stderr.readline()
     os.write(master, b"\x1b[C")
     time.sleep(0.5)

@@ -190,9 +190,13 @@ with SimulatedRobot(kc.load_robot("delrin-tendon-robot"), real_time=True) as rob
 @needs_ros
 def test_commands_are_checked(ros):
     run = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(COMMANDED)], env=ros, check=True, timeout=120.0, text=True,
+        [sys.executable, "-c", textwrap.dedent(COMMANDED)],
+        env=ros,
+        check=True,
+        timeout=120.0,
+        text=True,
         stdout=subprocess.PIPE,
-    )  # fmt: skip
+    )
     lines = run.stdout.split("\n")
     assert lines[:2] == ["0 True", "True True"]
     # the node's silence or the robot's watchdog

@@ -34,11 +34,12 @@ def noisy(trajectories: list[kc.Trajectory], part: float, seed: int) -> list[kc.
     in_y, in_z = sizes(robot.y_layout, "y"), sizes(robot.z_layout, "z")
     return [
         dataclasses.replace(
-            each, y=each.y + part * in_y * rng.normal(size=each.y.shape),
+            each,
+            y=each.y + part * in_y * rng.normal(size=each.y.shape),
             z=each.z + part * in_z * rng.normal(size=each.z.shape),
         )
         for each in trajectories
-    ]  # fmt: skip
+    ]
 
 
 def as_measured(trajectories: list[kc.Trajectory], noise: float, seed: int) -> list[kc.Trajectory]:

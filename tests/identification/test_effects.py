@@ -57,9 +57,7 @@ def test_reduced_robots_stand_as_those_with_all_parts(model):
     assert np.allclose(shape(whole), shape(model.reduced(x, names)), rtol=0.0, atol=1e-9)
 
 
-@given(
-    st.floats(-3.0, 3.0), st.booleans(), st.floats(0.1, 10.0), st.floats(0.01, 2.0)
-)  # fmt: skip
+@given(st.floats(-3.0, 3.0), st.booleans(), st.floats(0.1, 10.0), st.floats(0.01, 2.0))
 @settings(deadline=None, max_examples=50)
 def test_numbers_and_their_coordinates(x, logarithmic, nominal, width):
     number = Number("a", "m", nominal, width, 0.0, 1e6, logarithmic)

@@ -17,9 +17,13 @@ from knode_cosserat.rods.routing import Polynomial
 from tests.identification.recorded import DT, measured, tensions
 
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
-    length=0.5, radius=0.003, density=1200.0, youngs_modulus=2.0e9, tendon_offset=0.025,
+    length=0.5,
+    radius=0.003,
+    density=1200.0,
+    youngs_modulus=2.0e9,
+    tendon_offset=0.025,
     gravity=(0.0, -9.81, 0.0),
-)  # fmt: skip
+)
 #: tendons that run neither straight nor evenly: no effect of the library has them
 TRUE = kc.robots.RoutedTendonRobot.like(
     NOMINAL,

@@ -18,9 +18,13 @@ from tests.identification.recorded import DT, measured, tensions
 
 #: as ruler, scale and data sheet have it: lying along z, with gravity across
 NOMINAL = kc.load_robot("delrin-tendon-robot").replace(
-    length=0.5, radius=0.003, density=1200.0, youngs_modulus=2.0e9, tendon_offset=0.025,
+    length=0.5,
+    radius=0.003,
+    density=1200.0,
+    youngs_modulus=2.0e9,
+    tendon_offset=0.025,
     gravity=(0.0, -9.81, 0.0),
-)  # fmt: skip
+)
 GAIN = np.array([1.0, 1.0, 0.93, 1.0])
 TRUE = kc.robots.RoutedTendonRobot.like(
     NOMINAL,

@@ -24,10 +24,15 @@ class Curve:
     def __init__(self, true=(0.4, -0.3, 0.2), fails=False):
         numbers = tuple((f"number {k}", 0.0) for k in range(3))
         self.model = SimpleNamespace(
-            size=3, nominal=SimpleNamespace(length=1.0), prior=np.ones(3),
+            size=3,
+            nominal=SimpleNamespace(length=1.0),
+            prior=np.ones(3),
             bounds=(np.full(3, -5.0), np.full(3, 5.0)),
-            begin=np.zeros(3), numbers=numbers, names=("curve",), robot=(np.zeros(3),),
-        )  # fmt: skip
+            begin=np.zeros(3),
+            numbers=numbers,
+            names=("curve",),
+            robot=(np.zeros(3),),
+        )
         t = np.linspace(0.0, 1.0, ROWS)
         self.shape = np.stack([t, np.sin(5.0 * t), t**3])
         rng = np.random.default_rng(0)
@@ -39,9 +44,13 @@ class Curve:
             size=(ROWS, BODIES, 3)
         )
         return Experiment(
-            0.05, np.zeros((ROWS - 1, 1)), BodyPositions((0.5, 1.0)), position.reshape(ROWS, -1),
-            np.zeros(1), name=name,
-        )  # fmt: skip
+            0.05,
+            np.zeros((ROWS - 1, 1)),
+            BodyPositions((0.5, 1.0)),
+            position.reshape(ROWS, -1),
+            np.zeros(1),
+            name=name,
+        )
 
     def differences(self, x, rows=None, which=None, offsets=None):
         self.calls += 1

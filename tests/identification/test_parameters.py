@@ -325,9 +325,15 @@ def test_matrices_and_vectors_as_numbers():
     effects = parameter_effects(robot, ["bending_damping", "drag", "gravity", "radius"])
     model = ParameterModel(robot, effects)
     assert model.labels == (
-        "bending_damping[0]", "bending_damping[1]", "bending_damping[2]", "drag",
-        "gravity[0]", "gravity[1]", "gravity[2]", "radius",
-    )  # fmt: skip
+        "bending_damping[0]",
+        "bending_damping[1]",
+        "bending_damping[2]",
+        "drag",
+        "gravity[0]",
+        "gravity[1]",
+        "gravity[2]",
+        "radius",
+    )
     np.testing.assert_allclose(
         model.values(np.zeros(model.size)), [0.03, 0.04, 0.05, 1e-4, 0.0, 0.0, -9.81, 0.003175]
     )

@@ -13,10 +13,17 @@ from knode_cosserat.rods.tendons import Reels
 
 #: three cables in a soft rod that hangs; a control of 1 takes in 0.1 mm
 CABLES = kc.robots.RoutedTendonRobot(
-    length=0.12, radius=0.004, density=1100.0, youngs_modulus=3e5, gravity=(0.0, 0.0, 9.81), nodes=6,
-    tendon_offset=0.004, tendon_angles=(0.0, 2.0944, 4.1888), drive="reel",
+    length=0.12,
+    radius=0.004,
+    density=1100.0,
+    youngs_modulus=3e5,
+    gravity=(0.0, 0.0, 9.81),
+    nodes=6,
+    tendon_offset=0.004,
+    tendon_angles=(0.0, 2.0944, 4.1888),
+    drive="reel",
     reels=Reels(motors=(1, 2, 3), radius=(1e-4, 1e-4, 1e-4)),
-)  # fmt: skip
+)
 PAIR = CABLES.replace(
     routing=(Straight(0.02, 0.0), Straight(-0.02, 0.0), Straight(0.0, 0.02, end=0.5)),
     reels=Reels(motors=(1, -1, 2), radius=(0.03, 0.03), taken_in=(1e-3, 1e-3, 0.0), compliance=(1e-3,) * 3),
@@ -68,10 +75,16 @@ def equilibria(robot, control, noise=5e-5):
     position = position + noise * np.random.default_rng(0).normal(size=position.shape)
     count = len(control)
     return kc.recordings.Measurements(
-        time=np.arange(float(count)), tension=control, fractions=np.ones(1), position=position,
-        quaternion=np.full((count, 1, 4), np.nan), measured=np.ones((count, 1), dtype=bool), simulated=True,
-        source="equilibria", static=True,
-    )  # fmt: skip
+        time=np.arange(float(count)),
+        tension=control,
+        fractions=np.ones(1),
+        position=position,
+        quaternion=np.full((count, 1, 4), np.nan),
+        measured=np.ones((count, 1), dtype=bool),
+        simulated=True,
+        source="equilibria",
+        static=True,
+    )
 
 
 def test_equilibria_follow_a_row_that_was_not_seen():
@@ -85,9 +98,11 @@ def test_equilibria_follow_a_row_that_was_not_seen():
 def test_a_robot_is_found_from_equilibria():
     """Slack cables among them; each row is predicted by itself, and in any order."""
     true = CABLES.replace(
-        length=0.125, tendon_offset=0.0043, sections=(Stretch(curvature=(1.0, -0.5, 0.0)),),
+        length=0.125,
+        tendon_offset=0.0043,
+        sections=(Stretch(curvature=(1.0, -0.5, 0.0)),),
         shear_stiffness=0.7 * np.asarray(CABLES.Kse),
-    )  # fmt: skip
+    )
     rng = np.random.default_rng(1)
     control = 80.0 * rng.uniform(size=(40, 3))
     control[np.arange(40), rng.integers(0, 3, size=40)] = 0.0
@@ -104,13 +119,19 @@ def test_a_robot_is_found_from_equilibria():
 
 #: two sections of steel, three tendons each, with a servo for each tendon; controls are lengths
 SERVOS = kc.robots.RoutedTendonRobot(
-    length=0.2, radius=5e-4, density=7850.0, youngs_modulus=2e11, nodes=7, drive="reel",
+    length=0.2,
+    radius=5e-4,
+    density=7850.0,
+    youngs_modulus=2e11,
+    nodes=7,
+    drive="reel",
     reels=Reels(motors=(1, 2, 3, 4, 5, 6)),
     routing=tuple(
         Straight(4.5e-3 * np.cos(angle), 4.5e-3 * np.sin(angle), end=end)
-        for end, turn in ((0.5, 0.0), (1.0, np.pi / 6)) for angle in turn + 2 * np.pi / 3 * np.arange(3)
+        for end, turn in ((0.5, 0.0), (1.0, np.pi / 6))
+        for angle in turn + 2 * np.pi / 3 * np.arange(3)
     ),
-)  # fmt: skip
+)
 
 
 @pytest.mark.campaign
@@ -121,7 +142,7 @@ def test_a_servo_robot_is_found_from_the_tip():
         reels=Reels(motors=(1, 2, 3, 4, 5, 6), zero=(2e-4, -3e-4, 1e-4, -2e-4, 3e-4, -1e-4)),
         tendon_compliance=compliance,
         base_end=kc.robots.ends.Clamped(position=(2e-3, -1e-3, 0.0), orientation=(1.0, 0.0, 0.0, 0.0)),
-    )  # fmt: skip
+    )
     control = 3e-3 * np.random.default_rng(2).uniform(-1.0, 1.0, size=(80, 6))
     seen = equilibria(true, control, 5e-4)
     found = kc.identify(SERVOS, [seen.rows(0, 50)], ["base position", "motor zeros", "tendon elasticity"])

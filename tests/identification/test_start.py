@@ -98,13 +98,19 @@ def test_slopes_of_a_start_in_equilibrium_are_exact():
 
 
 ROD = kc.robots.SlenderRod(
-    length=0.3, radius=0.004, density=1200.0, youngs_modulus=2e8, bending_damping=1e-3, nodes=5,
-    gravity=[9.81, 0.0, 0.0], base_end=kc.robots.ends.Driven(axes=("x",)),
+    length=0.3,
+    radius=0.004,
+    density=1200.0,
+    youngs_modulus=2e8,
+    bending_damping=1e-3,
+    nodes=5,
+    gravity=[9.81, 0.0, 0.0],
+    base_end=kc.robots.ends.Driven(axes=("x",)),
     loads=(
         kc.robots.loads.AttachedMass(mass=0.02),
         kc.robots.loads.PointWrench(at=0.5, force=[0.0, 0.1, 0.0]),
     ),
-)  # fmt: skip
+)
 
 
 def test_parameters_of_parts_have_names_with_dots():

@@ -51,10 +51,11 @@ def test_the_range_is_that_of_the_trajectories(model, seen):
         (trained.strain_low, trained.strain_high, np.concatenate([each.z for each in seen]).reshape(-1, 1)),
         (trained.control_low, trained.control_high, np.concatenate([each.control[1:] for each in seen])),
         (
-            trained.rate_low, trained.rate_high,
+            trained.rate_low,
+            trained.rate_high,
             np.concatenate([np.diff(each.z, axis=0) / each.dt for each in seen]).reshape(-1, 1),
         ),
-    ):  # fmt: skip
+    ):
         np.testing.assert_allclose(low, values.min(axis=0), atol=1e-12)
         np.testing.assert_allclose(high, values.max(axis=0), atol=1e-12)
 
@@ -126,9 +127,13 @@ def test_files_keep_the_range(model, tmp_path):
     again = kc.load_model(tmp_path / "model", knowledge=WRONG)
     assert jax.tree.all(jax.tree.map(np.array_equal, again.trained, model.trained))
     trained = TrainedRange(
-        np.array([-1e-5, -1e-5, 0.999, -3.0, -2.0, -0.1]), np.array([1e-5, 1e-5, 1.0, 3.0, 2.0, 0.1]),
-        -np.ones(6), np.ones(6), np.zeros(4), np.full(4, 9.5),
-    )  # fmt: skip
+        np.array([-1e-5, -1e-5, 0.999, -3.0, -2.0, -0.1]),
+        np.array([1e-5, 1e-5, 1.0, 3.0, 2.0, 0.1]),
+        -np.ones(6),
+        np.ones(6),
+        np.zeros(4),
+        np.full(4, 9.5),
+    )
     robot = kc.load_robot("delrin-routed-tendon-robot").replace(trained=trained)
     kc.save_robot(robot, tmp_path / "robot.yaml")
     found = kc.load_robot(tmp_path / "robot.yaml")

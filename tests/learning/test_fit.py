@@ -222,9 +222,10 @@ def test_metrics_for_tensorboard(bars, unseen, tmp_path):
         facts = model.about.facts
         scalars = _scalars(tmp_path / f"seed-{facts['seed']}")
         for stage, name, tag in (
-            ("segments", "loss", "loss"), ("segments", "learning_rate", "learning_rate"),
+            ("segments", "loss", "loss"),
+            ("segments", "learning_rate", "learning_rate"),
             ("rollouts", "learning_rate", "learning_rate"),
-        ):  # fmt: skip
+        ):
             series = [(step, value) for label, step, value in scalars if label == f"{stage}/{tag}"]
             assert [step for step, _ in series] == list(range(len(facts[stage][name])))
             np.testing.assert_allclose([value for _, value in series], facts[stage][name], rtol=1e-6)

@@ -67,10 +67,16 @@ def test_an_equilibrium_of_a_learned_robot_stays_at_rest(scheme):
 def test_models_of_the_paper_start_in_one_rest():
     rows = 4
     measured = Measurements(
-        time=DT * np.arange(rows), tension=np.tile(TENSION, (rows, 1)), fractions=np.ones(1),
-        position=np.zeros((rows, 1, 3)), quaternion=np.zeros((rows, 1, 4)), measured=np.ones((rows, 1), bool),
-        simulated=True, source="none", initial_tension=TENSION,
-    )  # fmt: skip
+        time=DT * np.arange(rows),
+        tension=np.tile(TENSION, (rows, 1)),
+        fractions=np.ones(1),
+        position=np.zeros((rows, 1, 3)),
+        quaternion=np.zeros((rows, 1, 4)),
+        measured=np.ones((rows, 1), bool),
+        simulated=True,
+        source="none",
+        initial_tension=TENSION,
+    )
     rest = kc.equilibrium(ROBOT, TENSION, space="euler")
     moved = _paper_motion(learned(1.5 / DT), ROBOT, measured, 0.0)
     np.testing.assert_array_equal(moved.y[0], rest.y[-1])

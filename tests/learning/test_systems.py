@@ -25,13 +25,19 @@ def pushed(period, size, phases):
 
 def driven_in_contact():
     robot = kc.robots.SlenderRod(
-        length=0.4, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=41,
-        bending_damping=2e-4, drag=0.01,
-        base_end=Driven(axes=("x", "ry")), gravity=[0.0, 0.0, 9.81],
+        length=0.4,
+        radius=0.005,
+        density=1100.0,
+        youngs_modulus=2e6,
+        nodes=41,
+        bending_damping=2e-4,
+        drag=0.01,
+        base_end=Driven(axes=("x", "ry")),
+        gravity=[0.0, 0.0, 9.81],
         surroundings=(
             Plane(point=[-0.03, 0.0, 0.0], normal=[1.0, 0.0, 0.0], stiffness=300.0, smoothing=2e-3),
         ),
-    )  # fmt: skip
+    )
     return robot, *(pushed(T, [0.03, 0.2], np.array([0.0, 1.0])) for T in (1.5, 2.2))
 
 
@@ -47,9 +53,15 @@ def magnetic():
 
 def in_water():
     robot = kc.robots.SlenderRod(
-        length=0.3, radius=0.005, density=1100.0, youngs_modulus=2e6, nodes=11, bending_damping=2e-4,
-        base_end=Driven(axes=("x", "ry")), loads=(kc.robots.fluids.Fluid(),),
-    )  # fmt: skip
+        length=0.3,
+        radius=0.005,
+        density=1100.0,
+        youngs_modulus=2e6,
+        nodes=11,
+        bending_damping=2e-4,
+        base_end=Driven(axes=("x", "ry")),
+        loads=(kc.robots.fluids.Fluid(),),
+    )
     return robot, *(pushed(T, [0.03, 0.4], np.array([0.0, 1.0])) for T in (1.5, 2.2))
 
 
@@ -95,9 +107,14 @@ def test_a_wrong_modulus_is_made_up_for(name):
 # samples where something acts
 
 LADEN = kc.robots.SlenderRod(
-    length=0.5, radius=0.005, density=1000.0, youngs_modulus=1e8, bending_damping=1e-2, nodes=11,
+    length=0.5,
+    radius=0.005,
+    density=1000.0,
+    youngs_modulus=1e8,
+    bending_damping=1e-2,
+    nodes=11,
     loads=(PointWrench(at=0.4, force=[0.3, 0.0, 0.0], controlled=True), AttachedMass(at=0.4, mass=0.05)),
-)  # fmt: skip
+)
 
 
 @pytest.mark.campaign

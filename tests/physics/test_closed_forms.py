@@ -38,9 +38,14 @@ class TipLoaded(kc.robots.TendonRobot):
 def rod(*, nodes=21, **changes):
     """Without gravity, of a section that cannot shear; two tendons, one along x and one along y."""
     parameters = {
-        "length": LENGTH, "radius": RADIUS, "youngs_modulus": YOUNGS_MODULUS, "density": DENSITY,
-        "gravity": (0.0, 0.0, 0.0), "tendon_angles": (0.0, np.pi / 2), "shear_stiffness": RIGID,
-    }  # fmt: skip
+        "length": LENGTH,
+        "radius": RADIUS,
+        "youngs_modulus": YOUNGS_MODULUS,
+        "density": DENSITY,
+        "gravity": (0.0, 0.0, 0.0),
+        "tendon_angles": (0.0, np.pi / 2),
+        "shear_stiffness": RIGID,
+    }
     return TipLoaded(nodes=nodes, **{**parameters, **changes})
 
 

@@ -47,8 +47,9 @@ def assert_begins_alike(recording, streams):
         np.testing.assert_allclose(
             np.diff(body.position, axis=0),
             np.diff(streams[0][name].position[: len(body.time)], axis=0),
-            rtol=0, atol=1e-12,
-        )  # fmt: skip
+            rtol=0,
+            atol=1e-12,
+        )
     known = streams[1].tension[: len(recording.tension.time)]
     np.testing.assert_allclose(recording.tension.tension, known, rtol=0, atol=1e-12)
 

@@ -24,9 +24,17 @@ def recorded(time, tension, command=None, until=4.0):
     frames = np.round(np.arange(0.0, until + 1e-9, 0.01), 6)
     body = Body(frames, np.tile([0.0, 0.0, 0.5], (len(frames), 1)), None, "tip", "tip", 1.0)
     return Recording(
-        source="it", config=CONFIG, bodies=(body,), base=None, tension=Tensions(time, tension, "tension"),
-        command=command, rest=None, simulated=True, findings=(), delays={},
-    )  # fmt: skip
+        source="it",
+        config=CONFIG,
+        bodies=(body,),
+        base=None,
+        tension=Tensions(time, tension, "tension"),
+        command=command,
+        rest=None,
+        simulated=True,
+        findings=(),
+        delays={},
+    )
 
 
 @pytest.fixture(scope="module")

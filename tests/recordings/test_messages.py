@@ -555,10 +555,15 @@ def test_sensors_beside_motion_capture_are_read_from_bags(tmp_path, ros):
 
     def imu(at, row):
         return it.make(
-            "sensor_msgs/msg/Imu", header=it.header(at), orientation=it.quaternion(QUATERNION[row]),
-            orientation_covariance=no, angular_velocity=zero, angular_velocity_covariance=no,
-            linear_acceleration=zero, linear_acceleration_covariance=no,
-        )  # fmt: skip
+            "sensor_msgs/msg/Imu",
+            header=it.header(at),
+            orientation=it.quaternion(QUATERNION[row]),
+            orientation_covariance=no,
+            angular_velocity=zero,
+            angular_velocity_covariance=no,
+            linear_acceleration=zero,
+            linear_acceleration_covariance=no,
+        )
 
     def wrench(at, row):
         made = it.make(

@@ -52,9 +52,10 @@ def errors(make, exact, nodes, **options):
 
 def angle_frame(nodes, **options):
     """Return the height lost by the tip of a beam on a column, under a force at the tip (m)."""
-    column, beam = rod("column", tip_end=on("corner")), rod(
-        "beam", base_end=on("corner", orientation=ALONG_X), tip_end=on("load")
-    )  # fmt: skip
+    column, beam = (
+        rod("column", tip_end=on("corner")),
+        rod("beam", base_end=on("corner", orientation=ALONG_X), tip_end=on("load")),
+    )
     bodies = RigidBody(name="corner"), RigidBody(name="load", force=(0.0, 0.0, -FORCE))
     return -moved(assembly(column, beam, bodies=bodies, nodes=nodes), "load", **options)[2]
 
@@ -75,10 +76,12 @@ def grid(nodes, **options):
     rods = [
         rod(name, base_end=Clamped(position=way, orientation=turn), tip_end=on("crossing", orientation=turn))
         for name, way, turn in (
-            ("west", (-L, 0.0, 0.0), ALONG_X), ("east", (L, 0.0, 0.0), (1.0, 0.0, -1.0, 0.0)),
-            ("north", (0.0, L, 0.0), (1.0, 1.0, 0.0, 0.0)), ("south", (0.0, -L, 0.0), (1.0, -1.0, 0.0, 0.0)),
+            ("west", (-L, 0.0, 0.0), ALONG_X),
+            ("east", (L, 0.0, 0.0), (1.0, 0.0, -1.0, 0.0)),
+            ("north", (0.0, L, 0.0), (1.0, 1.0, 0.0, 0.0)),
+            ("south", (0.0, -L, 0.0), (1.0, -1.0, 0.0, 0.0)),
         )
-    ]  # fmt: skip
+    ]
     crossing = RigidBody(name="crossing", force=(0.0, 0.0, -FORCE))
     return -moved(assembly(*rods, bodies=[crossing], nodes=nodes), "crossing", **options)[2]
 
@@ -86,9 +89,10 @@ def grid(nodes, **options):
 #: a frame of two beams, whose column has the moment F L; a portal frame of equal rods, (2 + 3) / (1 + 6);
 #: four beams that neither end turns
 FRAMES = {
-    angle_frame: FORCE * L**3 / EI * (1 / 3 + 1), four_bar: FORCE * L**3 / (12 * EI) * 5 / 7,
+    angle_frame: FORCE * L**3 / EI * (1 / 3 + 1),
+    four_bar: FORCE * L**3 / (12 * EI) * 5 / 7,
     grid: FORCE * L**3 / (48 * EI),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize(
@@ -108,10 +112,14 @@ def test_frames_bend_as_beams_to_a_millionth(frame):
 @pytest.mark.slow
 def test_a_ball_joint_passes_forces_on_but_no_moments():
     """Two rods on one line meet at a body, one of them with a ball joint: 3 EI / L³ each."""
-    below, above = rod("below", tip_end=on("hub")), rod(
-        "above", base_end=Clamped(position=(0.0, 0.0, 2.0 * L), orientation=DOWN),
-        tip_end=on("hub", Pinned, orientation=DOWN),
-    )  # fmt: skip
+    below, above = (
+        rod("below", tip_end=on("hub")),
+        rod(
+            "above",
+            base_end=Clamped(position=(0.0, 0.0, 2.0 * L), orientation=DOWN),
+            tip_end=on("hub", Pinned, orientation=DOWN),
+        ),
+    )
     hub = RigidBody(name="hub", force=(FORCE, 0.0, 0.0))
     sway = moved(assembly(below, above, bodies=[hub]), "hub", space="lobatto4")[0]
     assert sway == pytest.approx(FORCE * L**3 / (6 * EI), rel=1e-6)
@@ -136,8 +144,9 @@ def swinging(heavy, **more):
         return rod("arm", loads=(AttachedMass(mass=0.1, inertia=(1e-4, 2e-4, 3e-4)),), **more)
     return Assembly(
         rods=(rod("arm", tip_end=on("mass"), **more),),
-        bodies=(RigidBody(name="mass", mass=0.1, inertia=np.diag([1e-4, 2e-4, 3e-4])),), nodes=10,
-    )  # fmt: skip
+        bodies=(RigidBody(name="mass", mass=0.1, inertia=np.diag([1e-4, 2e-4, 3e-4])),),
+        nodes=10,
+    )
 
 
 @pytest.mark.slow
@@ -170,8 +179,10 @@ def test_a_divided_rod_bends_as_a_whole_one():
     whole = rod("whole", length=2.0 * L, nodes=11)
     halves = Assembly(
         rods=(rod("lower", tip_end=on("joint")), rod("upper", base_end=on("joint"))),
-        bodies=(RigidBody(name="joint"),), gravity=(40.0, 10.0, -90.0), nodes=6,
-    )  # fmt: skip
+        bodies=(RigidBody(name="joint"),),
+        gravity=(40.0, 10.0, -90.0),
+        nodes=6,
+    )
     one = kc.equilibrium(whole.replace(gravity=(40.0, 10.0, -90.0)), [], newton=NEWTON).part("p")[0]
     two = kc.equilibrium(halves, [], newton=NEWTON)
     assert one[-1, 0] > 0.05
@@ -195,13 +206,15 @@ def test_legs_and_a_platform_are_the_parallel_robot(legs):
     same = Assembly(
         rods=tuple(
             SlenderRod(
-                name=f"leg{k}", base_end=Driven(position=circle[0, k]),
-                tip_end=Clamped(body="platform", position=circle[1, k]), **section,
+                name=f"leg{k}",
+                base_end=Driven(position=circle[0, k]),
+                tip_end=Clamped(body="platform", position=circle[1, k]),
+                **section,
             )
             for k in range(legs)
         ),
         bodies=(RigidBody(name="platform", mass=robot.platform_mass, inertia=robot.inertia),),
-    )  # fmt: skip
+    )
     control = np.array([0.02, -0.03, 0.05, 0.01, 0.0, -0.02])[:legs]
     both = [kc.equilibrium(one, control, newton=NEWTON) for one in (robot, same)]
     assert all(one.all_valid for one in both)
@@ -230,9 +243,12 @@ def test_neighbours_share_a_load():
         return np.stack([y[1], y[2], y[3], (load - 2.0 * pushed) / EI])
 
     exact = solve_bvp(
-        curve, lambda a, b: np.array([a[0], a[1], b[2], b[3]]), np.linspace(0.0, L, 60), np.zeros((4, 60)),
+        curve,
+        lambda a, b: np.array([a[0], a[1], b[2], b[3]]),
+        np.linspace(0.0, L, 60),
+        np.zeros((4, 60)),
         tol=1e-10,
-    ).sol(np.linspace(0.0, L, 21))[0]  # fmt: skip
+    ).sol(np.linspace(0.0, L, 21))[0]
     np.testing.assert_allclose(x[0] - x[1], exact, atol=1e-6 * load * L**4 / EI)
 
 
@@ -283,8 +299,11 @@ def test_gradients_and_batches_are_those_of_single_assemblies():
 def test_the_gripper_has_names_for_its_controls_and_rods():
     robot = kc.load_robot("three-finger-gripper")
     assert kc.controls.labels(robot.control_layout)[2:] == [
-        "arm_tension_3", "thumb_tension", "index_tension", "middle_tension"
-    ]  # fmt: skip
+        "arm_tension_3",
+        "thumb_tension",
+        "index_tension",
+        "middle_tension",
+    ]
     assert robot.replace(length=0.5).rods[1].length == pytest.approx(0.16)
     assert robot.replace(**{"rods.thumb.length": 0.1}).rods[1].length == 0.1
 

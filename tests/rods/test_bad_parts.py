@@ -21,8 +21,12 @@ from knode_cosserat.robots import (
 from knode_cosserat.rods.assembly import NeighbourContact
 
 PAPER = kc.load_robot("delrin-tendon-robot")
-TABLE = {"bending_stiffness": [1.0, 2.0], "torsional_stiffness": [1.0], "axial_stiffness": [1.0],
-         "mass_per_length": [1.0]}  # fmt: skip
+TABLE = {
+    "bending_stiffness": [1.0, 2.0],
+    "torsional_stiffness": [1.0],
+    "axial_stiffness": [1.0],
+    "mass_per_length": [1.0],
+}
 
 
 def paper(**changes):
@@ -50,8 +54,16 @@ def fed(effects=(), **changes):
 
 
 def tube(k, **changes):
-    return tubes.Tube(**{"radius": 1e-3 * (k + 1), "inner_radius": 1e-3 * (k + 0.5), "density": 6450.0,
-                         "youngs_modulus": 6e10, "curvature": 0.0} | changes)  # fmt: skip
+    return tubes.Tube(
+        **{
+            "radius": 1e-3 * (k + 1),
+            "inner_radius": 1e-3 * (k + 0.5),
+            "density": 6450.0,
+            "youngs_modulus": 6e10,
+            "curvature": 0.0,
+        }
+        | changes
+    )
 
 
 def nested(**changes):

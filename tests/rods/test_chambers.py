@@ -17,9 +17,15 @@ r, a = 0.007, 0.004
 A = np.pi * a**2
 THREE = tuple(2 * np.pi * k / 3 for k in range(3))
 BODY = {
-    "length": L, "radius": R, "density": 1080.0, "youngs_modulus": E, "bending_damping": 2e-4,
-    "shear_damping": 0.5, "gravity": (0.0, 0.0, 0.0), "nodes": 6,
-}  # fmt: skip
+    "length": L,
+    "radius": R,
+    "density": 1080.0,
+    "youngs_modulus": E,
+    "bending_damping": 2e-4,
+    "shear_damping": 0.5,
+    "gravity": (0.0, 0.0, 0.0),
+    "nodes": 6,
+}
 P = 3e4
 
 

@@ -34,9 +34,13 @@ MATERIAL = {"density": DENSITY, "youngs_modulus": E, "shear_modulus": G}
 W, H = 0.012, 0.003
 STRIP = RectangularSection(width=W, height=H)
 TABLE = TabulatedSection(
-    at=(0.0, 0.37, 1.0), bending_stiffness=(2.0, 0.8, 0.5), bending_stiffness_y=(3.0, 1.5, 0.6),
-    torsional_stiffness=(0.9, 0.7, 0.3), axial_stiffness=(3e4,), mass_per_length=(0.05, 0.04, 0.03),
-)  # fmt: skip
+    at=(0.0, 0.37, 1.0),
+    bending_stiffness=(2.0, 0.8, 0.5),
+    bending_stiffness_y=(3.0, 1.5, 0.6),
+    torsional_stiffness=(0.9, 0.7, 0.3),
+    axial_stiffness=(3e4,),
+    mass_per_length=(0.05, 0.04, 0.03),
+)
 FORMS = {
     "elliptic": EllipticSection(semi_axis_x=0.006, semi_axis_y=0.002, angle=0.3),
     "hollow": HollowSection(radius=0.005, inner_radius=0.004),
@@ -121,9 +125,11 @@ def test_stiffness_and_inertia_are_integrals_over_the_area():
 def test_a_tube_without_a_hole_is_the_default_of_every_robot():
     radius, tendons = 0.004, {"tendon_offset": 0.01, "tendon_angles": [0.0, 2.0]}
     for kind, more in (
-        (kc.robots.SlenderRod, {}), (kc.robots.TendonRobot, tendons), (kc.robots.RoutedTendonRobot, tendons),
+        (kc.robots.SlenderRod, {}),
+        (kc.robots.TendonRobot, tendons),
+        (kc.robots.RoutedTendonRobot, tendons),
         (VirtualRobot, tendons),
-    ):  # fmt: skip
+    ):
         plain = rod(kind=kind, radius=radius, tip_radius=0.003, **more)
         tube = rod(HollowSection(radius=radius, inner_radius=0.0), kind, tip_radius=0.003, **more)
         stretch = rod(kind=kind, radius=radius, sections=(kc.robots.Stretch(radius=[1.0, -0.25]),), **more)
@@ -260,12 +266,17 @@ def test_a_table_moves_as_stretches_with_the_same_values():
     EI, EA, mass = E * np.pi * radius**4 / 4, E * np.pi * radius**2, DENSITY * np.pi * radius**2
     factors = np.array([1.0, 0.7, 0.3])
     table = TabulatedSection(
-        at=(0.0, 0.4, 1.0), bending_stiffness=EI * factors, torsional_stiffness=2 * EI * G / E * factors,
-        axial_stiffness=EA * factors, shear_stiffness=EA * G / E * factors, mass_per_length=[mass],
-    )  # fmt: skip
+        at=(0.0, 0.4, 1.0),
+        bending_stiffness=EI * factors,
+        torsional_stiffness=2 * EI * G / E * factors,
+        axial_stiffness=EA * factors,
+        shear_stiffness=EA * G / E * factors,
+        mass_per_length=[mass],
+    )
     stretches = (
-        kc.robots.Stretch(end=0.4, stiffness=[1.0, -0.3]), kc.robots.Stretch(begin=0.4, stiffness=[0.7, -0.4])
-    )  # fmt: skip
+        kc.robots.Stretch(end=0.4, stiffness=[1.0, -0.3]),
+        kc.robots.Stretch(begin=0.4, stiffness=[0.7, -0.4]),
+    )
     falling = {"gravity": [20.0, 0.0, -9.81]}
     tabulated, stretched = rod(table, **falling), rod(radius=radius, sections=stretches, **falling)
     found, expected = (
@@ -313,9 +324,13 @@ def test_legs_with_two_axes_hold_a_platform():
     robot = kc.load_robot("six-legged-robot")
     angles, length = np.asarray(robot.base_angles), float(robot.length)
     robot = robot.replace(
-        radius=None, cross_section=RectangularSection(width=0.002, height=0.001), gravity=[0.0, 0.0, 0.0],
-        platform_angles=angles, platform_radius=robot.base_radius, platform_mass=0.1,
-    )  # fmt: skip
+        radius=None,
+        cross_section=RectangularSection(width=0.002, height=0.001),
+        gravity=[0.0, 0.0, 0.0],
+        platform_angles=angles,
+        platform_radius=robot.base_radius,
+        platform_mass=0.1,
+    )
     EI = np.diag(np.asarray(robot.strand.Kbt))
     force = 1e-6 * 72.0 * EI[:2].min() / length**2 * np.array([1.0, 1.0, 0.0])
     found = kc.equilibrium(robot.replace(platform_force=force), np.zeros(6), space=SPACE)
@@ -336,9 +351,13 @@ def test_ribs_soften_each_principal_axis_as_a_beam_column():
     @jax.jit
     def softened(Kbt):
         robot = rod(
-            kind=kc.robots.RoutedTendonRobot, radius=0.003, bending_stiffness=Kbt, tendon_offset=0.01,
-            tendon_angles=[0.0], rib_spacing=RibSpacing(softening=softening),
-        )  # fmt: skip
+            kind=kc.robots.RoutedTendonRobot,
+            radius=0.003,
+            bending_stiffness=Kbt,
+            tendon_offset=0.01,
+            tendon_angles=[0.0],
+            rib_spacing=RibSpacing(softening=softening),
+        )
         y = robot.rest(0.2)[0]
         return robot.constitutive(0.2, 0.0, y, 0.0 * y, np.array([tension])).strains["u"].softened
 

@@ -10,10 +10,17 @@ from knode_cosserat.rods.routing import Helical, Polynomial, Tapered
 
 ANGLES = 2.0 * np.pi / 3.0 * np.arange(3)
 ROBOT = kc.robots.RoutedTendonRobot(
-    length=0.3, radius=0.0025, density=1400.0, youngs_modulus=1.2e9, bending_damping=2e-3, nodes=6,
-    tendon_offset=0.012, tendon_angles=ANGLES, loads=(kc.robots.loads.AttachedMass(mass=0.02),),
+    length=0.3,
+    radius=0.0025,
+    density=1400.0,
+    youngs_modulus=1.2e9,
+    bending_damping=2e-3,
+    nodes=6,
+    tendon_offset=0.012,
+    tendon_angles=ANGLES,
+    loads=(kc.robots.loads.AttachedMass(mass=0.02),),
     routing=(Helical(0.012, 0.0, 0.2), Tapered(0.012, 0.008, 2.0), Polynomial([-0.006, 0.002], [-0.01, 0.0])),
-)  # fmt: skip
+)
 #: changed parameters, each with a value and a step of its own size
 DESIGN = {
     "youngs_modulus": (1.2e9, 1e8),

@@ -29,10 +29,16 @@ def rotations(h):
 L, RADIUS, DENSITY = 0.5, 0.005, 1000.0
 LEVEL = quaternion(0.0, np.pi / 2, 0.0)
 LOOSE = kc.robots.SlenderRod(
-    length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, bending_damping=1e-3, nodes=11,
-    base_end=ends.Free(position=[0.0, 0.0, 0.0], orientation=LEVEL), linear_drag=0.0,
+    length=L,
+    radius=RADIUS,
+    density=DENSITY,
+    youngs_modulus=1e7,
+    bending_damping=1e-3,
+    nodes=11,
+    base_end=ends.Free(position=[0.0, 0.0, 0.0], orientation=LEVEL),
+    linear_drag=0.0,
     surroundings=(surroundings.Plane(stiffness=0.0, point=[0.0, 0.0, -0.2]),),
-)  # fmt: skip
+)
 MASS = float(LOOSE.mass_per_length) * L
 SIMPSON = np.array([1, 4, 2, 4, 2, 4, 2, 4, 2, 4, 1]) / 30.0
 
@@ -117,9 +123,11 @@ def test_a_falling_rod_reaches_its_terminal_velocity(law):
 def test_a_rod_on_a_plane_is_carried_by_it():
     k, δ = 2e4, 1e-4
     plane = {
-        "surroundings__0__stiffness": k, "surroundings__0__smoothing": δ, "surroundings__0__damping": 5.0,
+        "surroundings__0__stiffness": k,
+        "surroundings__0__smoothing": δ,
+        "surroundings__0__damping": 5.0,
         "surroundings__0__point": [0.0, 0.0, -RADIUS],
-    }  # fmt: skip
+    }
     found = loose(128, 0.01, **plane)
     p = np.asarray(found.part("p"))[-1]
     pressed = k * δ * np.log1p(np.exp(-p[:, 2] / δ))
@@ -136,9 +144,12 @@ def test_a_rod_that_slides_is_slowed_by_friction():
     weight = float(LOOSE.mass_per_length) * G
     depth = δ * np.log(np.expm1(weight / (k * δ)))
     plane = {
-        "surroundings__0__stiffness": k, "surroundings__0__smoothing": δ, "surroundings__0__friction": μ,
-        "surroundings__0__point": [0.0, 0.0, -RADIUS + depth], "surroundings__0__damping": 5.0,
-    }  # fmt: skip
+        "surroundings__0__stiffness": k,
+        "surroundings__0__smoothing": δ,
+        "surroundings__0__friction": μ,
+        "surroundings__0__point": [0.0, 0.0, -RADIUS + depth],
+        "surroundings__0__damping": 5.0,
+    }
     # along itself (material z is global x), so that friction at its surface does not roll it
     begin = in_motion(q=[0.0, 0.0, 1.0])
     found = loose(100, 0.005, begin, **plane)
@@ -154,9 +165,14 @@ def test_a_rod_that_slides_is_slowed_by_friction():
 # held at the base, anywhere
 
 HELD = kc.robots.SlenderRod(
-    length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, bending_damping=1e-3, nodes=11,
+    length=L,
+    radius=RADIUS,
+    density=DENSITY,
+    youngs_modulus=1e7,
+    bending_damping=1e-3,
+    nodes=11,
     base_end=ends.Clamped(position=[0.0, 0.0, 0.0], orientation=[1.0, 0.0, 0.0, 0.0]),
-)  # fmt: skip
+)
 
 
 @pytest.mark.slow
@@ -185,9 +201,13 @@ def test_where_the_base_is_moves_and_turns_everything():
 
 def quarter_period(amplitude, steps):
     bar = kc.robots.SlenderRod(
-        length=L, radius=0.01, density=DENSITY, youngs_modulus=1e11, nodes=11,
+        length=L,
+        radius=0.01,
+        density=DENSITY,
+        youngs_modulus=1e11,
+        nodes=11,
         base_end=ends.Pinned(orientation=quaternion(0.0, np.pi - amplitude, 0.0)),
-    )  # fmt: skip
+    )
     small = np.pi / 2 * np.sqrt(2 * L / (3 * G))
     t_end = 1.3 * small * ellipk(np.sin(amplitude / 2) ** 2) / (np.pi / 2)
     found = kc.simulate(bar, np.zeros((steps, 0)), t_end / steps, space="lobatto4", initial="unstressed")
@@ -215,9 +235,14 @@ def test_a_pendulum_has_its_period(degrees):
 
 BEAM_EI = 2.0
 BEAM = {
-    "length": 1.0, "radius": 0.01, "density": 100.0, "youngs_modulus": 1e9, "nodes": 11,
-    "bending_stiffness": BEAM_EI, "shear_stiffness": [1e8, 1e8, 10.0],
-}  # fmt: skip
+    "length": 1.0,
+    "radius": 0.01,
+    "density": 100.0,
+    "youngs_modulus": 1e9,
+    "nodes": 11,
+    "bending_stiffness": BEAM_EI,
+    "shear_stiffness": [1e8, 1e8, 10.0],
+}
 
 
 @pytest.mark.slow
@@ -241,10 +266,15 @@ def test_beams_held_at_both_ends(tip):
 # a base that is driven
 
 DRIVEN = kc.robots.SlenderRod(
-    length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, bending_damping=2e-3, nodes=11,
+    length=L,
+    radius=RADIUS,
+    density=DENSITY,
+    youngs_modulus=1e7,
+    bending_damping=2e-3,
+    nodes=11,
     base_end=ends.Driven(axes=("x", "ry", "z"), position=[0.1, 0.2, 0.3]),
     tip_end=ends.Clamped(position=[0.12, 0.2, 0.75]),
-)  # fmt: skip
+)
 
 
 @pytest.mark.campaign
@@ -304,10 +334,15 @@ def test_what_nothing_holds_is_said_to_have_no_equilibrium_under_its_weight(resu
 def test_a_universal_joint_carries_a_moment_across_both_hinges_only():
     """At the tip of a bent and twisted rod; a constraint does no work, so the stiffness is symmetric."""
     beam = kc.robots.SlenderRod(
-        length=L, radius=RADIUS, density=DENSITY, youngs_modulus=1e7, nodes=11, gravity=[2.0, 1.0, 0.0],
+        length=L,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=1e7,
+        nodes=11,
+        gravity=[2.0, 1.0, 0.0],
         base_end=ends.Clamped(orientation=quaternion(0.0, 0.0, 0.6)),
         tip_end=ends.Universal(position=[0.05, 0.02, 0.44], orientation=[1.0, 0.0, 0.0, 0.0]),
-    )  # fmt: skip
+    )
     found = kc.equilibrium(beam, np.zeros(0), space="lobatto4")
     d = rotations(found.part("h")[0, -1]).as_matrix()[0]
     m = np.asarray(found.part("m"))[0, -1]

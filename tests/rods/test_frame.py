@@ -120,9 +120,15 @@ def whirl(k, rate, GA):
 
 def modes_of_a_shaft(rate, GA, nodes=21):
     shaft = rod(
-        SpinningFrame(rate), radius=RADIUS, density=DENSITY, youngs_modulus=E, nodes=nodes,
-        base_end=ends.Pinned(), tip_end=ends.Universal(), shear_stiffness=[GA, GA, E * A],
-    )  # fmt: skip
+        SpinningFrame(rate),
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=E,
+        nodes=nodes,
+        base_end=ends.Pinned(),
+        tip_end=ends.Universal(),
+        shear_stiffness=[GA, GA, E * A],
+    )
     return kc.statics.modes(kc.equilibrium(shaft, NONE), count=40)
 
 
@@ -154,10 +160,14 @@ def supercritical(part, damping, drag):
     bare = rod(length=L, radius=0.002, youngs_modulus=1e9)
     first = 2.0 * np.pi * float(bare.bending_frequency)
     robot = rod(
-        SpinningFrame(part * first), length=L, radius=0.002, youngs_modulus=1e9, nodes=21,
+        SpinningFrame(part * first),
+        length=L,
+        radius=0.002,
+        youngs_modulus=1e9,
+        nodes=21,
         bending_damping=damping * float(bare.Kbt[0, 0]) / first,
         linear_drag=drag * float(bare.mass_per_length) * first,
-    )  # fmt: skip
+    )
     return kc.equilibrium(robot, NONE, space="lobatto4"), first
 
 
@@ -231,9 +241,11 @@ def test_a_rod_in_the_frame_moves_as_one_with_a_turning_base():
     distances = []
     for nodes in (11, 21):
         seen = rod(
-            SpinningFrame(RATE, point=POINT), **LADEN, nodes=nodes,
+            SpinningFrame(RATE, point=POINT),
+            **LADEN,
+            nodes=nodes,
             base_end=ends.Clamped(position=PLACE, orientation=TILT),
-        )  # fmt: skip
+        )
         driven = rod(
             **LADEN,
             nodes=nodes,
@@ -255,9 +267,10 @@ def test_without_damping_energy_less_spin_times_angular_momentum_is_constant():
     spin, J = np.array([0.0, 0.0, 15.0]), np.asarray(rod().section.rhoJ)
     for nodes in (21, 41):
         robot = rod(
-            SpinningFrame(15.0), nodes=nodes,
+            SpinningFrame(15.0),
+            nodes=nodes,
             base_end=ends.Clamped(orientation=[np.sqrt(0.5), 0.0, np.sqrt(0.5), 0.0]),
-        )  # fmt: skip
+        )
         # let go from its shape under a weight along the axis
         bent = kc.equilibrium(robot.replace(gravity=[0.0, 0.0, -9.81]), NONE, space="lobatto4")
         found = kc.simulate(robot, np.zeros((steps, 0)), 0.2 / steps, space="lobatto4", initial=bent)
@@ -282,7 +295,10 @@ def test_it_runs_in_batches_has_gradients_and_carries_a_model():
     def moved(rate):
         return kc.simulate(
             rod(SpinningFrame(rate), bending_damping=1e-4, gravity=[1.0, 0.0, 0.0], nodes=6),
-            np.zeros((20, 0)), 0.01, initial="unstressed")  # fmt: skip
+            np.zeros((20, 0)),
+            0.01,
+            initial="unstressed",
+        )
 
     robots = [moved(rate).system for rate in (3.0, 9.0)]
     both = kc.simulate(robots, np.zeros((2, 20, 0)), 0.01, initial="unstressed")

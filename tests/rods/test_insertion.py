@@ -25,9 +25,15 @@ FED = (Insertion(reserve=0.5, retraction=0.3),)
 
 def rod(**changes):
     given = {
-        "length": L, "radius": RADIUS, "density": DENSITY, "youngs_modulus": 1e7, "nodes": 11,
-        "gravity": (0.0, 0.0, 0.0), "bending_damping": 1e-4, "effects": FED,
-    }  # fmt: skip
+        "length": L,
+        "radius": RADIUS,
+        "density": DENSITY,
+        "youngs_modulus": 1e7,
+        "nodes": 11,
+        "gravity": (0.0, 0.0, 0.0),
+        "bending_damping": 1e-4,
+        "effects": FED,
+    }
     return kc.robots.SlenderRod(**given | changes)
 
 
@@ -47,9 +53,13 @@ def eased(time, start=0.1):
 def test_material_that_moves_along_a_turning_arm_has_coriolis_forces():
     rate, speed, radius = 3.0, 0.5, 0.01
     arm = rod(
-        radius=radius, youngs_modulus=2e12, bending_damping=40.0, shear_damping=2e4, nodes=7,
+        radius=radius,
+        youngs_modulus=2e12,
+        bending_damping=40.0,
+        shear_damping=2e4,
+        nodes=7,
         base_end=Driven(axes=("rx",)),
-    )  # fmt: skip
+    )
     way = eased(2e-3 * np.arange(1, 101))
     turning = kc.simulate(
         arm, np.stack([rate * way, speed * way], axis=1), 2e-3, time="bdf2", space="lobatto4"
@@ -113,9 +123,12 @@ SOFT = {"stiffness": (0.4,), "curvature": (0.0, 3.0, 0.0)}
 
 def table(at, values):
     return TabulatedSection(
-        bending_stiffness=values, torsional_stiffness=[4e-3], axial_stiffness=[800.0], mass_per_length=[0.08],
+        bending_stiffness=values,
+        torsional_stiffness=[4e-3],
+        axial_stiffness=[800.0],
+        mass_per_length=[0.08],
         at=at,
-    )  # fmt: skip
+    )
 
 
 def bare(**changes):
@@ -130,8 +143,15 @@ def curved(begin, **changes):
 
 
 def wound(turns, angle=0.0, **changes):
-    given = {"length": L, "radius": RADIUS, "density": DENSITY, "youngs_modulus": 1e7, "nodes": 21,
-             "gravity": (0.3, 0.0, 0.0), "bending_damping": 1e-4}  # fmt: skip
+    given = {
+        "length": L,
+        "radius": RADIUS,
+        "density": DENSITY,
+        "youngs_modulus": 1e7,
+        "nodes": 21,
+        "gravity": (0.3, 0.0, 0.0),
+        "bending_damping": 1e-4,
+    }
     routing = (Helical(radius=0.008, phase=angle, turns=turns),)
     return kc.robots.RoutedTendonRobot(**given | {"routing": routing} | changes)
 
@@ -191,10 +211,13 @@ FED_AND_CUT = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("case", [
-    name if name in ("half of a curved tip", "helix") else pytest.param(name, marks=pytest.mark.slow)
-    for name in FED_AND_CUT
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "case",
+    [
+        name if name in ("half of a curved tip", "helix") else pytest.param(name, marks=pytest.mark.slow)
+        for name in FED_AND_CUT
+    ],
+)
 def test_a_fed_rod_rests_as_a_rod_of_the_exposed_material(case):
     inserted, control, fed, cut = FED_AND_CUT[case]
     names = fed.control_layout.names
@@ -250,11 +273,17 @@ def test_a_hanging_rod_let_out_slowly_is_stretched_by_its_exposed_weight():
     expected = exposed + DENSITY * 9.81 * exposed**2 / (2.0 * 1e6)
     errors = [
         kc.simulate(
-            hanging, inserted[:, None], duration / 400, space="lobatto4", time="bdf2", between="linear",
+            hanging,
+            inserted[:, None],
+            duration / 400,
+            space="lobatto4",
+            time="bdf2",
+            between="linear",
             initial=rest(hanging, 0.0),
-        ).tip_position[1:, 2] - expected
+        ).tip_position[1:, 2]
+        - expected
         for duration in (80.0, 160.0)
-    ]  # fmt: skip
+    ]
     assert np.abs(errors[1]).max() < 1e-6 * L
     # damping and momentum are proportional to the rate and to its square
     assert np.abs(errors[0]).max() == pytest.approx(2.0 * np.abs(errors[1]).max(), rel=0.02)
@@ -274,9 +303,14 @@ def test_a_swinging_rod_let_out_slowly_keeps_the_ratio_of_energy_and_frequency()
     control = np.concatenate([np.zeros(first), fed_smoothly(20.0, 1000), np.full(last, 0.3)])
     with pytest.warns(UndampedWarning):
         found = kc.simulate(
-            swinging, control[:, None], dt, space="lobatto4", time="trapezoidal", between="linear",
+            swinging,
+            control[:, None],
+            dt,
+            space="lobatto4",
+            time="trapezoidal",
+            between="linear",
             initial=rest(rod(gravity=(0.02, 0.0, 0.0)), 0.0),
-        )  # fmt: skip
+        )
     swing = found.tip_position[1:, 0]
     growth = np.sqrt(np.mean(swing[-last:] ** 2) / np.mean(swing[:first] ** 2))
     assert growth == pytest.approx(np.sqrt((L + 0.3) / L), rel=2e-3)

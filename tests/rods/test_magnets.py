@@ -19,9 +19,14 @@ UNIT = EI / L**2
 
 
 PLAIN = kc.robots.SlenderRod(
-    length=L, radius=RADIUS, density=1700.0, youngs_modulus=E, bending_damping=1e-9, nodes=11,
+    length=L,
+    radius=RADIUS,
+    density=1700.0,
+    youngs_modulus=E,
+    bending_damping=1e-9,
+    nodes=11,
     gravity=[0.0, 0.0, 0.0],
-)  # fmt: skip
+)
 #: magnetised along its axis in a uniform field, in that of a dipole, and at its tip: one compiled program
 MAGNETIC = PLAIN.replace(
     loads=(Magnet(), Magnet(field=DipoleField([0.0, 0.0, 1.0], [0.0, 0.0, 0.0])), PointMagnet())
@@ -89,9 +94,12 @@ def test_a_field_against_the_magnetisation_buckles_the_rod():
 
 def test_a_magnet_at_the_tip_is_a_moment_that_turns_with_it():
     """EI θ' = m B cos θ_L along the rod, whose line is a circle."""
-    robot = MAGNETIC.replace(**{
-        "loads.2.moment": [0.0, 0.0, UNIT * L], "loads.2.field.flux_density": [1.3, 0.0, 0.0],
-    })  # fmt: skip
+    robot = MAGNETIC.replace(
+        **{
+            "loads.2.moment": [0.0, 0.0, UNIT * L],
+            "loads.2.field.flux_density": [1.3, 0.0, 0.0],
+        }
+    )
     found = rest(robot)
     angle = brentq(lambda angle: angle - 1.3 * np.cos(angle), 0.0, 1.5, xtol=1e-15)
     np.testing.assert_allclose(np.asarray(found.part("u"))[0, :, 1], angle / L, rtol=1e-8)

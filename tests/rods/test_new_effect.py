@@ -51,8 +51,12 @@ class FrictionLayer(Effect):
 
 
 ROD = {
-    "length": 0.3, "radius": 0.002, "density": 2e3, "youngs_modulus": 1e9, "bending_damping": 1e-4,
-}  # fmt: skip
+    "length": 0.3,
+    "radius": 0.002,
+    "density": 2e3,
+    "youngs_modulus": 1e9,
+    "bending_damping": 1e-4,
+}
 DT, STEPS = 0.02, 20
 
 

@@ -178,9 +178,12 @@ def test_a_heavy_platform_on_light_legs_swings_as_a_mass_on_springs():
         )
         x, time = swing.tip_position[:, 0], swing.time
         # from the first to the second crossing of zero is half a period
-        at = [np.interp(0.0, x[[k + 1, k]], time[[k + 1, k]]) if x[k] > 0 else
-              np.interp(0.0, x[[k, k + 1]], time[[k, k + 1]])
-              for k in np.flatnonzero(x[:-1] * x[1:] < 0)]  # fmt: skip
+        at = [
+            np.interp(0.0, x[[k + 1, k]], time[[k + 1, k]])
+            if x[k] > 0
+            else np.interp(0.0, x[[k, k + 1]], time[[k, k + 1]])
+            for k in np.flatnonzero(x[:-1] * x[1:] < 0)
+        ]
         found.append(np.pi / (at[1] - at[0]))
     errors = np.array(found) / omega - 1.0
     # tan(ω' dt/2) = ω dt/2, and a straight line between rows errs by as much

@@ -107,13 +107,17 @@ ROUTED = {
 TUBES = st.tuples(
     *(
         st.builds(
-            Tube, radius=st.just(radius), inner_radius=st.just(0.7 * radius), density=st.just(6e3),
-            youngs_modulus=st.floats(1e3, 2e12), curvature=st.floats(-1e3, 1e3),
+            Tube,
+            radius=st.just(radius),
+            inner_radius=st.just(0.7 * radius),
+            density=st.just(6e3),
+            youngs_modulus=st.floats(1e3, 2e12),
+            curvature=st.floats(-1e3, 1e3),
             curved=st.none() | st.floats(0.0, 20.0),
         )
         for radius in (1e-3, 2e-3)
     )
-)  # fmt: skip
+)
 FIELDS = {
     "slender-rod": ROD,
     "routed-tendon-robot": ROUTED,
@@ -251,18 +255,25 @@ def test_code_cannot_be_saved(tmp_path):
 # parameters of parts by name
 
 LADEN = kc.robots.SlenderRod(
-    **BODY, nodes=6, base_end=Driven(axes=("x", "ry")),
+    **BODY,
+    nodes=6,
+    base_end=Driven(axes=("x", "ry")),
     loads=(AttachedMass(mass=0.1, at=0.4), PointWrench(controlled=True), DistributedWrench(begin=0.3)),
     surroundings=(Sphere(center=[0.0, 0.0, -1.0]),),
     sections=(kc.robots.Stretch(end=0.4, stiffness=[1.0, 2.0]),),
-)  # fmt: skip
+)
 
 
 def test_parameters_of_parts_by_name():
-    changed = LADEN.replace(**{
-        "loads.0.mass": 0.3, "loads.1.force": [1, 2, 3], "surroundings.0.radius": 0.2,
-        "base_end.position": [1, 0, 0], "loads.0.at": 0.6,
-    })  # fmt: skip
+    changed = LADEN.replace(
+        **{
+            "loads.0.mass": 0.3,
+            "loads.1.force": [1, 2, 3],
+            "surroundings.0.radius": 0.2,
+            "base_end.position": [1, 0, 0],
+            "loads.0.at": 0.6,
+        }
+    )
     assert (
         changed.loads[0].mass == 0.3 and changed.loads[0].at == 0.6 and 0.6 in changed.discontinuities.places
     )
@@ -301,23 +312,34 @@ def made(robots):
     numbers = np.zeros((*batch, 3))
     system = jax.tree.map(lambda *leaves: np.stack(leaves), *robots) if batch else one
     return kc.Trajectory(
-        system, None, np.arange(3) * 0.1, rng.normal(size=(*batch, 3, one.nodes, one.y_layout.size)),
+        system,
+        None,
+        np.arange(3) * 0.1,
+        rng.normal(size=(*batch, 3, one.nodes, one.y_layout.size)),
         rng.normal(size=(*batch, 3, one.nodes, one.z_layout.size)),
-        rng.normal(size=(*batch, 3, one.control_layout.size)), numbers.astype(int), numbers,
+        rng.normal(size=(*batch, 3, one.control_layout.size)),
         numbers.astype(int),
-    )  # fmt: skip
+        numbers,
+        numbers.astype(int),
+    )
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_trajectories_of_robots_that_differ_in_their_parts_come_back(tmp_path, count):
     robots = [
-        LADEN.replace(**{
-            "loads.0.mass": 0.1 * k, "loads.1.moment": [k, 0, 1], "surroundings.0.radius": 0.1 + k,
-            "length": 0.5 + k, "sections.0.stiffness": [1.0 + k, 2.0], "base_end.position": [0, 0, k],
-            "loads.2.force": [0, k, 0],
-        })
+        LADEN.replace(
+            **{
+                "loads.0.mass": 0.1 * k,
+                "loads.1.moment": [k, 0, 1],
+                "surroundings.0.radius": 0.1 + k,
+                "length": 0.5 + k,
+                "sections.0.stiffness": [1.0 + k, 2.0],
+                "base_end.position": [0, 0, k],
+                "loads.2.force": [0, k, 0],
+            }
+        )
         for k in range(count)
-    ]  # fmt: skip
+    ]
     truth = made(robots)
     truth.save(tmp_path / "here.nc")
     found = kc.load_trajectory(tmp_path / "here.nc")
@@ -384,10 +406,15 @@ parameters:
 @pytest.mark.parametrize(
     ("length", "one", "other", "warned"),
     [
-        (0.125, 0.125, 0.125, True), (0.125, 0.0625, 0.125, True), (0.3, 0.3, 0.1, True),
-        (0.125, 0.125, 1.0, False), (0.5, 0.5, 1.0, False), (0.125, 0.5, 0.75, False), (1.0, 1.0, 1.0, False),
+        (0.125, 0.125, 0.125, True),
+        (0.125, 0.0625, 0.125, True),
+        (0.3, 0.3, 0.1, True),
+        (0.125, 0.125, 1.0, False),
+        (0.5, 0.5, 1.0, False),
+        (0.125, 0.5, 0.75, False),
+        (1.0, 1.0, 1.0, False),
     ],
-)  # fmt: skip
+)
 def test_places_in_metres_are_warned_of(tmp_path, length, one, other, warned):
     path = tmp_path / "robot.yaml"
     path.write_text(PLACES.format(length=length, one=one, other=other))

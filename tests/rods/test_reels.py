@@ -10,9 +10,14 @@ from knode_cosserat.rods.tendons import Reels
 
 PAIRS = Reels(motors=(1, -1, 2, -2), radius=(0.02, 0.03), zero=(0.1, 0.0), taken_in=(1e-3, 1e-3, 0.0, 2e-3))
 ROBOT = kc.robots.RoutedTendonRobot.like(
-    kc.load_robot("delrin-tendon-robot"), drive="reel", tendon_offset=0.02, tendon_compliance=1e-4,
-    tendon_angles=(0.0, np.pi, np.pi / 2, -np.pi / 2), gravity=(0.0, 0.0, 0.0), nodes=6,
-)  # fmt: skip
+    kc.load_robot("delrin-tendon-robot"),
+    drive="reel",
+    tendon_offset=0.02,
+    tendon_compliance=1e-4,
+    tendon_angles=(0.0, np.pi, np.pi / 2, -np.pi / 2),
+    gravity=(0.0, 0.0, 0.0),
+    nodes=6,
+)
 
 
 def test_a_pair_is_wound_up_on_one_side_and_let_out_on_the_other():

@@ -14,9 +14,7 @@ from knode_cosserat.robots import section, tendons
 
 KNOWLEDGE = kc.load_robot("delrin-tendon-robot")
 NO_LOADS = {"gravity": [0.0, 0.0, 0.0], "drag": 0.0}
-RUBBING = {
-    "friction": tendons.TendonFriction(wobble=0.6, curvature=0.1, reach=0.1), "bending_damping": 2e-3
-}  # fmt: skip
+RUBBING = {"friction": tendons.TendonFriction(wobble=0.6, curvature=0.1, reach=0.1), "bending_damping": 2e-3}
 
 
 def moved(robot, steps=60, dt=0.025, control="sine:1.0", **options):

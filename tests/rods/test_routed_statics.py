@@ -13,14 +13,18 @@ from tests.rods import rucker_webster as oracle
 DELRIN = kc.load_robot("delrin-tendon-robot")
 L = 0.635
 ROD = oracle.Rod(
-    L, np.asarray(DELRIN.Kse), np.asarray(DELRIN.Kbt),
+    L,
+    np.asarray(DELRIN.Kse),
+    np.asarray(DELRIN.Kbt),
     float(DELRIN.mass_per_length) * np.array([0.0, 0.0, -9.81]),
-)  # fmt: skip
+)
 #: one ends at a node (of 11, 21 or 41), one between nodes
 ROUTING = (
-    Straight(0.015, 0.01), Helical(0.02, 0.5, 0.75), Polynomial([0.01, 0.02, -0.03], [0.0, 0.015], end=0.4),
+    Straight(0.015, 0.01),
+    Helical(0.02, 0.5, 0.75),
+    Polynomial([0.01, 0.02, -0.03], [0.0, 0.015], end=0.4),
     Tapered(0.02, 0.008, 2.5, end=0.73),
-)  # fmt: skip
+)
 PATHS = (
     lambda T: oracle.polynomial([0.015], [0.01], L, T),
     lambda T: oracle.helix(0.02, 0.5, 0.75, L, T),
@@ -117,7 +121,7 @@ def test_a_tendon_that_gives_takes_more_pulling():
     T = [
         field(kc.equilibrium(REELED.replace(tendon_compliance=C), taken_in), "tension")[0, 0]
         for C in (0.0, 1e-4, 1e-3)
-    ]  # fmt: skip
+    ]
     assert T[0] > T[1] > T[2] > 0.0
     # small and straight: springs in series, of rod and tendon
     give = 0.003 / T[0]
@@ -157,9 +161,11 @@ def test_a_batch_of_reeled_robots_is_each_by_itself():
 def helices(turn=0.0):
     routing = tuple(Helical(0.02, turn + k * np.pi / 2, 0.5) for k in range(4))
     return kc.robots.RoutedTendonRobot.like(
-        DELRIN, routing=routing, friction=TendonFriction(wobble=0.6, curvature=0.3, reach=0.02),
+        DELRIN,
+        routing=routing,
+        friction=TendonFriction(wobble=0.6, curvature=0.3, reach=0.02),
         gravity=[0.0, 0.0, 0.0],
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.campaign

@@ -101,13 +101,18 @@ def resting(*stretches, cut, nodes=11):
     """Curved at rest, each stretch from its first curvature to its second."""
     (a, b), (c, d) = (np.asarray(each) for each in stretches)
     return kc.robots.SlenderRod(
-        length=L, radius=RADIUS, density=1000.0, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=nodes,
+        length=L,
+        radius=RADIUS,
+        density=1000.0,
+        youngs_modulus=E,
+        gravity=[0.0, 0.0, 0.0],
+        nodes=nodes,
         bending_damping=1e-3,
         sections=(
             kc.robots.Stretch(end=cut, curvature=a, curvature_slope=b - a),
             kc.robots.Stretch(begin=cut, curvature=c, curvature_slope=d - c),
         ),
-    )  # fmt: skip
+    )
 
 
 def frames(stretches, cut):
@@ -212,16 +217,15 @@ def test_one_stretch_is_two():
     whole = dataclasses.replace(
         CHANGED, sections=(kc.robots.section.FunctionSection(function=function, inputs=1),)
     )
-    parts = changed(
-        {"curvature_gain": [1.0, 0.0, 2.0]}, radius_0=[1.0, -0.141], radius_1=[0.859, -0.159]
-    )  # fmt: skip
+    parts = changed({"curvature_gain": [1.0, 0.0, 2.0]}, radius_0=[1.0, -0.141], radius_1=[0.859, -0.159])
     for name in ("Kse", "Kbt", "u_star", "rhoA", "rhoJ", "radius"):
         for s in (0.0, 0.1, 0.3, 0.4):
             np.testing.assert_allclose(
                 getattr(whole.material(s, np.array([0.7])), name),
                 getattr(parts.material(s, np.array([0.7, 0.7])), name),
-                rtol=1e-12, atol=1e-14,
-            )  # fmt: skip
+                rtol=1e-12,
+                atol=1e-14,
+            )
 
 
 @pytest.mark.campaign
@@ -244,9 +248,13 @@ def test_derivatives_with_respect_to_a_section_and_its_control():
     control = np.stack([np.sin(np.arange(20) / 4.0), np.cos(np.arange(20) / 5.0)], axis=1)
 
     def tip(gain, scale):
-        robot = CHANGED.replace(**{
-            "sections.0.curvature_gain": gain, "sections.1.stiffness_gain": 0.3, "gravity": [1.0, 2.0, -9.0]
-        })  # fmt: skip
+        robot = CHANGED.replace(
+            **{
+                "sections.0.curvature_gain": gain,
+                "sections.1.stiffness_gain": 0.3,
+                "gravity": [1.0, 2.0, -9.0],
+            }
+        )
         return kc.simulate(robot, scale * control, 0.02).position[-1, -1, 0]
 
     at, along = (np.array([1.0, 3.0, 0.2]), 0.8), (np.array([0.4, -0.3, 0.6]), 0.5)
@@ -278,9 +286,12 @@ def test_nothing_is_left_of_no_section(given, said):
 @pytest.mark.parametrize("gain", [0.2, -0.2])
 def test_a_control_leaves_some_stiffness(gain):
     rod = kc.robots.SlenderRod(
-        length=L, radius=RADIUS, density=1000.0, youngs_modulus=E,
+        length=L,
+        radius=RADIUS,
+        density=1000.0,
+        youngs_modulus=E,
         sections=(kc.robots.Stretch(controlled=True, stiffness_gain=gain),),
-    )  # fmt: skip
+    )
     limit = -1.0 / gain
     assert kc.equilibrium(rod, np.array([0.9 * limit])).all_valid
     for beyond in (limit, 1.2 * limit):
@@ -317,10 +328,13 @@ def test_an_extended_segment_is_an_arc_of_its_own_length():
     np.testing.assert_allclose(found.tip_position[0], expected, atol=1e-7)
     np.testing.assert_allclose(found.part("n"), 0.0, atol=1e-7 * EI)
     # made so: at rest without a control
-    made = segment().replace(**{
-        "sections.0.curvature": [x, 0.0, 0.0], "sections.1.curvature": [0.0, y, 0.0],
-        "sections.2.extension": extension,
-    })  # fmt: skip
+    made = segment().replace(
+        **{
+            "sections.0.curvature": [x, 0.0, 0.0],
+            "sections.1.curvature": [0.0, y, 0.0],
+            "sections.2.extension": extension,
+        }
+    )
     still, strains = made.rest(L)
     np.testing.assert_allclose(still[:3], expected, atol=1e-9)
     np.testing.assert_allclose(strains, [0.0, 0.0, 1.0 + extension, x, y, 0.0], atol=1e-12)

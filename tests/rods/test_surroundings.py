@@ -68,9 +68,12 @@ def test_the_distance_from_a_cylinder(p, point, axis, radius, inside, shift):
     assert float(pipe.distance(p + shift * unit)[0]) == pytest.approx(float(distance), abs=1e-9)
 
 
-MOVING = loads.Motion(*map(jnp.asarray, (
-    [0.05, 0.02, 0.1035], np.eye(3), [0.02, -0.01, -0.03], [0.3, 0.1, 0.2], np.zeros(3), np.zeros(3)
-)))  # fmt: skip
+MOVING = loads.Motion(
+    *map(
+        jnp.asarray,
+        ([0.05, 0.02, 0.1035], np.eye(3), [0.02, -0.01, -0.03], [0.3, 0.1, 0.2], np.zeros(3), np.zeros(3)),
+    )
+)
 OBSTACLES = [
     each(stiffness=1e4, smoothing=1e-3, damping=2.0, friction=0.4, slip=1e-2, **where)
     for each, where in (

@@ -52,8 +52,12 @@ def shape(rod, routings, tensions, tolerance=1e-11):
             running = np.where(anchored * rod.length > s, tensions, 0.0)
             along = solve_ivp(
                 lambda at, x, running=running: np.asarray(rates(at, x, running)[0]),
-                (s, stop), x, method="DOP853", rtol=tolerance, atol=tolerance,
-            )  # fmt: skip
+                (s, stop),
+                x,
+                method="DOP853",
+                rtol=tolerance,
+                atol=tolerance,
+            )
             x, s = along.y[:, -1], stop
         return np.concatenate([x[:12], np.asarray(rates(s, x, running)[1])]), x[12:]
 

@@ -56,8 +56,10 @@ def test_two_tubes_twist_like_a_pendulum_with_order_four():
         exact = solve_bvp(
             lambda s, y: np.stack([y[1], twisting(6.0, 5.0) ** 2 * np.sin(y[0])]),
             lambda a, b: np.array([a[0] - 2.5, b[1]]),
-            np.linspace(0.0, L, 50), np.stack([np.full(50, 2.5), np.zeros(50)]), tol=1e-11,
-        ).sol(np.linspace(0.0, L, nodes // 2 + 1))[0]  # fmt: skip
+            np.linspace(0.0, L, 50),
+            np.stack([np.full(50, 2.5), np.zeros(50)]),
+            tol=1e-11,
+        ).sol(np.linspace(0.0, L, nodes // 2 + 1))[0]
         errors.append(np.abs(np.diff(angle, axis=1)[: nodes // 2 + 1, 0] - exact).max())
     assert errors[1] < 1e-6
     assert np.log2(errors[0] / errors[1]) == pytest.approx(4.0, abs=0.3)

@@ -16,9 +16,17 @@ ENDS = kc.robots.ends
 def shaft(nodes, axes=("x", "rx", "rz"), **options):
     """Return a horizontal shaft on a driven base, which sags by 0.8 % of its length."""
     return kc.robots.SlenderRod(
-        length=LENGTH, radius=RADIUS, density=DENSITY, youngs_modulus=MODULUS, gravity=(-9.81, 0.0, 0.0),
-        nodes=nodes, bending_damping=0.02, linear_drag=0.5, base_end=ENDS.Driven(axes=axes), **options,
-    )  # fmt: skip
+        length=LENGTH,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=MODULUS,
+        gravity=(-9.81, 0.0, 0.0),
+        nodes=nodes,
+        bending_damping=0.02,
+        linear_drag=0.5,
+        base_end=ENDS.Driven(axes=axes),
+        **options,
+    )
 
 
 def turned(t, speed):
@@ -139,9 +147,16 @@ def coil(nodes, turns=10.0, radius=1e-3, **options):
     """Return a rod that is coiled at rest."""
     curled = kc.robots.Stretch(curvature=(2 * np.pi * turns, 0.0, 0.0))
     return kc.robots.SlenderRod(
-        length=LENGTH, radius=radius, density=DENSITY, youngs_modulus=MODULUS, gravity=(0.0, 0.0, 0.0),
-        nodes=nodes, bending_damping=0.02, sections=(curled,), **options,
-    )  # fmt: skip
+        length=LENGTH,
+        radius=radius,
+        density=DENSITY,
+        youngs_modulus=MODULUS,
+        gravity=(0.0, 0.0, 0.0),
+        nodes=nodes,
+        bending_damping=0.02,
+        sections=(curled,),
+        **options,
+    )
 
 
 def test_a_coil_that_is_off_by_its_own_radius_is_coarse():
@@ -191,9 +206,12 @@ def test_a_stretch_beyond_rod_theory_is_warned_of(stretch):
 def test_results_that_hold_for_all_later_rows():
     codes = kc.Result
     converged, coarse, continued, halved, failed = (
-        codes.CONVERGED, codes.COARSE, codes.RECOVERED_LOAD_CONTINUATION, codes.RECOVERED_STEP_HALVING,
+        codes.CONVERGED,
+        codes.COARSE,
+        codes.RECOVERED_LOAD_CONTINUATION,
+        codes.RECOVERED_STEP_HALVING,
         codes.NO_CONVERGENCE,
-    )  # fmt: skip
+    )
     rows = np.array([
         [converged, continued, converged, halved, converged, coarse, converged, continued],
         [converged, coarse, converged, converged, failed, failed, failed, failed],

@@ -220,9 +220,13 @@ def test_pieces_side_by_side_as_one_after_the_other(space, changes):
 
     places = grid.places_of(np.arange(grid.tip))
     given = (
-        y_points[:-1], y_points[1:], jnp.asarray(grid.acting), problem.places[places],
-        problem.lengths()[:, 0], past[places],
-    )  # fmt: skip
+        y_points[:-1],
+        y_points[1:],
+        jnp.asarray(grid.acting),
+        problem.places[places],
+        problem.lengths()[:, 0],
+        past[places],
+    )
     one = one_piece(problem)
     np.testing.assert_allclose(jax.jit(jax.vmap(one))(*given) / scale, ends / scale, atol=1e-12)
     by_start, by_end = jax.jit(jax.vmap(jax.jacfwd(one, argnums=(0, 1))))(*given)
@@ -265,10 +269,14 @@ def test_a_discontinuity_close_beside_a_node_costs_no_accuracy(off):
 
     def tip(at):
         rod = kc.robots.SlenderRod(
-            length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, nodes=11,
+            length=0.5,
+            radius=0.005,
+            density=1200.0,
+            youngs_modulus=5e6,
+            nodes=11,
             sections=(kc.robots.Stretch(begin=at, stiffness=[0.2]),),
             loads=(kc.robots.loads.PointWrench(force=[0.1, 0.0, 0.0]),),
-        )  # fmt: skip
+        )
         return kc.equilibrium(rod, np.zeros(0), space="lobatto4").tip_position[-1]
 
     np.testing.assert_allclose(tip(0.5 + off), tip(0.5), atol=2e-8)

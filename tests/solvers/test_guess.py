@@ -13,11 +13,16 @@ def cable(lengths, nodes=61):
     """A cable of so many gravity-bending lengths (EI/ρAg)^⅓ between two grippers."""
     stiffness = WEIGHT * (LENGTH / lengths) ** 3
     return kc.robots.SlenderRod(
-        length=LENGTH, radius=0.003, density=0.05 / (np.pi * 0.003**2), youngs_modulus=1e7, nodes=nodes,
+        length=LENGTH,
+        radius=0.003,
+        density=0.05 / (np.pi * 0.003**2),
+        youngs_modulus=1e7,
+        nodes=nodes,
         bending_stiffness=np.diag([stiffness, stiffness, 0.8 * stiffness]),
         shear_stiffness=np.diag([1.0, 1.0, 1.0]) * max(1e3 * WEIGHT, 1e3 * stiffness),
-        base_end=kc.robots.ends.Driven(axes=AXES), tip_end=kc.robots.ends.Driven(axes=AXES),
-    )  # fmt: skip
+        base_end=kc.robots.ends.Driven(axes=AXES),
+        tip_end=kc.robots.ends.Driven(axes=AXES),
+    )
 
 
 def grips(distance):
@@ -84,9 +89,15 @@ def test_an_arch_snaps_where_the_theory_has_its_limit_point():
     """One clamp of a compressed strip is turned: a saddle-node at α = 1.7818 √(ΔL/L) (Gomez et al. 2017)."""
     shortened, turned = 0.005, 0.2
     strip = kc.robots.SlenderRod(
-        length=1.0, radius=0.001, density=1e3, youngs_modulus=1e9, nodes=41, gravity=(0.0, 0.0, 0.0),
-        shear_stiffness=np.diag([1e6] * 3), tip_end=kc.robots.ends.Driven(axes=("z", "rx")),
-    )  # fmt: skip
+        length=1.0,
+        radius=0.001,
+        density=1e3,
+        youngs_modulus=1e9,
+        nodes=41,
+        gravity=(0.0, 0.0, 0.0),
+        shear_stiffness=np.diag([1e6] * 3),
+        tip_end=kc.robots.ends.Driven(axes=("z", "rx")),
+    )
     x = np.linspace(0.0, 1.0, 33)
     height = np.sqrt(shortened) / np.pi * (1.0 - np.cos(2.0 * np.pi * x))
     folds = []

@@ -73,8 +73,12 @@ def test_a_motion_goes_on_as_if_it_had_not_been_parted(rod, time, tmp_path):
     for _ in range(8):
         row = stepper.step(np.zeros(0))
     for before, count in (
-        (one[:9], 4), (second, 4), (second[:3], 6), (kc.load_trajectory(tmp_path / "second.nc"), 4), (row, 4)
-    ):  # fmt: skip
+        (one[:9], 4),
+        (second, 4),
+        (second[:3], 6),
+        (kc.load_trajectory(tmp_path / "second.nc"), 4),
+        (row, 4),
+    ):
         found = gone_on(rod, before, count, time=time)
         np.testing.assert_allclose(found.y, one.y[-count - 1 :], atol=2e-8)
 
@@ -186,12 +190,16 @@ def test_only_an_equilibrium_is_taken_for_one(rod):
 def test_rest_is_rest_at_all_places(space):
     """Also beside a discontinuity, on either side of it."""
     bent = kc.robots.SlenderRod(
-        length=0.5, radius=0.005, density=1200.0, youngs_modulus=5e6, nodes=6,
+        length=0.5,
+        radius=0.005,
+        density=1200.0,
+        youngs_modulus=5e6,
+        nodes=6,
         sections=(
             kc.robots.Stretch(end=0.4, curvature=[6.0, 0.0, 0.0]),
             kc.robots.Stretch(begin=0.73, curvature=[0.0, 3.0, 0.0]),
         ),
-    )  # fmt: skip
+    )
     past = jax.jit(resting_history, static_argnums=1)(bent, kc.solvers.Settings(space=SCHEMES[space]))
     records, grid = past.records[0], grid_of(bent, SCHEMES[space])
     u = bent.z_layout.get(records[..., bent.y_layout.size :], "u")
@@ -264,9 +272,12 @@ def test_a_robot_that_was_changed_begins_where_the_other_one_rested(rod):
     assert np.all(coarse.result == kc.Result.CONVERGED)
     other = rod.replace(nodes=41)
     fine = kc.simulate(
-        other.replace(gravity=pushed.gravity), np.zeros((60, 0)), 3e-4, space="lobatto4",
+        other.replace(gravity=pushed.gravity),
+        np.zeros((60, 0)),
+        3e-4,
+        space="lobatto4",
         initial=kc.equilibrium(other, np.zeros(0), space="lobatto4"),
-    )  # fmt: skip
+    )
     aside = [each.tip_position[-1, 1] for each in (coarse, fine)]
     assert aside[0] == pytest.approx(aside[1], rel=0.02) and abs(aside[1]) < 1e-3 * rod.length
 

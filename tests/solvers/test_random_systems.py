@@ -117,9 +117,12 @@ def in_contact(seed, hurry=QUICK):
     parameters, EI, L, dt, times = rod(draws)
     k = draws.log(10.0, 1e4) * EI / L**4
     law = {
-        "stiffness": k, "smoothing": draws.log(3e-4, 3e-2) * L, "damping": 1.0,
-        "friction": draws.generator.uniform(0.0, 0.6), "slip": 0.02 * L,
-    }  # fmt: skip
+        "stiffness": k,
+        "smoothing": draws.log(3e-4, 3e-2) * L,
+        "damping": 1.0,
+        "friction": draws.generator.uniform(0.0, 0.6),
+        "slip": 0.02 * L,
+    }
     across = np.array([0.0, 3.0, 0.0])
     surroundings = (
         Plane(point=[-0.1 * L, 0.0, 0.0], normal=[1.0, 0.0, 0.0], **law),
@@ -137,12 +140,17 @@ def with_sections(seed):
     parameters, _, L, dt, _ = rod(draws)
     sections = tuple(
         kc.robots.Stretch(
-            begin=begin, end=end, controlled=True, radius=[1.0, draws.generator.uniform(-0.3, 0.3)],
-            stiffness=[draws.log(0.3, 3.0)], curvature=draws.vector(2.0 / L), stiffness_gain=0.3,
+            begin=begin,
+            end=end,
+            controlled=True,
+            radius=[1.0, draws.generator.uniform(-0.3, 0.3)],
+            stiffness=[draws.log(0.3, 3.0)],
+            curvature=draws.vector(2.0 / L),
+            stiffness_gain=0.3,
             curvature_gain=draws.vector(4.0 / L),
         )
         for begin, end in ((0.0, 0.37), (0.37, 1.0))
-    )  # fmt: skip
+    )
     return Case(kc.robots.SlenderRod(**parameters, sections=sections), draws.signals(2, -1.0, 1.0), dt)
 
 
@@ -187,11 +195,12 @@ def several_rods(seed, hurry=QUICK):
     mass = min(1e4, draws.generator.uniform(0.0, 0.25) * heavy)
     robot = kc.robots.ParallelRobot(
         **{**parameters, "gravity": [0.0, 0.0, -gravity]},
-        base_angles=base, platform_angles=base + draws.generator.uniform(-0.6, 0.6, 6),
+        base_angles=base,
+        platform_angles=base + draws.generator.uniform(-0.6, 0.6, 6),
         base_radius=L * draws.generator.uniform(0.1, 0.3),
         platform_radius=L * draws.generator.uniform(0.1, 0.3),
         platform_mass=mass,
-    )  # fmt: skip
+    )
     legs = 6.0 * parameters["density"] * np.pi * parameters["radius"] ** 2 * L
     slower = np.sqrt(1.0 + mass / legs)
     control = unhurried(draws.signals(6, -0.04 * L, 0.04 * L), 0.02 * hurry * times / slower * L)

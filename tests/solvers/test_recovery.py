@@ -121,9 +121,15 @@ def test_time_of_recovery_is_in_proportion_to_that_of_the_run():
 def test_short_time_steps_on_few_long_segments(space):
     """Forward Euler was unstable there: solved to rounding, and nonsense."""
     soft = kc.robots.TendonRobot(
-        length=0.87, radius=4.77e-3, density=1411.7, youngs_modulus=18.6e6, bending_damping=0.03, drag=1e-4,
-        gravity=(0.0, 0.0, -0.15), nodes=5,
-    )  # fmt: skip
+        length=0.87,
+        radius=4.77e-3,
+        density=1411.7,
+        youngs_modulus=18.6e6,
+        bending_damping=0.03,
+        drag=1e-4,
+        gravity=(0.0, 0.0, -0.15),
+        nodes=5,
+    )
     dt = 1.23e-3
     tensions = 0.03 * kc.controls.sine(0.05, 16, dt, base=1.0)
     found = kc.simulate(soft, tensions, dt, space=space)

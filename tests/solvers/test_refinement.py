@@ -17,9 +17,13 @@ ROBOTS = kc.robots
 LENGTH, MODULUS, RADIUS, ARM = 0.3, 5e10, 1e-3, 0.01
 EI = MODULUS * np.pi * RADIUS**4 / 4.0
 ROD = {
-    "length": LENGTH, "radius": RADIUS, "density": 6000.0, "youngs_modulus": MODULUS, "gravity": np.zeros(3),
+    "length": LENGTH,
+    "radius": RADIUS,
+    "density": 6000.0,
+    "youngs_modulus": MODULUS,
+    "gravity": np.zeros(3),
     "bending_damping": 1e-4,
-}  # fmt: skip
+}
 coarse_is_said = pytest.mark.filterwarnings("ignore:the grid is too coarse")
 
 
@@ -227,9 +231,14 @@ def test_an_equilibrium_that_a_coarse_grid_does_not_have_is_found():
         for at, force in ((0.37, (1.6e-5, 5.1e-5, -1.12e-4)), (1.0, (1.7e-5, 8.3e-5, -2.0e-5)))
     ]
     rod = ROBOTS.SlenderRod(
-        length=0.5, radius=2e-3, density=1200.0, youngs_modulus=7.26e5, gravity=(3.76, 1.27, 4.48),
-        bending_damping=1e-5, loads=tuple(loads),
-    )  # fmt: skip
+        length=0.5,
+        radius=2e-3,
+        density=1200.0,
+        youngs_modulus=7.26e5,
+        gravity=(3.76, 1.27, 4.48),
+        bending_damping=1e-5,
+        loads=tuple(loads),
+    )
     with pytest.raises(kc.SimulationError):
         kc.equilibrium(rod.replace(nodes=10), with_stability=False)
     found = kc.equilibrium(rod, with_stability=False)

@@ -123,9 +123,15 @@ def line(nodes):
     """A thin line that is pulled at its tip, far more than bends it."""
     pull = kc.robots.loads.PointWrench(force=[0.1, 0.0, 1.0])
     return kc.robots.SlenderRod(
-        length=1.0, radius=5e-4, density=1150.0, youngs_modulus=2e9, bending_damping=1e-6,
-        gravity=[0.0, 0.0, 0.0], nodes=nodes, loads=(pull,),
-    )  # fmt: skip
+        length=1.0,
+        radius=5e-4,
+        density=1150.0,
+        youngs_modulus=2e9,
+        bending_damping=1e-6,
+        gravity=[0.0, 0.0, 0.0],
+        nodes=nodes,
+        loads=(pull,),
+    )
 
 
 @pytest.mark.slow

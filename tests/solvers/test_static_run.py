@@ -12,13 +12,24 @@ ends, sections = kc.robots.ends, kc.robots
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 LENGTH, RADIUS, G = 0.5, 0.003, 9.81
 CABLE = kc.robots.SlenderRod(
-    length=LENGTH, radius=RADIUS, density=1100.0, youngs_modulus=5e6, gravity=(0.0, 0.0, 0.0), nodes=21,
+    length=LENGTH,
+    radius=RADIUS,
+    density=1100.0,
+    youngs_modulus=5e6,
+    gravity=(0.0, 0.0, 0.0),
+    nodes=21,
     tip_end=ends.Clamped(position=(0.0, 0.0, 0.4), orientation=UPRIGHT),
-)  # fmt: skip
+)
 ROD = kc.robots.SlenderRod(
-    length=1.0, radius=0.01, density=1e3, youngs_modulus=1e7, gravity=(0.0, 0.0, 0.0), nodes=21,
-    base_end=ends.Driven(axes=("rz",)), tip_end=ends.Driven(axes=("rx", "rz")),
-)  # fmt: skip
+    length=1.0,
+    radius=0.01,
+    density=1e3,
+    youngs_modulus=1e7,
+    gravity=(0.0, 0.0, 0.0),
+    nodes=21,
+    base_end=ends.Driven(axes=("rz",)),
+    tip_end=ends.Driven(axes=("rx", "rz")),
+)
 GJ = 1e7 / 2.6 * np.pi * 0.01**4 / 2.0
 
 
@@ -215,11 +226,16 @@ def helix(turns, pitch=0.1, hand=1.0, radius=0.015, wire=0.002):
 
     curvature = (0.0, cosine**2 / radius, cosine * sine / radius)
     rod = kc.robots.SlenderRod(
-        length=length, radius=wire / 2.0, density=7800.0, youngs_modulus=200e9, gravity=(0.0, 0.0, 0.0),
-        nodes=nodes, sections=(sections.Stretch(curvature=curvature),),
+        length=length,
+        radius=wire / 2.0,
+        density=7800.0,
+        youngs_modulus=200e9,
+        gravity=(0.0, 0.0, 0.0),
+        nodes=nodes,
+        sections=(sections.Stretch(curvature=curvature),),
         base_end=ends.Clamped(position=(0.0, 0.0, 0.0), orientation=frame(0.0)),
         tip_end=ends.Driven(position=tuple(points[-1]), orientation=frame(angle[-1]), axes=("z",)),
-    )  # fmt: skip
+    )
     return rod, points, float(np.pi * wire**4 / 64.0 * 200e9 / length)
 
 

@@ -18,9 +18,14 @@ TIP, BASE = {"tip_end": ends.Driven(axes=("rz",))}, {"base_end": ends.Driven(axe
 
 def shaft(**changes):
     given = {
-        "length": L, "radius": RADIUS, "density": 1000.0, "youngs_modulus": E, "gravity": (0.0, 0.0, 0.0),
-        "nodes": 21, "bending_damping": 1e-3,
-    }  # fmt: skip
+        "length": L,
+        "radius": RADIUS,
+        "density": 1000.0,
+        "youngs_modulus": E,
+        "gravity": (0.0, 0.0, 0.0),
+        "nodes": 21,
+        "bending_damping": 1e-3,
+    }
     return kc.robots.SlenderRod(**given | changes)
 
 
@@ -101,9 +106,10 @@ def test_an_assembly_keeps_them_too():
             half.replace(name="lower", tip_end=ends.Clamped(body="joint")),
             half.replace(name="upper", base_end=ends.Clamped(body="joint"), tip_end=driven),
         ),
-        bodies=(RigidBody(name="joint", mass=0.01, inertia=1e-6 * np.eye(3)),), gravity=(0.0, 0.0, 0.0),
+        bodies=(RigidBody(name="joint", mass=0.01, inertia=1e-6 * np.eye(3)),),
+        gravity=(0.0, 0.0, 0.0),
         nodes=11,
-    )  # fmt: skip
+    )
     found = kc.simulate(robot, held(7.0), 0.05)
     assert twist(found.part("lower_m")[-1, -1]) == pytest.approx(7.0, rel=0.02)
 
@@ -129,8 +135,13 @@ def test_far_turns_are_refused_where_nothing_recovers_them():
 
 def test_only_rods_between_ends_hold_turns():
     assert largest_turns(shaft(**BASE), np.array([7.0])) == 0.0
-    assert largest_turns(shaft(base_end=ends.Driven(axes=("x", "rx", "rz")), tip_end=ends.Clamped()),
-                         np.array([9.0, 3.0, 4.0])) == 5.0  # fmt: skip
+    assert (
+        largest_turns(
+            shaft(base_end=ends.Driven(axes=("x", "rx", "rz")), tip_end=ends.Clamped()),
+            np.array([9.0, 3.0, 4.0]),
+        )
+        == 5.0
+    )
 
 
 def test_a_free_rod_follows_a_base_that_turns_at_once():

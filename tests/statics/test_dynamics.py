@@ -28,9 +28,16 @@ def column(follower=0.0, tangential=0.0, dead=0.0, torque=0.0, mass=0.0, damping
         AttachedMass(mass=mass * MASS * L),
     )
     return kc.robots.SlenderRod(
-        length=L, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=21,
-        loads=loads, bending_damping=damping * EI * TIME, linear_drag=drag * MASS / TIME,
-    )  # fmt: skip
+        length=L,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=E,
+        gravity=[0.0, 0.0, 0.0],
+        nodes=21,
+        loads=loads,
+        bending_damping=damping * EI * TIME,
+        linear_drag=drag * MASS / TIME,
+    )
 
 
 def decided(**loads):

@@ -22,10 +22,16 @@ ROOTS = {
 
 def beam(end, nodes=40, **changes):
     rod = kc.robots.SlenderRod(
-        length=L, radius=RADIUS, density=DENSITY, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=nodes,
+        length=L,
+        radius=RADIUS,
+        density=DENSITY,
+        youngs_modulus=E,
+        gravity=[0.0, 0.0, 0.0],
+        nodes=nodes,
         tip_end=Free() if end in (Free, None) else end(position=(0.0, 0.0, L)),
-        base_end=Pinned() if end is Universal else Clamped(), **changes,
-    )  # fmt: skip
+        base_end=Pinned() if end is Universal else Clamped(),
+        **changes,
+    )
     if end is None:
         return kc.simulate(
             rod.replace(base_end=Free(), bending_damping=1e-15),

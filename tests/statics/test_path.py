@@ -14,9 +14,14 @@ L, RADIUS, E = 1.0, 2e-3, 1e9
 def test_a_twisted_ring_stays_a_circle_and_has_no_limit_points():
     """It turns about its tangent without a force at any twist, below Michell's 2π√3 EI/GJ = 14.1 rad."""
     ring = kc.robots.SlenderRod(
-        length=L, radius=RADIUS, density=1e3, youngs_modulus=E, gravity=[0.0, 0.0, 0.0], nodes=21,
+        length=L,
+        radius=RADIUS,
+        density=1e3,
+        youngs_modulus=E,
+        gravity=[0.0, 0.0, 0.0],
+        nodes=21,
         tip_end=ends.Driven(position=[0.0, 0.0, 0.0], axes=("rz",)),
-    )  # fmt: skip
+    )
     s, r = 2.0 * np.pi * np.linspace(0.0, 1.0, 41), L / (2.0 * np.pi)
     circle = np.stack([r * (1.0 - np.cos(s)), 0.0 * s, r * np.sin(s)], axis=1)
     followed = kc.statics.equilibrium_path(

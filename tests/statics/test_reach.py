@@ -185,10 +185,17 @@ def test_no_equilibrium_to_begin_with_is_said():
 
 #: inextensible tendons on reels: their tensions feel any residual far more than the shape does
 REELED = kc.robots.RoutedTendonRobot(
-    length=0.3, radius=0.0015, density=1500.0, youngs_modulus=3.0e9, bending_damping=2.0e-3,
-    tendon_offset=0.01, tendon_angles=[0.0, 2.0943951, 4.1887902], gravity=[0.0, 0.0, 0.0], drive="reel",
+    length=0.3,
+    radius=0.0015,
+    density=1500.0,
+    youngs_modulus=3.0e9,
+    bending_damping=2.0e-3,
+    tendon_offset=0.01,
+    tendon_angles=[0.0, 2.0943951, 4.1887902],
+    gravity=[0.0, 0.0, 0.0],
+    drive="reel",
     nodes=21,
-)  # fmt: skip
+)
 
 
 @pytest.mark.campaign

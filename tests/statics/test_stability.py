@@ -13,9 +13,15 @@ from tests.trajectories import synthetic
 L, RADIUS, E = 0.5, 2e-3, 2e9
 EI, EA = E * np.pi * RADIUS**4 / 4, E * np.pi * RADIUS**2
 ROD = kc.robots.SlenderRod(
-    length=L, radius=RADIUS, density=1200.0, youngs_modulus=E, bending_damping=1e-3, drag=1e-3,
-    gravity=[0.0, 0.0, 0.0], nodes=21,
-)  # fmt: skip
+    length=L,
+    radius=RADIUS,
+    density=1200.0,
+    youngs_modulus=E,
+    bending_damping=1e-3,
+    drag=1e-3,
+    gravity=[0.0, 0.0, 0.0],
+    nodes=21,
+)
 PINNED = 4.493409457909064**2
 
 
@@ -110,9 +116,10 @@ def test_a_buckled_column_has_nothing_to_lose_but_its_plane():
 def test_an_arch_snaps_where_it_is_no_longer_stable_and_says_so():
     """Pushed in its middle against its bend, step by step: one row has snapped, and says so."""
     arch = ROD.replace(
-        nodes=21, tip_end=Pinned(position=[0.0, 0.0, 0.9 * L]),
+        nodes=21,
+        tip_end=Pinned(position=[0.0, 0.0, 0.9 * L]),
         loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
-    )  # fmt: skip
+    )
     unit = EI / L**2
     rest = kc.equilibrium(arch, [20.0 * unit], space="lobatto4")
     side = np.sign(rest.position[0, 10, 0])
@@ -140,9 +147,14 @@ def wire(slenderness, bend, nodes):
     r, modulus = 0.3 / slenderness, 70e9
     force = 2.0 * bend * modulus * np.pi * r**4 / 4 / 0.3**2
     return kc.robots.SlenderRod(
-        length=0.3, radius=r, density=6450.0, youngs_modulus=modulus, gravity=[0.0, 0.0, 0.0], nodes=nodes,
+        length=0.3,
+        radius=r,
+        density=6450.0,
+        youngs_modulus=modulus,
+        gravity=[0.0, 0.0, 0.0],
+        nodes=nodes,
         loads=(PointWrench(force=[force, 0.0, 0.0]),),
-    )  # fmt: skip
+    )
 
 
 @pytest.mark.campaign
@@ -183,9 +195,14 @@ def test_the_six_legs_of_the_catalogs_robot_are_stable():
 def test_a_slender_robot_bent_by_its_tendon_is_stable():
     modulus, r = 70e9, 1e-3
     robot = kc.robots.RoutedTendonRobot(
-        length=0.6, radius=r, density=6450.0, youngs_modulus=modulus, gravity=[0.0, 0.0, 0.0],
-        tendon_offset=0.01, tendon_angles=[0.0],
-    )  # fmt: skip
+        length=0.6,
+        radius=r,
+        density=6450.0,
+        youngs_modulus=modulus,
+        gravity=[0.0, 0.0, 0.0],
+        tendon_offset=0.01,
+        tendon_angles=[0.0],
+    )
     for bend in (0.5, 1.0, 1.5):
         tension = bend * modulus * np.pi * r**4 / 4 / 0.6 / 0.01
         found = kc.statics.stability(kc.equilibrium(robot, [tension], space="lobatto4"))
@@ -199,10 +216,16 @@ def test_a_slender_arch_pushed_inwards_leaves_its_plane(nodes):
     length, r = 0.6, 1e-3
     unit = 70e9 * np.pi * r**4 / 4 / length**2
     arch = kc.robots.SlenderRod(
-        length=length, radius=r, density=6450.0, youngs_modulus=70e9, bending_damping=1e-3, nodes=nodes,
-        gravity=[0.0, 0.0, 0.0], tip_end=Pinned(position=[0.0, 0.0, 0.9 * length]),
+        length=length,
+        radius=r,
+        density=6450.0,
+        youngs_modulus=70e9,
+        bending_damping=1e-3,
+        nodes=nodes,
+        gravity=[0.0, 0.0, 0.0],
+        tip_end=Pinned(position=[0.0, 0.0, 0.9 * length]),
         loads=(PointWrench(at=0.5, force=[1.0, 0.0, 0.0], controlled=True),),
-    )  # fmt: skip
+    )
     rest = kc.equilibrium(arch, [20.0 * unit], space="lobatto4")
     side = np.sign(rest.position[0, nodes // 2, 0])
     found = []
@@ -249,9 +272,12 @@ def test_a_platform_on_upright_legs_falls_under_its_buckling_load():
     for part in (0.95, 1.05):
         mass = part * 6.0 * np.pi**2 * stiffness / length**2 / 9.81
         loaded = robot.replace(
-            base_angles=even, platform_angles=even, platform_radius=float(robot.base_radius), density=1.0,
+            base_angles=even,
+            platform_angles=even,
+            platform_radius=float(robot.base_radius),
+            density=1.0,
             platform_mass=mass,
-        )  # fmt: skip
+        )
         found = kc.statics.stability(kc.equilibrium(loaded, np.zeros(6), space="lobatto4"))
         assert found.stable == (part < 1.0)
         assert found.mode.shape == (robot.nodes, 6, 3)

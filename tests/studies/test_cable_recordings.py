@@ -113,10 +113,19 @@ def with_a_shape(shape):
 @pytest.mark.parametrize(
     "data",
     [
-        b"", b"\x80\x04", b"junk", with_memory_request(), nested(), itself(), pickle.dumps(MARKERS)[:-40],
-        pickle.dumps(MARKERS)[:100], with_a_shape((10**9, 10**9)), with_a_shape((-1, 3)), with_a_shape((7,)),
+        b"",
+        b"\x80\x04",
+        b"junk",
+        with_memory_request(),
+        nested(),
+        itself(),
+        pickle.dumps(MARKERS)[:-40],
+        pickle.dumps(MARKERS)[:100],
+        with_a_shape((10**9, 10**9)),
+        with_a_shape((-1, 3)),
+        with_a_shape((7,)),
     ],
-)  # fmt: skip
+)
 def test_damaged_and_hostile_files(tmp_path, data):
     (tmp_path / "x.pkl").write_bytes(data)
     with pytest.raises(RecordingError, match=r"x\.pkl") as error:
@@ -135,8 +144,12 @@ def test_every_byte_changed_is_read_or_refused(tmp_path):
 
 def test_orders_of_axes():
     for given in (
-        MARKERS, MARKERS.swapaxes(1, 2), MARKERS.swapaxes(0, 1), MARKERS.reshape(20, 21), MARKERS[None],
-    ):  # fmt: skip
+        MARKERS,
+        MARKERS.swapaxes(1, 2),
+        MARKERS.swapaxes(0, 1),
+        MARKERS.reshape(20, 21),
+        MARKERS[None],
+    ):
         np.testing.assert_array_equal(as_markers(given, "x"), MARKERS)
 
 

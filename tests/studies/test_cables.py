@@ -28,9 +28,14 @@ from studies.cables.study import CableResult, as_markdown
 
 SPACE, NODES = "lobatto2", 9
 TRUE = CableParameters(
-    bending=0.02, torsion=0.02, damping_time=0.02, drag=1.0, square_drag=0.01, curvature=(1.0, 0.5),
+    bending=0.02,
+    torsion=0.02,
+    damping_time=0.02,
+    drag=1.0,
+    square_drag=0.01,
+    curvature=(1.0, 0.5),
     offset=(4e-3, 0.0),
-)  # fmt: skip
+)
 PLACES = np.linspace(0.0, 0.4, 5)
 matplotlib = pytest.mark.skipif(importlib.util.find_spec("matplotlib") is None, reason="needs matplotlib")
 

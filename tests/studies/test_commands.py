@@ -12,9 +12,19 @@ from tests.commands import ROBOT, run_study
 ROOT = Path(__file__).parents[2]
 BEAM = ROOT / "tests" / "files" / "beam"
 NAMES = (
-    "simulation", "control", "environments", "hardware", "imperfections", "data", "estimation", "recordings",
-    "beam", "cables", "virtual-robots", "loop",
-)  # fmt: skip
+    "simulation",
+    "control",
+    "environments",
+    "hardware",
+    "imperfections",
+    "data",
+    "estimation",
+    "recordings",
+    "beam",
+    "cables",
+    "virtual-robots",
+    "loop",
+)
 BAD = [
     (("nothing",), "No such command"),
     (("simulation",), "--out"),

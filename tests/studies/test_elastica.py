@@ -104,9 +104,16 @@ def test_the_loop_is_that_of_pyelastica(perfect):
     robot = ROBOT.replace(bending_damping=0.0, drag=0.0, gravity=np.zeros(3))
     rod = ElasticaRod(robot, PERFECT, elements=n, rotary_inertia=1.0)
     other = CosseratRod.straight_rod(
-        n, np.zeros(3), np.array([0.0, 0.0, 1.0]), np.array([1.0, 0.0, 0.0]), LENGTH, float(robot.radius),
-        float(robot.density), youngs_modulus=float(robot.youngs_modulus), shear_modulus=float(robot.G),
-    )  # fmt: skip
+        n,
+        np.zeros(3),
+        np.array([0.0, 0.0, 1.0]),
+        np.array([1.0, 0.0, 0.0]),
+        LENGTH,
+        float(robot.radius),
+        float(robot.density),
+        youngs_modulus=float(robot.youngs_modulus),
+        shear_modulus=float(robot.G),
+    )
     other.mass_second_moment_of_inertia[2, 2] = other.mass_second_moment_of_inertia[0, 0]
     other.inv_mass_second_moment_of_inertia[2, 2] = other.inv_mass_second_moment_of_inertia[0, 0]
     rod.restart()
@@ -123,9 +130,12 @@ def test_the_loop_is_that_of_pyelastica(perfect):
         from elastica.rod.data_structures import overload_operator_kinematic_numba
 
         overload_operator_kinematic_numba(
-            dt, other.position_collection, other.director_collection, other.velocity_collection,
+            dt,
+            other.position_collection,
+            other.director_collection,
+            other.velocity_collection,
             other.omega_collection,
-        )  # fmt: skip
+        )
 
     other.update_dynamics, other.update_kinematics = dynamics, kinematics
     for _ in range(steps):

@@ -15,9 +15,10 @@ def facts():
     found["rate"] = {"rate": 7e4, "raw": 8e4, "ratio": 0.875, "compiled": 0, "different": 0}
     found["ppo"] = {"ratio": 0.95, "until": 200.0, "curve": [[4096, 1.0, 0.2]]}
     found["sweep"] = {
-        "parallel_efficiency": {"wall": 0.95, "cores": 0.97}, "seconds_for_a_million": 700.0,
+        "parallel_efficiency": {"wall": 0.95, "cores": 0.97},
+        "seconds_for_a_million": 700.0,
         "identical": True,
-    }  # fmt: skip
+    }
     return found
 
 

@@ -134,9 +134,19 @@ def test_a_folder_describes_its_robot_and_its_topics(folder, tmp_path):
 def test_the_whole_table(folder, tmp_path):
     """The best model is the robot's kind: what it has not seen it predicts; the paper's learns."""
     done = run(
-        folder, "--out", tmp_path, "--train", "sine_1p0", "--train", "rand_0", "--seconds", 3, "--seeds", 2,
+        folder,
+        "--out",
+        tmp_path,
+        "--train",
+        "sine_1p0",
+        "--train",
+        "rand_0",
+        "--seconds",
+        3,
+        "--seeds",
+        2,
         "--physical",
-    )  # fmt: skip
+    )
     assert done.exit_code == 0, done.output
     cells = json.loads((tmp_path / "table2.json").read_text())
     by = {(cell["recording"], cell["method"], cell["seed"]): cell for cell in cells}

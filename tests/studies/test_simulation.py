@@ -94,9 +94,13 @@ def test_killed_in_the_middle_it_goes_on_to_the_same_table(tmp_path, baseline):
     origins = [importlib.util.find_spec(name).origin for name in ("knode_cosserat", "studies")]
     sources = os.pathsep.join(str(Path(origin).parents[1]) for origin in origins)
     done = subprocess.run(
-        [sys.executable, "-c", KILLED, *map(str, arguments)], env=os.environ | {"PYTHONPATH": sources},
-        stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
+        [sys.executable, "-c", KILLED, *map(str, arguments)],
+        env=os.environ | {"PYTHONPATH": sources},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
     assert done.returncode == -signal.SIGKILL, done.stderr
     kept = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "jobs").iterdir()}
     assert set(kept) == {"reference.json", "self-weight-baseline.json", "length-baseline.json"}
@@ -136,9 +140,13 @@ def test_what_is_learned_is_tabled_beside_the_papers_and_kept(tmp_path, one_impe
     assert (tmp_path / "table1.md").read_text() in result.stdout
     cells = json.loads((tmp_path / "table1.json").read_text())
     assert [(cell["control"], cell["method"], cell["seed"]) for cell in cells] == [
-        ("sine", "baseline", 0), ("sine", "best", 0), ("sine", "best", 1),
-        ("step", "baseline", 0), ("step", "best", 0), ("step", "best", 1),
-    ]  # fmt: skip
+        ("sine", "baseline", 0),
+        ("sine", "best", 0),
+        ("sine", "best", 1),
+        ("step", "baseline", 0),
+        ("step", "best", 0),
+        ("step", "best", 1),
+    ]
     for cell in cells:
         if cell["method"] == "best":
             dtw, mse = simulation.PUBLISHED["length", cell["control"]].learned
@@ -172,8 +180,10 @@ def test_what_fails_is_recorded_and_shown(tmp_path, one_imperfection, monkeypatc
     assert "| failed" in text
     assert "- length, step, baseline: step 31 (t = 1.55 s): no solution found" in text
     assert {path.name for path in (tmp_path / "trajectories").iterdir()} == {
-        "reference-sine.nc", "reference-step.nc", "length-baseline-sine.nc",
-    }  # fmt: skip
+        "reference-sine.nc",
+        "reference-step.nc",
+        "length-baseline-sine.nc",
+    }
 
 
 def test_a_fit_that_fails_is_recorded_for_every_seed(tmp_path, one_imperfection, monkeypatch):

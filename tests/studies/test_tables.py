@@ -14,9 +14,15 @@ PUBLISHED = {
 
 def cell(imperfection, method, seed, dtw, mse, **more):
     return {
-        "imperfection": imperfection, "control": "sine", "method": method, "seed": seed, "tip_dtw": dtw,
-        "pose_mse": mse, "rotation_rmse": None if mse is None else 0.01 * mse, **more,
-    }  # fmt: skip
+        "imperfection": imperfection,
+        "control": "sine",
+        "method": method,
+        "seed": seed,
+        "tip_dtw": dtw,
+        "pose_mse": mse,
+        "rotation_rmse": None if mse is None else 0.01 * mse,
+        **more,
+    }
 
 
 CELLS = [
@@ -80,8 +86,15 @@ def test_the_markdown_has_the_papers_figures_beside_ours_and_every_failure():
     assert head[5:] == ["baseline", "best", "ratio"]
     assert set("".join(rule)) == {"-"}
     assert length == [
-        "length", "sine", "40.16", "4.31", "4.03", "40.2", "0.002 ± 0.001 (1 of 3 failed)", "1/2,155",
-    ]  # fmt: skip
+        "length",
+        "sine",
+        "40.16",
+        "4.31",
+        "4.03",
+        "40.2",
+        "0.002 ± 0.001 (1 of 3 failed)",
+        "1/2,155",
+    ]
     assert weight == ["self-weight", "sine", "1.75", "0.00", "0.00", "", "failed (2 of 2)", ""]
     assert rows[6][2:6] == ["16.46", "1.44", "1.17", "16.5"]
     # the paper has no angles; cells have radians, tables degrees

@@ -11,9 +11,13 @@ HEIGHTS = [0.5, 1.0, 1e7, -6.0]
 
 def described(**changes):
     given = {
-        "robots": ROBOT, "controls": "step:{height},at=0.1", "steps": 4, "dt": 0.05, "shard": 16,
+        "robots": ROBOT,
+        "controls": "step:{height},at=0.1",
+        "steps": 4,
+        "dt": 0.05,
+        "shard": 16,
         "vary": {"length": Range(0.5, 0.7, count=12), "height": HEIGHTS},
-    }  # fmt: skip
+    }
     return Sweep(**{**given, **changes})
 
 

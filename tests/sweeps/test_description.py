@@ -70,10 +70,15 @@ store: [tip_position, controls]
     )
     found = Sweep.load(path)
     expected = Sweep(
-        [ROBOT, {"robot": ROBOT, "set": {"nodes": 6}}], [WORD, "random:{seed}"], 20, 0.05,
+        [ROBOT, {"robot": ROBOT, "set": {"nodes": 6}}],
+        [WORD, "random:{seed}"],
+        20,
+        0.05,
         vary={"period": Range(0.5, 2.0), "length": [0.5, 0.6], "youngs_modulus": Range(1e9, 1e10, "log")},
-        sampler="sobol", samples=16, store=["tip_position", "controls"],
-    )  # fmt: skip
+        sampler="sobol",
+        samples=16,
+        store=["tip_position", "controls"],
+    )
     assert found == expected and Plan.of(found).identity == Plan.of(expected).identity
     assert found.case_count == 2 * 2 * 16
     assert Sweep.of(found.described()) == found

@@ -119,9 +119,17 @@ def shard_texts(folder, patch):
 @READERS
 def manifest_size(folder, patch):
     manifest = {
-        "format": _folder.FORMAT, "version": 1, "made_by": {}, "machine": {}, "identity": "",
-        "sweep": {}, "cases": 1, "shards": 1, "shard_cases": 1, "robots": [{"columns": {}}],
-    }  # fmt: skip
+        "format": _folder.FORMAT,
+        "version": 1,
+        "made_by": {},
+        "machine": {},
+        "identity": "",
+        "sweep": {},
+        "cases": 1,
+        "shards": 1,
+        "shard_cases": 1,
+        "robots": [{"columns": {}}],
+    }
     text = json.dumps(manifest | {"checksum": _folder.json_checksum(manifest)})
     (folder / "sweep.json").write_text(text)
     patch.setattr(_folder, "LARGEST_MANIFEST", len(text) - 1)

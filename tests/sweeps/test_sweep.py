@@ -190,9 +190,11 @@ def test_slurm_with_a_fake_scheduler_gives_the_same_bytes(whole, tmp_path, monke
     tools = tmp_path / "bin"
     tools.mkdir()
     for name, text in (
-        ("sbatch", FAKE_SBATCH.format(python=sys.executable)), ("srun", FAKE_SRUN),
-        ("sacct", "#!/bin/sh\necho 'JobID|State|NodeList'\n"), ("scontrol", "#!/bin/sh\necho here\n"),
-    ):  # fmt: skip
+        ("sbatch", FAKE_SBATCH.format(python=sys.executable)),
+        ("srun", FAKE_SRUN),
+        ("sacct", "#!/bin/sh\necho 'JobID|State|NodeList'\n"),
+        ("scontrol", "#!/bin/sh\necho here\n"),
+    ):
         (tools / name).write_text(text)
         (tools / name).chmod(0o755)
     monkeypatch.setenv("PATH", f"{tools}:{os.environ['PATH']}")
@@ -324,9 +326,17 @@ def test_equal_columns_give_equal_bytes():
 # the command
 
 COMMAND = (
-    "sweep", "delrin-tendon-robot", "--controls", "step:{height},at=0.1", "--vary", "height=0.5,1",
-    "--steps", 4, "--dt", 0.05,
-)  # fmt: skip
+    "sweep",
+    "delrin-tendon-robot",
+    "--controls",
+    "step:{height},at=0.1",
+    "--vary",
+    "height=0.5,1",
+    "--steps",
+    4,
+    "--dt",
+    0.05,
+)
 
 
 def test_the_command_runs_a_description_with_changes(whole, tmp_path):

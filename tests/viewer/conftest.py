@@ -65,9 +65,17 @@ def coarse(truth):
     error = np.full(len(result), 1e-4)
     error[40:50] = 0.02
     return kc.Trajectory(
-        truth.system, truth.settings, truth.time, truth.y, truth.z, truth.control, result, truth.residual,
-        truth.iterations, position_error=error,
-    )  # fmt: skip
+        truth.system,
+        truth.settings,
+        truth.time,
+        truth.y,
+        truth.z,
+        truth.control,
+        result,
+        truth.residual,
+        truth.iterations,
+        position_error=error,
+    )
 
 
 # one a file: a page that stays open draws on, and takes the processor from whatever is tested next

@@ -85,10 +85,14 @@ def test_a_track_holds_the_states_and_says_where_things_stand_in_them(truth):
 
 def test_five_hundred_steps_are_compact(truth):
     long = kc.Trajectory(
-        truth.system, truth.settings, np.arange(501) * 0.05,
-        *(np.resize(np.asarray(value)[1:], (501, *value.shape[1:]))
-          for value in (truth.y, truth.z, truth.control, truth.result, truth.residual, truth.iterations)),
-    )  # fmt: skip
+        truth.system,
+        truth.settings,
+        np.arange(501) * 0.05,
+        *(
+            np.resize(np.asarray(value)[1:], (501, *value.shape[1:]))
+            for value in (truth.y, truth.z, truth.control, truth.result, truth.residual, truth.iterations)
+        ),
+    )
     found = track(long, "long")
     assert found["arrays"]["y"]["shape"] == [501, 10, 19]
     assert len(json.dumps(found)) < 600_000
@@ -121,10 +125,14 @@ def test_without_a_single_solution_there_is_nothing_to_draw(failed):
 
 def test_robots_of_a_batch_are_shown_one_by_one(truth):
     stacked = kc.Trajectory(
-        truth.system, truth.settings, truth.time,
-        *(np.stack([np.asarray(value)] * 3)
-          for value in (truth.y, truth.z, truth.control, truth.result, truth.residual, truth.iterations)),
-    )  # fmt: skip
+        truth.system,
+        truth.settings,
+        truth.time,
+        *(
+            np.stack([np.asarray(value)] * 3)
+            for value in (truth.y, truth.z, truth.control, truth.result, truth.residual, truth.iterations)
+        ),
+    )
     assert [each["name"] for each in scene({"b": stacked})["tracks"]] == ["b [0]", "b [1]", "b [2]"]
     with pytest.raises(ValueError, match=f"15 trajectories.*1 to {MOST}"):
         scene([stacked] * 5)
@@ -152,9 +160,16 @@ def test_the_estimated_error_of_each_row_is_in_the_scene(truth, coarse):
     known = unpacked(track(coarse, "coarse")["position_error"])
     np.testing.assert_allclose(known, coarse.position_error, rtol=1e-6)
     measured = kc.Trajectory(
-        truth.system, None, truth.time, truth.y, truth.z, truth.control, truth.result, truth.residual,
+        truth.system,
+        None,
+        truth.time,
+        truth.y,
+        truth.z,
+        truth.control,
+        truth.result,
+        truth.residual,
         truth.iterations,
-    )  # fmt: skip
+    )
     assert np.all(np.isnan(unpacked(track(measured, "measured")["position_error"])))
 
 
@@ -215,9 +230,16 @@ def of(system, rows=4, nodes=5):
     y = np.random.default_rng(0).normal(size=(rows, nodes, 3))
     zero = np.zeros(rows)
     return kc.Trajectory(
-        system, None, np.arange(rows) * 0.1, y, np.zeros((rows, nodes, 0)), np.zeros((rows, 1)),
-        zero.astype(int), zero, zero.astype(int),
-    )  # fmt: skip
+        system,
+        None,
+        np.arange(rows) * 0.1,
+        y,
+        np.zeros((rows, nodes, 0)),
+        np.zeros((rows, 1)),
+        zero.astype(int),
+        zero,
+        zero.astype(int),
+    )
 
 
 def test_positions_of_two_numbers_stand_upright():

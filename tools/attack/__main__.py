@@ -75,8 +75,14 @@ def live(folder: Path, share: float, seed: int) -> list[Row]:
 
 
 PARTS: dict[str, Callable[[Path, float, int], list[Row]]] = {
-    "files": files, "kills": kills, "disk": disk, "cases": cases, "flood": flood, "long": long, "live": live,
-}  # fmt: skip
+    "files": files,
+    "kills": kills,
+    "disk": disk,
+    "cases": cases,
+    "flood": flood,
+    "long": long,
+    "live": live,
+}
 #: parts that end within an hour together
 USUAL = ("files", "kills", "disk", "cases", "flood")
 

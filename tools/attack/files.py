@@ -28,8 +28,12 @@ WORDS = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"nan ", b"1e99", b"-1\n\n", b"[[[[",
 
 #: kinds with a checksum of their numbers
 CHECKSUMMED = (
-    "trajectory.nc", "model.model", "member.checkpoint", "shard.parquet", "sweep.json",
-)  # fmt: skip
+    "trajectory.nc",
+    "model.model",
+    "member.checkpoint",
+    "shard.parquet",
+    "sweep.json",
+)
 
 
 class Outcome(NamedTuple):

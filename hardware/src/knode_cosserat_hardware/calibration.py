@@ -62,9 +62,15 @@ class LoadCellFit:
     def summary(self) -> dict[str, Any]:
         """Return the figures as plain numbers; None where there is none."""
         names = (
-            "gain", "gain_error", "offset", "offset_error", "residual_rms", "r_squared", "nonlinearity",
+            "gain",
+            "gain_error",
+            "offset",
+            "offset_error",
+            "residual_rms",
+            "r_squared",
+            "nonlinearity",
             "hysteresis",
-        )  # fmt: skip
+        )
         values = {name: float(getattr(self, name)) for name in names}
         found: dict[str, Any] = {
             name: value if np.isfinite(value) else None for name, value in values.items()
@@ -105,10 +111,18 @@ def fit_load_cell(weights: ArrayLike, readings: ArrayLike) -> LoadCellFit:
     bend, bend_is_significant = _nonlinearity(weight, reading, slope)
     hysteresis = _hysteresis(weight, reading, slope)
     return LoadCellFit(
-        weight, reading, 1.0 / slope, offset, slope_error / slope**2, offset_error, error / slope,
-        float(line.rvalue) ** 2, bend, hysteresis,
+        weight,
+        reading,
+        1.0 / slope,
+        offset,
+        slope_error / slope**2,
+        offset_error,
+        error / slope,
+        float(line.rvalue) ** 2,
+        bend,
+        hysteresis,
         _warnings(weight, bend if bend_is_significant else 0.0, hysteresis),
-    )  # fmt: skip
+    )
 
 
 def _checked(weights: ArrayLike, readings: ArrayLike) -> tuple[Any, Any]:

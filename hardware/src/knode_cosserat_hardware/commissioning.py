@@ -301,9 +301,14 @@ class Commissioning:
     """
 
     def __init__(
-        self, driver: Driver, path: str | Path, robot: str, person: Person, *,
+        self,
+        driver: Driver,
+        path: str | Path,
+        robot: str,
+        person: Person,
+        *,
         steps: Sequence[CheckStep] = CHECKLIST,
-    ):  # fmt: skip
+    ):
         self.path, self.robot, self.person, self.steps = Path(path), robot, person, tuple(steps)
         self._driver = driver
         #: results of steps by name

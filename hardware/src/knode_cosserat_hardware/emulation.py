@@ -68,8 +68,10 @@ def built() -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     done = subprocess.run(
         ["make", "--no-print-directory", "-C", str(sources), f"OUT={folder}", "all"],
-        capture_output=True, text=True, check=False,
-    )  # fmt: skip
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     if done.returncode:
         lines = [line for line in done.stderr.splitlines() if "error" in line.lower()]
         raise HardwareError(f"the firmware's build failed: {(lines or ['make failed'])[0]}")
@@ -108,12 +110,16 @@ class Chip:
         self._library = library = ctypes.CDLL(str(folder / "libemulator.so"))
         chip, text, size, flag = ctypes.c_void_p, ctypes.c_char_p, ctypes.c_uint32, ctypes.c_int
         for name, result, arguments in (
-            ("open", chip, [text]), ("run", flag, [chip, ctypes.c_uint64, chip]),
-            ("send", size, [chip, text, size]), ("receive", size, [chip, text, size]),
-            ("register", ctypes.c_uint8, [chip, ctypes.c_uint16]), ("contact", flag, [chip, flag]),
-            ("eeprom", flag, [chip, text, ctypes.c_uint16, flag]), ("reset", flag, [chip]),
+            ("open", chip, [text]),
+            ("run", flag, [chip, ctypes.c_uint64, chip]),
+            ("send", size, [chip, text, size]),
+            ("receive", size, [chip, text, size]),
+            ("register", ctypes.c_uint8, [chip, ctypes.c_uint16]),
+            ("contact", flag, [chip, flag]),
+            ("eeprom", flag, [chip, text, ctypes.c_uint16, flag]),
+            ("reset", flag, [chip]),
             ("close", flag, [chip]),
-        ):  # fmt: skip
+        ):
             function = getattr(library, f"emulator_{name}")
             function.restype, function.argtypes = result, arguments
         path = folder / "tension.elf" if program is None else program
@@ -353,10 +359,15 @@ class EmulatedRobot(TrueShape):
     """
 
     def __init__(
-        self, robot: str | RoutedTendonRobot = ROBOT, *, motors: MotorParameters | None = None,
-        cells: LoadCellParameters | None = None, compliance: float = COMPLIANCE,
-        slack: float = 0.002, seed: int = 0,
-    ):  # fmt: skip
+        self,
+        robot: str | RoutedTendonRobot = ROBOT,
+        *,
+        motors: MotorParameters | None = None,
+        cells: LoadCellParameters | None = None,
+        compliance: float = COMPLIANCE,
+        slack: float = 0.002,
+        seed: int = 0,
+    ):
         """Set up the robot at rest with slack tendons, and start the chip.
 
         Args:

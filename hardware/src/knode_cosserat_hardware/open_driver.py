@@ -102,11 +102,14 @@ def open_driver(port: str, hardware: HardwareDescription, robot: Callable[[], Sy
             from knode_cosserat_hardware.can_robot import CanRobot
 
             driver = CanRobot(
-                address, _ids(options), limits, _reel(options, hardware),
+                address,
+                _ids(options),
+                limits,
+                _reel(options, hardware),
                 interface=options.get("interface", "socketcan"),
                 gear_ratio=_number(options, "gear_ratio", 1.0),
                 bitrate=int(_number(options, "bitrate", 1e6)),
-            )  # fmt: skip
+            )
             opened = OpenedDriver(driver, f"can:{address}")
     return dataclasses.replace(opened, base_height=base_height)
 
@@ -154,9 +157,12 @@ def _emulated(limits: Limits, robot: System) -> OpenedDriver:
         raise HardwareError(f"the emulated robot is not available here ({error})") from None
     emulated = EmulatedRobot(robot) if isinstance(robot, RoutedTendonRobot) else EmulatedRobot()
     return OpenedDriver(
-        SerialBoard(EmulatedPort(emulated), limits), "emulated",
-        "the emulated board tares: all reels move in and out", emulated, _accept_settings,
-    )  # fmt: skip
+        SerialBoard(EmulatedPort(emulated), limits),
+        "emulated",
+        "the emulated board tares: all reels move in and out",
+        emulated,
+        _accept_settings,
+    )
 
 
 def _accept_settings(driver: Driver) -> None:

@@ -44,9 +44,15 @@ class HardwarePlant(Plant):
     """
 
     def __init__(
-        self, driver: Driver, source: Source | None, dt: float, *, size: int = 3,
-        region: SafeRegion | None = None, emergency: EmergencyStop | None = None,
-    ):  # fmt: skip
+        self,
+        driver: Driver,
+        source: Source | None,
+        dt: float,
+        *,
+        size: int = 3,
+        region: SafeRegion | None = None,
+        emergency: EmergencyStop | None = None,
+    ):
         if not 0.0 < dt < math.inf:
             raise HardwareError(f"dt must be a positive number of seconds (got {dt!r})")
         self.driver, self.dt = driver, float(dt)

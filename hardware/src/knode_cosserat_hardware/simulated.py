@@ -153,9 +153,13 @@ class SimulatedRobot(TrueShape, Driver):
     """
 
     def __init__(
-        self, robot: System, limits: Limits | None = None, *,
-        machine: MachineParameters | None = None, real_time: bool = False,
-    ):  # fmt: skip
+        self,
+        robot: System,
+        limits: Limits | None = None,
+        *,
+        machine: MachineParameters | None = None,
+        real_time: bool = False,
+    ):
         if robot.control_layout.names != ("tension",):
             raise HardwareError(
                 f"a simulated robot is driven by tensions; this {type(robot).__name__} has "

@@ -26,8 +26,14 @@ STICK, TRIGGER, STOP_BUTTON = (0, 1), 5, 1
 DEAD_ZONE = 0.1
 #: change by one key, as part of the range
 KEY_STEP = 0.1
-_KEYS = {b"\x1b[C": (1, 0, 0), b"\x1b[D": (-1, 0, 0), b"\x1b[A": (0, 1, 0), b"\x1b[B": (0, -1, 0),
-         b"+": (0, 0, 1), b"-": (0, 0, -1)}  # fmt: skip
+_KEYS = {
+    b"\x1b[C": (1, 0, 0),
+    b"\x1b[D": (-1, 0, 0),
+    b"\x1b[A": (0, 1, 0),
+    b"\x1b[B": (0, -1, 0),
+    b"+": (0, 0, 1),
+    b"-": (0, 0, -1),
+}
 
 
 class Wish(NamedTuple):
@@ -284,9 +290,16 @@ class SliderWindow:
             self._add_tendon(tk, columns, k)
         tk.Button(root, text="Release all", command=self.release).pack(fill="x", padx=12)
         self._button = tk.Button(
-            root, text="STOP", font=("TkDefaultFont", 28, "bold"), fg="white", bg=STOP, takefocus=0,
-            activebackground=STOP, activeforeground="white", command=lambda: self._stop("STOP was pressed"),
-        )  # fmt: skip
+            root,
+            text="STOP",
+            font=("TkDefaultFont", 28, "bold"),
+            fg="white",
+            bg=STOP,
+            takefocus=0,
+            activebackground=STOP,
+            activeforeground="white",
+            command=lambda: self._stop("STOP was pressed"),
+        )
         self._button.pack(fill="both", padx=12, pady=12, ipady=14)
         root.update()
 
@@ -295,9 +308,15 @@ class SliderWindow:
         column.grid(row=0, column=k, padx=10)
         tk.Label(column, text=f"tendon {k + 1}", font=("TkDefaultFont", 11, "bold")).pack()
         scale = tk.Scale(
-            column, from_=self.high, to=self.low, resolution=0.05, length=HEIGHT, width=26, orient="vertical",
+            column,
+            from_=self.high,
+            to=self.low,
+            resolution=0.05,
+            length=HEIGHT,
+            width=26,
+            orient="vertical",
             showvalue=True,
-        )  # fmt: skip
+        )
         scale.set(self.low)
         scale.pack()
         reading = tk.Label(column, text="measured\n- N", width=11)

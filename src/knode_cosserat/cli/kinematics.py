@@ -104,9 +104,13 @@ def reach(
     system = model.load()
     low, high = limits.of(system)
     found = kc.inverse_kinematics(
-        system, *target.pose(float(system.length)), low=low, high=high, tolerance=target.tolerance,
+        system,
+        *target.pose(float(system.length)),
+        low=low,
+        high=high,
+        tolerance=target.tolerance,
         space=space,
-    )  # fmt: skip
+    )
     try:
         decided = kc.statics.stability(found.equilibrium)
         stability, warnings = stability_summary(decided.kind, decided.reason)
@@ -183,9 +187,12 @@ def modes(
     if drawing:
         drawing.vibration(found).savefig(picture)
     facts = {
-        "robot": model.robot, "frequency": found.frequency.tolist(), "damping": found.damping.tolist(),
-        "growth_rate": found.values.real.tolist(), "error": found.error.tolist(),
-    }  # fmt: skip
+        "robot": model.robot,
+        "frequency": found.frequency.tolist(),
+        "damping": found.damping.tolist(),
+        "growth_rate": found.values.real.tolist(),
+        "error": found.error.tolist(),
+    }
     write_output(as_json, facts, repr(found).splitlines(), picture=picture)
 
 
@@ -240,9 +247,13 @@ def workspace(
     inside = found.position[found.valid]
     box = [inside.min(axis=0).tolist(), inside.max(axis=0).tolist()] if len(inside) else None
     facts = {
-        "robot": model.robot, "count": count, "unsolved": found.unsolved, "seed": seed, "box": box,
+        "robot": model.robot,
+        "count": count,
+        "unsolved": found.unsolved,
+        "seed": seed,
+        "box": box,
         "computing_time": round(seconds, 3),
-    }  # fmt: skip
+    }
     lines = [f"{count} equilibria computed in {seconds:.1f} s; not solved: {found.unsolved}"]
     if box:
         lines.append(f"tip positions between {vector_text(box[0])} and {vector_text(box[1])} m")

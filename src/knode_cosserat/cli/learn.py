@@ -149,10 +149,15 @@ def fit(nominal: Nominal, data: _Data, method: _FitMethod, files: _FitFiles, rep
     try:
         result = best_so_far(
             lambda: learn(
-                system, training, config, held_out=validation, checkpoint=files.checkpoint,
-                log_dir=files.log, progress=report.shows_progress,
+                system,
+                training,
+                config,
+                held_out=validation,
+                checkpoint=files.checkpoint,
+                log_dir=files.log,
+                progress=report.shows_progress,
             )
-        )  # fmt: skip
+        )
     except DataError as error:
         # files' names instead of the numbers of trajectories
         names = dict(enumerate(map(str, data.trajectories)))
@@ -240,10 +245,15 @@ def identify(
     progress = functools.partial(print, file=sys.stderr, flush=True) if report.shows_progress else None
     identified = best_so_far(
         lambda: find(
-            system, samples, search.effects or None, space=sampling.space, progress=progress,
-            checkpoint=search.checkpoint, minutes=search.minutes,
+            system,
+            samples,
+            search.effects or None,
+            space=sampling.space,
+            progress=progress,
+            checkpoint=search.checkpoint,
+            minutes=search.minutes,
         )
-    )  # fmt: skip
+    )
     kc.save_robot(identified.robot, search.out)
     facts = identified.to_dict() | {"computing_time": round(perf_counter() - began, 1)}
     write_output(report.as_json, facts, str(identified).splitlines(), out=search.out)

@@ -34,9 +34,19 @@ OPTIONAL_COMMANDS = {"robot": "knode-cosserat-hardware", "robot-parts": "knode-c
 _EXPECTED = (KnodeCosseratError, ValueError, OSError, ImportError, MemoryError, OverflowError)
 
 #: options that take several numbers
-VECTOR_OPTIONS = frozenset([
-    "--tension", "--control", "--low", "--high", "--masses", "--position", "--quaternion", "--seeds", "--set",
-])  # fmt: skip
+VECTOR_OPTIONS = frozenset(
+    [
+        "--tension",
+        "--control",
+        "--low",
+        "--high",
+        "--masses",
+        "--position",
+        "--quaternion",
+        "--seeds",
+        "--set",
+    ]
+)
 #: options that take NAME=VALUE pairs
 _NAMED_OPTIONS = frozenset(["--control"])
 

@@ -115,9 +115,18 @@ def _lines(report: Health) -> list[str]:
 
 
 _TITLES = [
-    "topic", "what", "rows", "rate [Hz]", "jitter [ms]", "missing [%]", "gaps", "longest [ms]", "delay [ms]",
-    "noise", "angle noise [mrad]",
-]  # fmt: skip
+    "topic",
+    "what",
+    "rows",
+    "rate [Hz]",
+    "jitter [ms]",
+    "missing [%]",
+    "gaps",
+    "longest [ms]",
+    "delay [ms]",
+    "noise",
+    "angle noise [mrad]",
+]
 
 
 def _row(stream: StreamHealth) -> list[str]:
@@ -226,8 +235,12 @@ def record_virtual(
     )
     elapsed = perf_counter() - began
     facts: dict[str, Any] = {
-        "signal": signal, "seconds": seconds, "seed": seed, "swap": swap, "simulated": True,
-    }  # fmt: skip
+        "signal": signal,
+        "seconds": seconds,
+        "seed": seed,
+        "swap": swap,
+        "simulated": True,
+    }
     lines = [f"recorded {seconds:g} s of {signal} (simulated) in {elapsed:.1f} s"]
     written = {"out": out} | ({"states": states} if states or as_json else {})
     if states:

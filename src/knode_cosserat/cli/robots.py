@@ -98,9 +98,15 @@ def simulate(
     began = perf_counter()
     with coarse_grid_in_output():
         trajectory = kc.simulate(
-            system, sequence, dt, time=run.time, space=run.space, initial=run.initial,  # type: ignore[arg-type]  # checked there
-            progress=report.shows_progress, on_failure="return" if run.allow_failure else "raise",
-        )  # fmt: skip
+            system,
+            sequence,
+            dt,
+            time=run.time,
+            space=run.space,
+            initial=run.initial,  # type: ignore[arg-type]  # checked there
+            progress=report.shows_progress,
+            on_failure="return" if run.allow_failure else "raise",
+        )
     seconds = perf_counter() - began
     trajectory.save(out)
     if drawing:

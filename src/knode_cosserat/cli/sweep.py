@@ -163,9 +163,12 @@ def sweep(
     require_writable(folders=[] if dry_run else [out])
     plan = Plan.of(described)
     facts = {
-        "cases": described.case_count, "robots": len(plan.systems), "shards": plan.shard_count,
-        "shard_cases": plan.shard_cases, "megabytes": round(plan.total_bytes / 1e6, 3),
-    }  # fmt: skip
+        "cases": described.case_count,
+        "robots": len(plan.systems),
+        "shards": plan.shard_count,
+        "shard_cases": plan.shard_cases,
+        "megabytes": round(plan.total_bytes / 1e6, 3),
+    }
     if dry_run:
         size = (
             f"{plan.shard_count} files of up to {plan.shard_cases} cases; "

@@ -103,9 +103,13 @@ def view(
         if sys.stderr.isatty():
             typer.echo(f"preparing {name} …", err=True)
         viewer.view_live(
-            robot, dt=live.dt, space=live.space, title=name if name in catalog() else Path(name).name,
-            port=page.port, open_browser=announce,
-        )  # fmt: skip
+            robot,
+            dt=live.dt,
+            space=live.space,
+            title=name if name in catalog() else Path(name).name,
+            port=page.port,
+            open_browser=announce,
+        )
         return
     if not names:
         raise ValueError("no trajectory is given; type: knode-cosserat view FILE…, or view --live ROBOT")

@@ -194,9 +194,13 @@ def register_controller(name: str, help: str) -> Callable[[AnyController], AnyCo
 
 
 def controller_named(
-    name: str, robot: System, dt: float, limits: ControlLimits, adapt: Sequence[Any] = (),
+    name: str,
+    robot: System,
+    dt: float,
+    limits: ControlLimits,
+    adapt: Sequence[Any] = (),
     measured: Any = None,
-) -> Controller:  # fmt: skip
+) -> Controller:
     """Return a controller of the tip's position by its name.
 
     Args:
@@ -277,9 +281,11 @@ def apply_lag(
 
 
 def identified_lag(
-    commanded: Float[np.ndarray, "T c"], measured: Float[np.ndarray, "T c"], dt: float,
+    commanded: Float[np.ndarray, "T c"],
+    measured: Float[np.ndarray, "T c"],
+    dt: float,
     initial: Float[np.ndarray, " c"],
-) -> float:  # fmt: skip
+) -> float:
     """Return the time constant (s) of the motors, by least squares of the measured tensions.
 
     Args:

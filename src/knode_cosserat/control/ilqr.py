@@ -25,9 +25,16 @@ class ILQR(PlanController):
     """
 
     def __init__(
-        self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, weights: Weights = Weights(), iterations: int = 2,
-    ):  # fmt: skip
+        self,
+        observer: KalmanObserver,
+        target: Output,
+        limits: ControlLimits,
+        *,
+        horizon: int = 20,
+        knots: int = 8,
+        weights: Weights = Weights(),
+        iterations: int = 2,
+    ):
         """Set up the controller as `PredictiveController`; `iterations` are the steps in a period."""
         super().__init__(observer, target, limits, Knots.spaced(horizon, knots), weights)
         self.iterations = iterations

@@ -89,9 +89,16 @@ class KoopmanController(Controller):
     """Predictive control of the tip by a lifted linear model and one quadratic program a period."""
 
     def __init__(
-        self, robot: System, dt: float, limits: ControlLimits, *, horizon: int = 20, knots: int = 8,
-        weights: Weights = Weights(), seed: int = 0,
-    ):  # fmt: skip
+        self,
+        robot: System,
+        dt: float,
+        limits: ControlLimits,
+        *,
+        horizon: int = 20,
+        knots: int = 8,
+        weights: Weights = Weights(),
+        seed: int = 0,
+    ):
         """Simulate random motions of the robot and fit the lifted model.
 
         Args:

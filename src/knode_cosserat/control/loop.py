@@ -114,9 +114,14 @@ def distance_out_of_reach(
         distance = np.minimum(distance, np.linalg.norm(wanted - wanted[chosen[-1]], axis=1))
     chosen.sort()
     nearest = inverse_kinematics(
-        robot, wanted[chosen], low=bounds.low, high=bounds.high, tolerance=REACHED, starts=STARTS,
+        robot,
+        wanted[chosen],
+        low=bounds.low,
+        high=bounds.high,
+        tolerance=REACHED,
+        starts=STARTS,
         pose=_coordinates(known),
-    )  # fmt: skip
+    )
     errors = np.where(nearest.converged, 0.0, np.nan_to_num(nearest.position_error))
     k = int(np.argmax(errors))
     return float(errors[k]), float(times[chosen[k]])
@@ -239,11 +244,16 @@ class LoopLog:
             )
         position = self.measured.reshape(rows, bodies, 3)
         return Measurements(
-            time=self.time, tension=self.control, fractions=np.asarray(fractions, dtype=float),
-            position=position, quaternion=np.full((rows, bodies, 4), np.nan),
-            measured=np.isfinite(position).all(axis=-1), simulated=simulated, source="closed loop",
+            time=self.time,
+            tension=self.control,
+            fractions=np.asarray(fractions, dtype=float),
+            position=position,
+            quaternion=np.full((rows, bodies, 4), np.nan),
+            measured=np.isfinite(position).all(axis=-1),
+            simulated=simulated,
+            source="closed loop",
             initial_tension=self.initial_control,
-        )  # fmt: skip
+        )
 
     def to_csv(self, path: str | Path) -> None:
         """Write one row a period: time, reference, tip, controls, status and times of the computation."""
@@ -255,8 +265,10 @@ class LoopLog:
         columns |= {f"control {k + 1}": column for k, column in enumerate(self.control.T)}
         columns |= self.parameters
         columns |= {
-            "status": self.status, "feedback (s)": self.feedback, "preparation (s)": self.preparation,
-        }  # fmt: skip
+            "status": self.status,
+            "feedback (s)": self.feedback,
+            "preparation (s)": self.preparation,
+        }
         with replacing(Path(path)) as part:
             pd.DataFrame(columns).to_csv(part, index=False)
 
@@ -284,10 +296,16 @@ def estimated_state(controller: Any) -> Trajectory | None:
     estimate = observer.estimate
     one = np.zeros(1)
     return Trajectory(
-        observer.robot, None, np.array([estimate.time]), np.asarray(estimate.y)[None],
-        np.asarray(estimate.z)[None], np.asarray(observer.control, dtype=float)[None],
-        np.zeros(1, dtype=int), one, one,
-    )  # fmt: skip
+        observer.robot,
+        None,
+        np.array([estimate.time]),
+        np.asarray(estimate.y)[None],
+        np.asarray(estimate.z)[None],
+        np.asarray(observer.control, dtype=float)[None],
+        np.zeros(1, dtype=int),
+        one,
+        one,
+    )
 
 
 def join_rows(states: Sequence[Trajectory], times: Sequence[float]) -> Trajectory:
@@ -302,9 +320,17 @@ def join_rows(states: Sequence[Trajectory], times: Sequence[float]) -> Trajector
     ]
     none = np.zeros(len(times))
     return Trajectory(
-        states[0].system, states[0].settings, np.array(times), y, z, control, result, none,
-        none.astype(int), position_error=np.concatenate(errors),
-    )  # fmt: skip
+        states[0].system,
+        states[0].settings,
+        np.array(times),
+        y,
+        z,
+        control,
+        result,
+        none,
+        none.astype(int),
+        position_error=np.concatenate(errors),
+    )
 
 
 # periods
@@ -352,9 +378,7 @@ class Loop:
         row = loop.period()
     """
 
-    def __init__(
-        self, controller: Controller, plant: Plant, reference: Reference, kept: int | None = None
-    ):  # fmt: skip
+    def __init__(self, controller: Controller, plant: Plant, reference: Reference, kept: int | None = None):
         """Start the plant and the controller; the log has the last `kept` periods, None for all.
 
         Raises:
@@ -402,9 +426,16 @@ class Loop:
         controller.prepare(time + controller.dt, reference)
         done = clock.perf_counter()
         row = Period(
-            time, reference.at(time)[0], measured, tip, command, sent - began, done - moved,
-            {} if observer is None else dict(observer.estimate.parameters), state,
-        )  # fmt: skip
+            time,
+            reference.at(time)[0],
+            measured,
+            tip,
+            command,
+            sent - began,
+            done - moved,
+            {} if observer is None else dict(observer.estimate.parameters),
+            state,
+        )
         self._rows.append(row)
         self._overrun += row.feedback + row.preparation > controller.dt
         self._count += 1

@@ -80,9 +80,14 @@ class LQR(Controller):
     """
 
     def __init__(
-        self, robot: System, dt: float, limits: ControlLimits, *, change: float = 1e-2,
+        self,
+        robot: System,
+        dt: float,
+        limits: ControlLimits,
+        *,
+        change: float = 1e-2,
         disturbance: float = 0.1,
-    ):  # fmt: skip
+    ):
         """Linearise the robot about the equilibrium under a quarter of the greatest controls.
 
         Args:

@@ -28,10 +28,19 @@ class MPPI(PlanController):
     """Path integral control: the mean of random plans, weighted by the exponential of their costs."""
 
     def __init__(
-        self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, weights: Weights = Weights(), samples: int = 32, deviation: float = 0.05,
-        temperature: float = 0.1, seed: int = 0,
-    ):  # fmt: skip
+        self,
+        observer: KalmanObserver,
+        target: Output,
+        limits: ControlLimits,
+        *,
+        horizon: int = 20,
+        knots: int = 8,
+        weights: Weights = Weights(),
+        samples: int = 32,
+        deviation: float = 0.05,
+        temperature: float = 0.1,
+        seed: int = 0,
+    ):
         """Set up the controller as `PredictiveController`, with more settings.
 
         `samples` is the number of random plans in each period (the plan itself is one more), `deviation` the
@@ -53,10 +62,12 @@ class MPPI(PlanController):
         if not solved.any():
             self._hold()
             return self.fallback("no sampled plan was solved")
-        costs = np.array([
-            self.tracking.cost(error, plan, self._control)
-            for error, plan in zip(errors[solved], plans[solved], strict=True)
-        ])  # fmt: skip
+        costs = np.array(
+            [
+                self.tracking.cost(error, plan, self._control)
+                for error, plan in zip(errors[solved], plans[solved], strict=True)
+            ]
+        )
         scale = max(self.temperature * float(costs.std()), 1e-12)
         share = np.exp(-(costs - costs.min()) / scale)
         return self.planned(np.tensordot(share / share.sum(), plans[solved], 1))

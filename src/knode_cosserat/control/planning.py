@@ -158,7 +158,7 @@ class Tracking:
 
     def __init__(
         self, knots: Knots, limits: ControlLimits, weights: Weights, noise: Float[np.ndarray, " e"], dt: float
-    ):  # fmt: skip
+    ):
         #: an error counts in each sample of its step
         self.limits, self.weights, self.noise = limits, weights, noise / np.sqrt(knots.stride)
         self._spread = np.asarray(limits.high) - np.asarray(limits.low)
@@ -186,9 +186,12 @@ class Tracking:
         return float(cost + weights.effort * np.sum((away / self._spread) ** 2))
 
     def program(
-        self, error: Float[np.ndarray, "T e"], by_plan: Float[np.ndarray, "n T e"], plan: np.ndarray,
+        self,
+        error: Float[np.ndarray, "T e"],
+        by_plan: Float[np.ndarray, "n T e"],
+        plan: np.ndarray,
         control: np.ndarray,
-    ) -> QuadraticProgram:  # fmt: skip
+    ) -> QuadraticProgram:
         """Return the program whose unknowns are the changes (n,) of a plan.
 
         Args:
@@ -228,9 +231,15 @@ class PredictedOutputs(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("structure", "target", "limited", "columns"))
 def _outputs(
-    structure: Structure, target: Output, limited: tuple[Output, ...], columns: tuple[int, ...],
-    numbers: Any, records: Any, d_records: Any, reference: Any,
-) -> Any:  # fmt: skip
+    structure: Structure,
+    target: Output,
+    limited: tuple[Output, ...],
+    columns: tuple[int, ...],
+    numbers: Any,
+    records: Any,
+    d_records: Any,
+    reference: Any,
+) -> Any:
     """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
     system, (steps, *_, count) = structure.system(numbers), d_records.shape
     error, slopes = errors_along(system, target, records, d_records, reference, columns=columns)
@@ -274,7 +283,7 @@ class PlanController(Controller):
 
     def __init__(
         self, observer: KalmanObserver, target: Output, limits: ControlLimits, knots: Knots, weights: Weights
-    ):  # fmt: skip
+    ):
         self.observer, self.target, self.dt = observer, target, observer.dt
         self.limits, self.knots = limits.of(observer.robot), knots
         count = observer.robot.control_layout.size
@@ -291,9 +300,15 @@ class PlanController(Controller):
 
     @classmethod
     def for_tip(
-        cls, robot: System, dt: float, limits: ControlLimits, *, adapt: Sequence[Adapted | str] = (),
-        measured: Output | None = None, **options: Any,
-    ) -> Self:  # fmt: skip
+        cls,
+        robot: System,
+        dt: float,
+        limits: ControlLimits,
+        *,
+        adapt: Sequence[Adapted | str] = (),
+        measured: Output | None = None,
+        **options: Any,
+    ) -> Self:
         """Return a controller of the tip's position, with an observer of the model."""
         target = TipPosition()
         observer = KalmanObserver(robot, dt, target if measured is None else measured, adapt=adapt)
@@ -352,9 +367,11 @@ class PlanController(Controller):
         return np.concatenate([plan, acting], axis=-2)
 
     def predicted(
-        self, plan: Float[np.ndarray, "knots c"], wanted: Float[np.ndarray, "T p"],
+        self,
+        plan: Float[np.ndarray, "knots c"],
+        wanted: Float[np.ndarray, "T p"],
         limited: tuple[Output, ...] = (),
-    ) -> PredictedOutputs | None:  # fmt: skip
+    ) -> PredictedOutputs | None:
         """Return the prediction of a plan from the estimated state; None if it is not solved.
 
         It is linearised by the plan's numbers and by the directions in which the state is uncertain.
@@ -374,9 +391,15 @@ class PlanController(Controller):
         if motion is None:
             return None
         outputs = _outputs(
-            moved.structure, self.target, limited, columns, moved.numbers, motion.records, motion.d_records,
+            moved.structure,
+            self.target,
+            limited,
+            columns,
+            moved.numbers,
+            motion.records,
+            motion.d_records,
             wanted,
-        )  # fmt: skip
+        )
         error, slopes, value, slope, path = map(np.asarray, outputs)
         # without the derivatives by the acting controls
         n, first = plan.size, len(by_plan)

@@ -53,10 +53,18 @@ class PredictiveController(PlanController):
     """
 
     def __init__(
-        self, observer: KalmanObserver, target: Output, limits: ControlLimits, *, horizon: int = 20,
-        knots: int = 8, stride: int = 1, realtime: bool | float = 0.0, weights: Weights = Weights(),
+        self,
+        observer: KalmanObserver,
+        target: Output,
+        limits: ControlLimits,
+        *,
+        horizon: int = 20,
+        knots: int = 8,
+        stride: int = 1,
+        realtime: bool | float = 0.0,
+        weights: Weights = Weights(),
         soft: Sequence[SoftLimit] = (),
-    ):  # fmt: skip
+    ):
         """Set up the controller around an observer of the model; `realtime` compiles and measures, too.
 
         Args:
@@ -96,10 +104,16 @@ class PredictiveController(PlanController):
             horizon, knots, stride = self.choice.size
             log.info("%s", self.choice)
         super().__init__(observer, target, limits, Knots.spaced(horizon, knots, stride), weights)
-        ends = np.concatenate([
-            np.zeros((2, 0)),
-            *([np.full(limit.output.size, end) for end in (limit.low, limit.high)] for limit in self.soft),
-        ], axis=1)  # fmt: skip
+        ends = np.concatenate(
+            [
+                np.zeros((2, 0)),
+                *(
+                    [np.full(limit.output.size, end) for end in (limit.low, limit.high)]
+                    for limit in self.soft
+                ),
+            ],
+            axis=1,
+        )
         # at every sample of the horizon, one sample after the other
         self._low, self._high = np.tile(ends, horizon)
 

@@ -99,6 +99,11 @@ def _least_violation(problem: QuadraticProgram) -> QuadraticProgram:
     scale = np.concatenate([np.ones(hard), np.full(p.soft, 1.0 / unit)])
     free = np.full(p.soft, np.inf)
     return QuadraticProgram(
-        np.diag(np.concatenate([np.full(n, SMALL), np.ones(p.soft)])), np.zeros(n + p.soft),
-        np.concatenate([p.low, -free]), np.concatenate([p.high, free]), A, p.below * scale, p.above * scale,
-    )  # fmt: skip
+        np.diag(np.concatenate([np.full(n, SMALL), np.ones(p.soft)])),
+        np.zeros(n + p.soft),
+        np.concatenate([p.low, -free]),
+        np.concatenate([p.high, free]),
+        A,
+        p.below * scale,
+        p.above * scale,
+    )

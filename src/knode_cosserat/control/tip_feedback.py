@@ -82,9 +82,15 @@ class PID(_TipFeedback):
     """
 
     def __init__(
-        self, robot: System, dt: float, limits: ControlLimits, *, proportional: float = 0.4,
-        integral: float = 2.0, derivative: float = 0.05,
-    ):  # fmt: skip
+        self,
+        robot: System,
+        dt: float,
+        limits: ControlLimits,
+        *,
+        proportional: float = 0.4,
+        integral: float = 2.0,
+        derivative: float = 0.05,
+    ):
         """Set the gains: dimensionless, in 1/s, and in s."""
         self._gains = proportional, integral, derivative
         super().__init__(robot, dt, limits)

@@ -49,9 +49,13 @@ class ArrayCode:
     """Code of the arrays among the nodes of a program, in a function."""
 
     def __init__(
-        self, function: Function, program: Program, outputs: Iterable[int], added: Iterable[int],
+        self,
+        function: Function,
+        program: Program,
+        outputs: Iterable[int],
+        added: Iterable[int],
         values: dict[int, Any],
-    ):  # fmt: skip
+    ):
         #: nodes that outputs and added arrays need, in order
         self.needed = program.needed([*outputs, *added], frozenset(values))
         self.function, self.program, self._values = function, program, values

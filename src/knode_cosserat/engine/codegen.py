@@ -25,11 +25,32 @@ if TYPE_CHECKING:
     from knode_cosserat.engine.machine_code import MachineCode
 
 #: functions of one number that LLVM provides, then those of the C library, a call for every lane
-INTRINSICS = {"abs": "fabs", "sqrt": "sqrt", "exp": "exp", "log": "log", "sin": "sin", "cos": "cos",
-              "max": "maximum", "min": "minimum", "pow": "pow", "floor": "floor"}  # fmt: skip
+INTRINSICS = {
+    "abs": "fabs",
+    "sqrt": "sqrt",
+    "exp": "exp",
+    "log": "log",
+    "sin": "sin",
+    "cos": "cos",
+    "max": "maximum",
+    "min": "minimum",
+    "pow": "pow",
+    "floor": "floor",
+}
 LIBRARY = {
-    "log1p", "expm1", "tanh", "sin", "cos", "tan", "atan", "asin", "acos", "atan2", "erf", "fmod",
-}  # fmt: skip
+    "log1p",
+    "expm1",
+    "tanh",
+    "sin",
+    "cos",
+    "tan",
+    "atan",
+    "asin",
+    "acos",
+    "atan2",
+    "erf",
+    "fmod",
+}
 COMPARISONS = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
 
 
@@ -397,8 +418,9 @@ class Function:
             condition = self.splat(condition, lanes)
         return self.result(
             f"select {condition.type} {condition.name}, {yes.type} {yes.name}, {no.type} {no.name}",
-            yes.kind, lanes,
-        )  # fmt: skip
+            yes.kind,
+            lanes,
+        )
 
     def apply(self, operation: str, *arguments: Any) -> Value:
         """Return an operation of a program (`program.Program`)."""
@@ -571,9 +593,14 @@ class Function:
     # programs
 
     def evaluate(
-        self, program: Program, outputs: Sequence[int], known: Mapping[int, Any], lanes: int,
-        sums: Sums = ((), True), stores: Stores | None = None,
-    ) -> Values:  # fmt: skip
+        self,
+        program: Program,
+        outputs: Sequence[int],
+        known: Mapping[int, Any],
+        lanes: int,
+        sums: Sums = ((), True),
+        stores: Stores | None = None,
+    ) -> Values:
         """Write the operations that outputs need, and return the values of all of them.
 
         `known` are values of inputs and of operations that have been evaluated, or functions that read them;

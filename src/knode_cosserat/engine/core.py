@@ -86,9 +86,14 @@ class Core(EliminationCode):
         self.time_errors = [a(numbers, "used") for _ in memory]
         #: arrays of the state of a motion (`StateHistory`) and of an equilibrium (`StaticState`)
         self.motion = [
-            self.records, [self.rate], self.past, [self.weights], [self.t0],
-            [*self.errors, self.error_rate], self.time_errors,
-        ]  # fmt: skip
+            self.records,
+            [self.rate],
+            self.past,
+            [self.weights],
+            [self.t0],
+            [*self.errors, self.error_rate],
+            self.time_errors,
+        ]
         self.shape = [[self.y]]
         #: of the stage solved last (`USABLE` and the next)
         self.outcome = a(8)
@@ -192,9 +197,11 @@ class Core(EliminationCode):
             new_damping = f.select(accepts, f.apply("min", 1.0, 4.0 * damping.get()), damping.get() * 0.25)
             damping.set(f.select(active, new_damping, damping.get()))
             for variable, value in (
-                (error, new_error), (size, new_size), (relative_size, new_relative_size),
+                (error, new_error),
+                (size, new_size),
+                (relative_size, new_relative_size),
                 (factors, f.select(is_in(NEW), FRESH, f.select(is_in(FRESH), KEPT, factors.get()))),
-            ):  # fmt: skip
+            ):
                 variable.set(f.select(accepts, value, variable.get()))
             factors.set(f.select(active & renews, NONE, factors.get()))
             is_finished.set(is_finished.get() | (finishes & active))
@@ -205,9 +212,11 @@ class Core(EliminationCode):
         left = f.select(relative_size.get() <= LARGEST_CORRECTION, error.get(), left)
         is_usable = (left <= acceptable) & ~is_in(NONE)
         for k, value in (
-            (USABLE, f.select(is_usable, 1.0, 0.0)), (ERROR, left), (CORRECTIONS, corrections.get()),
+            (USABLE, f.select(is_usable, 1.0, 0.0)),
+            (ERROR, left),
+            (CORRECTIONS, corrections.get()),
             (LINEARISATIONS, linearisations.get()),
-        ):  # fmt: skip
+        ):
             self._put(value, self.outcome, k)
 
     def _residual_norm(self) -> Value:

@@ -299,9 +299,10 @@ class EliminationCode(RodCode):
                 x = f.pointer(*self._at(self.X, c * self._padded(ny), tip))
                 rows = [i for i in range(ny) if self.nonzero_X[i, c]]
                 product = self._product(
-                    [M[i] for i in rows], [f.load(x, i * component, lanes) for i in rows],
+                    [M[i] for i in rows],
+                    [f.load(x, i * component, lanes) for i in rows],
                     self.nonzero_M[:, rows],
-                )  # fmt: skip
+                )
                 column = f.pointer(memory, (strand.value * own + c) * (self._padded(k) * component))
                 for row, value in zip(self._blocks(k), product, strict=True):
                     f.store(value, column, self.at_tip.at(row, 0), self.L)

@@ -197,9 +197,12 @@ class Equations(Sizes):
         self.products = {
             name: program.derivative([int(node) for node in nodes], directions)
             for name, nodes in (
-                ("rates", [*self.f, *self.z]), ("far", self.far), ("tip", self.tip), ("base", self.base)
+                ("rates", [*self.f, *self.z]),
+                ("far", self.far),
+                ("tip", self.tip),
+                ("base", self.base),
             )
-        }  # fmt: skip
+        }
         for nodes in self.products.values():
             outputs += nodes
         self._outputs = outputs
@@ -257,9 +260,11 @@ class TangentEquations(Equations):
         """
         super().__init__(system, moving, space)
         results = {
-            "rates": [*self.f, *self.z], "far": [*self.far] if system.discontinuities.jump else [],
-            "tip": [*self.tip], "base": [*self.base],
-        }  # fmt: skip
+            "rates": [*self.f, *self.z],
+            "far": [*self.far] if system.discontinuities.jump else [],
+            "tip": [*self.tip],
+            "base": [*self.base],
+        }
         self.z_by_y = self.program.nonzeros(self.z, self.y)
         #: by the history of all strands in turn; that of a point is the first
         whole = np.concatenate(self.strand_history)

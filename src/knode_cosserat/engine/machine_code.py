@@ -145,9 +145,12 @@ def _generated_beside(text: str, name: str) -> Any:
             file.seek(0)
             process = subprocess.Popen(
                 [program, "-P", generation.__file__, *paths],
-                stdin=file, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
+                stdin=file,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
                 env=os.environ | {"PYTHONPATH": os.pathsep.join(map(os.path.abspath, sys.path))},
-            )  # fmt: skip
+            )
         # waited for, or its entry would stay in the system's table
         threading.Thread(target=process.wait, daemon=True).start()
     except (OSError, RuntimeError):

@@ -214,9 +214,16 @@ class Motions:
         table[:, -1] = (i + ends) * self.steps.dt
         after, results = before.copy(), np.zeros(size)
         self.core._functions["run"](
-            self._memory.ctypes.data, after.ctypes.data, *addresses, results.ctypes.data, self._packed_size,
-            1, 1, len(acting), self._estimates,
-        )  # fmt: skip
+            self._memory.ctypes.data,
+            after.ctypes.data,
+            *addresses,
+            results.ctypes.data,
+            self._packed_size,
+            1,
+            1,
+            len(acting),
+            self._estimates,
+        )
         if not results[-2]:
             return before, None, NOT_SOLVED
         last = size - 2 - shapes[1][2]
@@ -253,9 +260,16 @@ class Motions:
         time_error = numbers[..., -1, TIME] if is_whole else np.full(off.shape, np.nan)
         corrections = np.sum(numbers[..., CORRECTIONS], axis=-1).astype(int)
         found = StepRows(
-            rows[:, :, -1], unknowns[:, :, -1], error, corrections, off, result, time_error,
-            rows[:, :, :-1], unknowns[:, :, :-1],
-        )  # fmt: skip
+            rows[:, :, -1],
+            unknowns[:, :, -1],
+            error,
+            corrections,
+            off,
+            result,
+            time_error,
+            rows[:, :, :-1],
+            unknowns[:, :, :-1],
+        )
         return found, done
 
     def _is_fine(self, off: Any, angle: Any, length: Any) -> Any:

@@ -195,9 +195,10 @@ def values_along(function: Callable[[Any, Any, Any], Any], system: System, s: An
     """
     pattern, control = Pattern.of(system).in_room, np.asarray(control, dtype=float)
     code = compiled(
-        (pattern, function, len(control)), _PlaceCode,
+        (pattern, function, len(control)),
+        _PlaceCode,
         lambda: _PlaceCode(function, pattern.system, len(control)),
-    )  # fmt: skip
+    )
     s = np.asarray(s, dtype=float)
     if s.ndim == 1:
         return code.evaluate(np.concatenate([packed(system), control]), s)

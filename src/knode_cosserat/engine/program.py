@@ -645,10 +645,12 @@ class Program:
         return [entry for entry in entries if not self.is_constant(entry[2], 0.0)]
 
     def gradient(
-        self, outputs: Sequence[int] | Nodes, cotangents: Sequence[int] | Nodes,
+        self,
+        outputs: Sequence[int] | Nodes,
+        cotangents: Sequence[int] | Nodes,
         variables: Sequence[int] | Nodes,
         linear: bool = False,
-    ) -> list[int]:  # fmt: skip
+    ) -> list[int]:
         """Return the cotangents of independent nodes from those of the outputs: a product λᵀ·J.
 
         Outputs that are `linear` in the variables are differentiated as they are evaluated, without rules.
@@ -891,8 +893,10 @@ class Program:
             if rule is None:
                 new[node] = self._with_arguments(node, new)
                 continue
-            arguments = [self._nodes([new.get(each, each) for each in self.parts(array)], array.shape)
-                         for array in rule.arguments]  # fmt: skip
+            arguments = [
+                self._nodes([new.get(each, each) for each in self.parts(array)], array.shape)
+                for array in rule.arguments
+            ]
             copy = _DerivativeRule(rule.function, rule.shapes, arguments)
             for array in rule.results:
                 parts = self.parts(array)
@@ -1091,14 +1095,22 @@ FORMULAS: dict[str, Callable[[_Scalar], _Scalar]] = {
 
 #: primitives that are operations under another or the same name
 ELEMENTWISE = {name: name for name in FOLDED if name not in ("select", "hold", "isfinite")} | {
-    "add_any": "add", "is_finite": "isfinite", "stop_gradient": "hold", "lt_to": "lt", "le_to": "le",
-}  # fmt: skip
+    "add_any": "add",
+    "is_finite": "isfinite",
+    "stop_gradient": "hold",
+    "lt_to": "lt",
+    "le_to": "le",
+}
 UNCHANGED = frozenset({"copy", "copy_p", "optimization_barrier", "reduce_precision", "device_put", "pvary"})
 CALLS = ("jaxpr", "call_jaxpr", "fun_jaxpr")
 REDUCED = {
-    "reduce_sum": "add", "reduce_prod": "mul", "reduce_max": "max", "reduce_min": "min", "reduce_and": "and",
+    "reduce_sum": "add",
+    "reduce_prod": "mul",
+    "reduce_max": "max",
+    "reduce_min": "min",
+    "reduce_and": "and",
     "reduce_or": "or",
-}  # fmt: skip
+}
 ACCUMULATED = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
 #: primitives that move entries, from arrays of nodes and parameters
 RESHAPED: dict[str, Callable[[Any, Any], Nodes]] = {
@@ -1112,9 +1124,15 @@ RESHAPED: dict[str, Callable[[Any, Any], Nodes]] = {
     "rev": lambda arrays, own: np.flip(arrays[0], own["dimensions"]),
 }
 SCATTERED = {
-    "scatter-add": "add", "scatter_add": "add", "scatter_mul": "mul", "scatter-mul": "mul",
-    "scatter_min": "min", "scatter-min": "min", "scatter_max": "max", "scatter-max": "max",
-}  # fmt: skip
+    "scatter-add": "add",
+    "scatter_add": "add",
+    "scatter_mul": "mul",
+    "scatter-mul": "mul",
+    "scatter_min": "min",
+    "scatter-min": "min",
+    "scatter_max": "max",
+    "scatter-max": "max",
+}
 #: primitives that are not covered, with what to use instead
 INSTEAD = {
     "custom_vjp_call": "use jax.custom_jvp",
@@ -1402,9 +1420,12 @@ class _JaxprEvaluation:
     # variable indices
 
     def by_index(
-        self, e: Any, nodes: Sequence[int], ranges: Sequence[tuple[int, int]],
+        self,
+        e: Any,
+        nodes: Sequence[int],
+        ranges: Sequence[tuple[int, int]],
         entry: Callable[..., list[Nodes]],
-    ) -> list[Nodes]:  # fmt: skip
+    ) -> list[Nodes]:
         """Return the entry for indices that may be variables: by selects; indices are clipped to ranges."""
         if not nodes:
             return entry()
@@ -1427,9 +1448,10 @@ class _JaxprEvaluation:
                 return self.where(p, found(no), found(yes))
             if high - low >= LARGEST_TABLE:
                 raise self.error(
-                    e, f"with a variable index into {high - low + 1} entries is not covered by the engine",
+                    e,
+                    f"with a variable index into {high - low + 1} entries is not covered by the engine",
                     f"use a formula, or at most {LARGEST_TABLE} entries",
-                )  # fmt: skip
+                )
             values = at(low)
             for k in range(low + 1, high + 1):
                 beyond = self.apply("ge", node, program.constant(float(k)))
@@ -1458,9 +1480,13 @@ class _JaxprEvaluation:
         return self.by_index(e, [int(start) for start in starts], ranges, entry)
 
     def _windows(
-        self, e: Any, indices: Nodes, axes: tuple[Any, ...], sizes: Sequence[int],
+        self,
+        e: Any,
+        indices: Nodes,
+        axes: tuple[Any, ...],
+        sizes: Sequence[int],
         entry: Callable[[Any, Any], list[Nodes]],
-    ) -> Callable[[Any], list[Nodes]]:  # fmt: skip
+    ) -> Callable[[Any], list[Nodes]]:
         """Return a function that calls entry(place, slices) for a batch index; slices are None outside.
 
         `axes` of the first operand: those of variable indices, of batches, and of batches in the indices.
@@ -1613,9 +1639,11 @@ class _JaxprEvaluation:
                 rows = rows[:1]
             sizes = self.elementwise("abs", A[rows, k])
             index = self.by_index(
-                None, [int(self._best_index("gt", sizes))], [(0, len(rows) - 1)],
+                None,
+                [int(self._best_index("gt", sizes))],
+                [(0, len(rows) - 1)],
                 lambda place, rows=rows: [self.program.constants(rows[place])],
-            )[0]  # fmt: skip
+            )[0]
             pivots[k] = index
             full = np.concatenate([A, order[:, None]], axis=1)
             chosen = self.by_index(None, [int(index)], [(k, n - 1)], lambda row, full=full: [full[row]])[0]
@@ -1717,9 +1745,15 @@ class _JaxprEvaluation:
         following = inner.evaluate(e.params["body_jaxpr"], [*fixed[cond_nconsts:], *state])
 
         loop = _WhileLoop(
-            inner, [(name, node) for node, name in inputs.items()], _flat(state), _flat(arguments[count:]),
-            _flat(following), int(condition), kinds, source_line(self.nested),
-        )  # fmt: skip
+            inner,
+            [(name, node) for node, name in inputs.items()],
+            _flat(state),
+            _flat(arguments[count:]),
+            _flat(following),
+            int(condition),
+            kinds,
+            source_line(self.nested),
+        )
         results = iter(outer.loop(loop))
         return [
             np.array([next(results) for _ in range(array.size)], dtype=np.int64).reshape(array.shape)

@@ -173,9 +173,14 @@ class RodCode(Memory):
         return found
 
     def _evaluate(
-        self, outputs: Sequence[int] | np.ndarray, j: Any, wide: bool, state: dict[int, Any],
-        sums: Sums = ((), True), stores: Stores | None = None,
-    ) -> list[Value]:  # fmt: skip
+        self,
+        outputs: Sequence[int] | np.ndarray,
+        j: Any,
+        wide: bool,
+        state: dict[int, Any],
+        sums: Sums = ((), True),
+        stores: Stores | None = None,
+    ) -> list[Value]:
         """Write the operations of outputs at a place, and of arrays that are added (`Function.evaluate`)."""
         own = [int(each) for each in outputs]
         self._outputs = [*own, *(node for node, _ in sums[0])]
@@ -402,8 +407,10 @@ class RodCode(Memory):
             with self._places(self._count(count)) as j:
                 here, first = j if count == "ends" else j + self._count("ends"), 0
                 for array, size, at in (
-                    (y, e.ny, j), (state.z, e.nz, here), (state.f, e.numbers - e.ny - e.nz, here)
-                ):  # fmt: skip
+                    (y, e.ny, j),
+                    (state.z, e.nz, here),
+                    (state.f, e.numbers - e.ny - e.nz, here),
+                ):
                     for i in self._each(size):
                         yield i + first, here, self._wide(array, i, at)
                     first += size

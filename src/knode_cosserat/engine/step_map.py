@@ -115,12 +115,23 @@ class StepMap(EliminationCode):
         # without jumps, y at the points is part of the new record
         y = dataclasses.replace(records[-1], size=ny, count=self.room["points"], where="points")
         t = self.tangents = Tangents(
-            records, self.lasting[-1], many(numbers, "used"), many(nx, "used"), many(ny, "pieces"),
-            many(ny, "used between"), many(1, "pieces"), many(k, 1), many(ny * self.strands, 1),
-            many(ny, "pieces"), many(ny, "points"), many(self.own, "groups and tips"),
-            many(self.own, "groups"), y if self.far is None else many(ny, "points"), many(ny, "used"),
+            records,
+            self.lasting[-1],
+            many(numbers, "used"),
+            many(nx, "used"),
+            many(ny, "pieces"),
+            many(ny, "used between"),
+            many(1, "pieces"),
+            many(k, 1),
+            many(ny * self.strands, 1),
+            many(ny, "pieces"),
+            many(ny, "points"),
+            many(self.own, "groups and tips"),
+            many(self.own, "groups"),
+            y if self.far is None else many(ny, "points"),
+            many(ny, "used"),
             records[-1],
-        )  # fmt: skip
+        )
         #: the results of the equations at fixed y, by the names of their derivatives
         self.results = {"rates": t.rates, "far": t.far, "tip": t.tip, "base": t.base}
 
@@ -386,11 +397,13 @@ class StepMap(EliminationCode):
         """Add the changes of y at a point by those of its unknowns."""
         return [
             Add(
-                Entry(target, i, j), Entry(source, c, group), Entry(self.X, self._of_X(i, c), j),
+                Entry(target, i, j),
+                Entry(source, c, group),
+                Entry(self.X, self._of_X(i, c), j),
                 is_negative,
             )
             for i, c in zip(*map(np.ndarray.tolist, np.nonzero(self.nonzero_X)), strict=True)
-        ]  # fmt: skip
+        ]
 
     def _entry_at(self, matrix: Array, rows: int, i: int, c: int, j: Any = 0) -> Entry:
         """Return an entry of a matrix with rows in lanes."""
@@ -465,8 +478,9 @@ class StepMap(EliminationCode):
         stop = base.value + self._count("points of strand")
         return [
             PlaceLoop(base.value + (count * size + 1), stop, functools.partial(solve, first + count)),
-            PlaceLoop(0, count, group_back, descends=True), *solve(first, base),
-        ]  # fmt: skip
+            PlaceLoop(0, count, group_back, descends=True),
+            *solve(first, base),
+        ]
 
     # the new record
 

@@ -128,8 +128,9 @@ class _TangentCode(StepMap):
         f.call(self.linearise, f.arguments[0])
         for name, state in self._end_states():
             for array, nonzeros in (
-                (self.by_history[name], e.by_history[name]), (self.by_control[name], e.by_control[name])
-            ):  # fmt: skip
+                (self.by_history[name], e.by_history[name]),
+                (self.by_control[name], e.by_control[name]),
+            ):
                 for i, value in enumerate(self._evaluate(_nodes(nonzeros), 0, False, state)):
                     self._put(value, array, i)
 
@@ -209,7 +210,7 @@ class _TangentCode(StepMap):
             states[:, first.offset :],
             (len(states), lanes, len(self.lasting), self.counts["used"], first.size),
             [8 * each for each in strides],
-        )  # fmt: skip
+        )
         memory = self.settings.memory
         turned = [*((k + turns) % memory for k in range(memory)), memory]
         return found[:, :, turned] if turns else found

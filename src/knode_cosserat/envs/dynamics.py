@@ -259,9 +259,17 @@ def reset(spec: Spec, arrays: Arrays, key: Any) -> tuple[EpisodeState, Float[Any
     system = _assemble(spec, arrays, drawn[0], model, goal)
     measured = _noisy(arrays, noise_key, spec.output.value(system, *split_record(system, arrays.record)))
     state = EpisodeState(
-        arrays.history, goal, drawn, changes_at, model, jnp.tile(arrays.start, (spec.delay[1] + 1, 1)), delay,
-        jnp.tile(measured, (MEASURED, 1)), jnp.array(0), key,
-    )  # fmt: skip
+        arrays.history,
+        goal,
+        drawn,
+        changes_at,
+        model,
+        jnp.tile(arrays.start, (spec.delay[1] + 1, 1)),
+        delay,
+        jnp.tile(measured, (MEASURED, 1)),
+        jnp.array(0),
+        key,
+    )
     return state, observation(spec, arrays, state)
 
 
@@ -321,9 +329,9 @@ def finish_step(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, 
         y, z = split_record(system, jnp.where(solved, record, 0.0))
         key, noise_key = jax.random.split(state.key)
         positions = _noisy(arrays, noise_key, spec.output.value(system, y, z))
-        measured = jnp.concatenate([
-            jnp.where(solved, positions, state.measured[0])[None], state.measured[:-1]
-        ])  # fmt: skip
+        measured = jnp.concatenate(
+            [jnp.where(solved, positions, state.measured[0])[None], state.measured[:-1]]
+        )
         count = state.count + 1
         state = state._replace(measured=measured, count=count, key=key)
         tip = tip_of(system, y)
@@ -341,9 +349,16 @@ def finish_step(spec: Spec, arrays: Arrays, systems: Any, states: EpisodeState, 
         )
         truncated = (ending != Ending.RUNNING) & ~terminated
         transition = Transition(
-            observation(spec, arrays, state), jnp.where(usable, reward, 0.0).astype(jnp.float32), terminated,
-            truncated, ending, error, tip.position, clearance, state.commands[0],
-        )  # fmt: skip
+            observation(spec, arrays, state),
+            jnp.where(usable, reward, 0.0).astype(jnp.float32),
+            terminated,
+            truncated,
+            ending,
+            error,
+            tip.position,
+            clearance,
+            state.commands[0],
+        )
         return state, transition
 
     axes = (None if spec.is_shared else 0, *[0] * 4)

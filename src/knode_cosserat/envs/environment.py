@@ -43,10 +43,18 @@ class Environment:
     """
 
     def __init__(
-        self, task: Task, robot: System, randomisation: Randomisation | None = None,
-        limits: ControlLimits | None = None, *, dt: float = 0.05, duration: float = 10.0,
-        actions: Actions = "tension", bodies: tuple[float, ...] = (0.5, 1.0), seed: int = 0,
-    ):  # fmt: skip
+        self,
+        task: Task,
+        robot: System,
+        randomisation: Randomisation | None = None,
+        limits: ControlLimits | None = None,
+        *,
+        dt: float = 0.05,
+        duration: float = 10.0,
+        actions: Actions = "tension",
+        bodies: tuple[float, ...] = (0.5, 1.0),
+        seed: int = 0,
+    ):
         """Set up the environment; equilibria of the robot are computed for a survey of its reach.
 
         Args:
@@ -117,14 +125,30 @@ class Environment:
         at_start = start_of(equipped, "equilibrium", settings, dt)
         self.task, self.robot, self.randomisation = task, robot, randomisation
         self.spec = Spec(
-            task, dt, steps, actions, settings, BodyPositions(bodies), tuple(randomisation.parameters),
-            float(randomisation.change), (randomisation.delay[0], randomisation.delay[1]), len(models),
-        )  # fmt: skip
+            task,
+            dt,
+            steps,
+            actions,
+            settings,
+            BodyPositions(bodies),
+            tuple(randomisation.parameters),
+            float(randomisation.change),
+            (randomisation.delay[0], randomisation.delay[1]),
+            len(models),
+        )
         self.arrays = Arrays(
-            equipped, stacked, *randomisation.ends(equipped), within.low, within.high, within.rate,
-            within.safe, float(randomisation.noise), task.survey(robot, within, seed),
-            at_start.state.history, at_start.record,
-        )  # fmt: skip
+            equipped,
+            stacked,
+            *randomisation.ends(equipped),
+            within.low,
+            within.high,
+            within.rate,
+            within.safe,
+            float(randomisation.noise),
+            task.survey(robot, within, seed),
+            at_start.state.history,
+            at_start.record,
+        )
 
     @property
     def dt(self) -> float:

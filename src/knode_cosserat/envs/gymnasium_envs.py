@@ -81,8 +81,10 @@ class SingleEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._state, after = self.environment.step(self._state, action)
         ending = Ending(int(after.ending))
         info: dict[str, Any] = {
-            "error": float(after.error), "tip": np.asarray(after.tip), "control": np.asarray(after.control),
-        }  # fmt: skip
+            "error": float(after.error),
+            "tip": np.asarray(after.tip),
+            "control": np.asarray(after.control),
+        }
         if ending is not Ending.RUNNING:
             info["ending"] = ending.message
         ends = bool(after.terminated), bool(after.truncated)
@@ -186,9 +188,11 @@ class VectorEnv(gymnasium.vector.VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         terminated, truncated = np.array(after.terminated), np.array(after.truncated)
         reward = np.array(after.reward, dtype=np.float64)
         info: dict[str, Any] = {
-            "error": after.error, "tip": after.tip, "control": after.control,
+            "error": after.error,
+            "tip": after.tip,
+            "control": after.control,
             "ending": np.array(after.ending),
-        }  # fmt: skip
+        }
         restarted = np.flatnonzero(self._ended)
         self._seen = np.array(after.observation)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and len(restarted):

@@ -222,9 +222,13 @@ class Task(abc.ABC):
         reached, lateral = position[:SURVEYED][usable], frame[-1][:2]
         distance = np.linalg.norm((reached - position[-1]) @ lateral.T, axis=1)
         return Survey(
-            position[-1], frame[-1], reached, frame[:SURVEYED, 2][usable],
-            position[SURVEYED:-1][usable], np.quantile(distance, EASY),
-        )  # fmt: skip
+            position[-1],
+            frame[-1],
+            reached,
+            frame[:SURVEYED, 2][usable],
+            position[SURVEYED:-1][usable],
+            np.quantile(distance, EASY),
+        )
 
     def placed(self, system: System, goal: Any) -> System:
         """Return the system with the parts of an episode, such as its obstacles; by default unchanged."""

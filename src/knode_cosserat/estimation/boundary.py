@@ -23,9 +23,14 @@ class BoundaryObserver:
     """
 
     def __init__(
-        self, robot: System, dt: float, *, stiffness: float | None = None, damping: float | None = None,
+        self,
+        robot: System,
+        dt: float,
+        *,
+        stiffness: float | None = None,
+        damping: float | None = None,
         initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium",
-    ):  # fmt: skip
+    ):
         """Start at rest under zero control, or at the last row of a trajectory.
 
         Args:

@@ -73,10 +73,17 @@ class KalmanObserver:
     """
 
     def __init__(
-        self, robot: System, dt: float, output: Output, *, adapt: Sequence[Adapted | str] = (),
-        initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium", columns: int = 14,
-        control_deviation: float | Sequence[float] | None = None, start_deviation: float = 0.0,
-    ):  # fmt: skip
+        self,
+        robot: System,
+        dt: float,
+        output: Output,
+        *,
+        adapt: Sequence[Adapted | str] = (),
+        initial: Trajectory | Literal["equilibrium", "unstressed"] = "equilibrium",
+        columns: int = 14,
+        control_deviation: float | Sequence[float] | None = None,
+        start_deviation: float = 0.0,
+    ):
         """Start at rest under zero control, or at the last row of a trajectory.
 
         Args:
@@ -173,9 +180,14 @@ class KalmanObserver:
             for number, value, deviation in zip(numbers, values, spread, strict=True)
         ]
         return StateEstimate(
-            self.time, y, z, dict(zip(labels, values, strict=True)),
-            dict(zip(labels, deviations, strict=True)), self._innovation, self._surprise,
-        )  # fmt: skip
+            self.time,
+            y,
+            z,
+            dict(zip(labels, values, strict=True)),
+            dict(zip(labels, deviations, strict=True)),
+            self._innovation,
+            self._surprise,
+        )
 
     def predict(self, control: Float[np.ndarray, " c"]) -> None:
         """Advance the estimate by one time step under a control.

@@ -198,9 +198,12 @@ class OnlineModel:
         return tuple(sorted({int(k) for output in outputs for k in self._columns[output]}))
 
     def simulated(
-        self, x: Float[np.ndarray, " n"], past: StateHistory, controls: Float[np.ndarray, "T c"],
+        self,
+        x: Float[np.ndarray, " n"],
+        past: StateHistory,
+        controls: Float[np.ndarray, "T c"],
         stride: int = 1,
-    ) -> tuple[StateHistory, StepRows] | None:  # fmt: skip
+    ) -> tuple[StateHistory, StepRows] | None:
         """Return the last history and the rows of a motion in steps of `stride` dt; None if not solved."""
         moved, steps = self.moved(x), len(controls)
         if stride > 1:  # the states before the newest one are not at the distance of a step
@@ -215,9 +218,13 @@ class OnlineModel:
         return after, StepRows(*(leaf[0] for leaf in rows))
 
     def rollout(
-        self, belief: Belief, controls: Float[np.ndarray, "T c"], d_controls: Float[np.ndarray, "k T c"],
-        columns: tuple[int, ...], stride: int = 1,
-    ) -> tuple[MovedRobot, TangentMotion | None]:  # fmt: skip
+        self,
+        belief: Belief,
+        controls: Float[np.ndarray, "T c"],
+        d_controls: Float[np.ndarray, "k T c"],
+        columns: tuple[int, ...],
+        stride: int = 1,
+    ) -> tuple[MovedRobot, TangentMotion | None]:
         """Return the robot, and its motion with tangents of all rows; None if it was not solved.
 
         A tangent is that along a direction of the belief's spread, with the tangents of the controls beside
@@ -233,9 +240,13 @@ class OnlineModel:
             at_all_stages(self.robot, settings, each) for each in (controls, np.moveaxis(d_controls, 0, -1))
         )
         data = SolvedSteps(
-            moved.numbers, table_of(self.coefficients(stride), steps, float(past.t0)), own, *rows.every_stage,
-            np.asarray(past.records)[:, :used], np.asarray(past.rate)[:used],
-        )  # fmt: skip
+            moved.numbers,
+            table_of(self.coefficients(stride), steps, float(past.t0)),
+            own,
+            *rows.every_stage,
+            np.asarray(past.records)[:, :used],
+            np.asarray(past.rate)[:used],
+        )
         d_records, d_rate = (np.moveaxis(part, 0, -1) for part in (spread.records, spread.rate))
         last, (d_rows, _) = moved.tangents.solve(
             data, (moved.directions, spread.parameters.T), d_own, (d_records, d_rate)
@@ -305,9 +316,14 @@ def split_record(system: System, record: Any) -> tuple[Any, Any]:
 
 @functools.partial(jax.jit, static_argnames=("output", "columns"))
 def errors_along(
-    system: System, output: Output, records: Float[Any, "T N x"], d_records: Float[Any, "T ... k"],
-    references: Float[Any, "T p"], directions: Any = None, columns: tuple[int, ...] | None = None,
-) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:  # fmt: skip
+    system: System,
+    output: Output,
+    records: Float[Any, "T N x"],
+    d_records: Float[Any, "T ... k"],
+    references: Float[Any, "T p"],
+    directions: Any = None,
+    columns: tuple[int, ...] | None = None,
+) -> tuple[Float[Any, "T e"], Float[Any, "k T e"]]:
     """Return the errors of an output in every row, and their tangents; `directions` are k of the system.
 
     The tangents of records are those of all numbers (T, N, x, k), or of the `columns` (T, columns, k) among
@@ -356,9 +372,14 @@ class Predicted(NamedTuple):
 
 @functools.partial(jax.jit, static_argnames=("structure", "output", "columns"))
 def _output_rows(
-    structure: Structure, output: Output, columns: tuple[int, ...], numbers: Any, records: Any,
-    d_records: Any, measured: Any,
-) -> Any:  # fmt: skip
+    structure: Structure,
+    output: Output,
+    columns: tuple[int, ...],
+    numbers: Any,
+    records: Any,
+    d_records: Any,
+    measured: Any,
+) -> Any:
     """Return values of the output in every row, their errors, and the errors' tangents."""
     system = structure.system(numbers)
     values = jax.vmap(lambda record: output.value(system, *split_record(system, record)))(records)

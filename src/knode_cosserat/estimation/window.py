@@ -25,9 +25,15 @@ class MovingHorizonObserver(KalmanObserver):
     """
 
     def __init__(
-        self, robot: System, dt: float, output: Output, *, window: int = 5, corrections: int = 1,
+        self,
+        robot: System,
+        dt: float,
+        output: Output,
+        *,
+        window: int = 5,
+        corrections: int = 1,
         **options: Any,
-    ):  # fmt: skip
+    ):
         """Start at rest, or at the last row of a trajectory.
 
         Args:

@@ -179,11 +179,15 @@ def _lines(seen: View, label: str, robot: _Moved, i: int, count: int) -> tuple[l
     nothing: list[list[float]] = [[]] * len(seen.index)
     rods = [
         seen.axes.plot(
-            *nothing, color=colour, linewidth=width, solid_capstyle="round", animated=True,
+            *nothing,
+            color=colour,
+            linewidth=width,
+            solid_capstyle="round",
+            animated=True,
             label=label if label and k == 0 else None,
         )[0]
         for k in range(len(robot.curves))
-    ]  # fmt: skip
+    ]
     return rods, seen.axes.plot(*nothing, color=colour, linewidth=0.45 * width, alpha=0.7, animated=True)[0]
 
 

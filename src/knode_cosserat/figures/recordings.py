@@ -98,20 +98,31 @@ def _draw_tensions(axes: Any, recording: Recording) -> None:
         time = np.append(recording.command.time, max(end, recording.command.time[-1]))
         for k, tension in enumerate(recording.command.tension.T):
             axes.step(
-                time, np.append(tension, tension[-1]), where="post", linestyle=":", linewidth=1.1,
-                color=PALETTE[k % len(PALETTE)], label="commanded (dotted)" if k == 0 else None,
-            )  # fmt: skip
+                time,
+                np.append(tension, tension[-1]),
+                where="post",
+                linestyle=":",
+                linewidth=1.1,
+                color=PALETTE[k % len(PALETTE)],
+                label="commanded (dotted)" if k == 0 else None,
+            )
     if recording.tension is not None:
         for k, tension in enumerate(recording.tension.tension.T):
             axes.plot(
-                recording.tension.time, tension, linewidth=1.0, color=PALETTE[k % len(PALETTE)],
+                recording.tension.time,
+                tension,
+                linewidth=1.0,
+                color=PALETTE[k % len(PALETTE)],
                 label=f"tendon {k + 1}",
-            )  # fmt: skip
+            )
     axes.set_ylabel("tension [N]")
     axes.legend(
-        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=recording.tendons + 1, columnspacing=1.2,
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=recording.tendons + 1,
+        columnspacing=1.2,
         handlelength=1.8,
-    )  # fmt: skip
+    )
 
 
 def _draw_positions(axes: Any, recording: Recording) -> None:

@@ -61,14 +61,19 @@ def effects_of(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]
     for module in pkgutil.iter_modules(package.__path__):
         if module.name.endswith("_effects"):
             importlib.import_module(f"{package.__name__}.{module.name}")
-    return [effect for function in sorted(_libraries, key=_libraries.__getitem__)
-            for effect in function(nominal, usual)]  # fmt: skip
+    return [
+        effect
+        for function in sorted(_libraries, key=_libraries.__getitem__)
+        for effect in function(nominal, usual)
+    ]
 
 
 def library_model(
-    nominal: TendonRod, tension: Float[np.ndarray, "T c"], bodies: Iterable[float] = (),
+    nominal: TendonRod,
+    tension: Float[np.ndarray, "T c"],
+    bodies: Iterable[float] = (),
     more: Sequence[PossibleEffect] = (),
-) -> ParameterModel:  # fmt: skip
+) -> ParameterModel:
     """Return the model with all registered effects of a robot whose tendons run beside it.
 
     Args:
@@ -81,9 +86,10 @@ def library_model(
         offset = float(nominal.tendon_offset) or OFFSET * float(nominal.section.radius)
         nominal = RoutedTendonRobot.like(nominal, tendon_offset=offset)
     usual = Usual(
-        float(np.nanmean(tension)), float(np.nanmax(tension.sum(axis=1))),
+        float(np.nanmean(tension)),
+        float(np.nanmax(tension.sum(axis=1))),
         tuple(float(at) for at in bodies if at > 0.0),
-    )  # fmt: skip
+    )
     return ParameterModel(nominal, [*effects_of(nominal, usual), *more])
 
 

@@ -80,9 +80,12 @@ class Evaluation:
 
 
 def coverage(
-    members: Iterable[System], measured: Recording | Measurements, level: float = 0.9, *,
+    members: Iterable[System],
+    measured: Recording | Measurements,
+    level: float = 0.9,
+    *,
     space: str | SpaceScheme = "lobatto4",
-) -> float:  # fmt: skip
+) -> float:
     """Return the fraction of the measured positions within the spread of several models.
 
     Each starts in its own equilibrium under the initial tensions. The interval contains one more model with
@@ -109,9 +112,12 @@ def coverage(
 
 
 def predict(
-    robot: System, measured: Recording | Measurements, *, space: str | SpaceScheme = "lobatto4",
+    robot: System,
+    measured: Recording | Measurements,
+    *,
+    space: str | SpaceScheme = "lobatto4",
     recovery: float | None = None,
-) -> Trajectory:  # fmt: skip
+) -> Trajectory:
     """Return the motion of a robot under measured tensions, or motor angles, in the rows of the recording.
 
     It starts in the equilibrium before the first row. Rows of equilibria are separate equilibria. Latencies
@@ -142,15 +148,26 @@ def predict(
             with_stability=False,
         )
     return simulated_rows(
-        robot, measured.tension[:-1], measured.dt, initial, measured.initial_tension, measured.continuous,
-        space, recovery,
-    )  # fmt: skip
+        robot,
+        measured.tension[:-1],
+        measured.dt,
+        initial,
+        measured.initial_tension,
+        measured.continuous,
+        space,
+        recovery,
+    )
 
 
 def evaluate(
-    robot: System, measured: Recording | Measurements, *, every: int = 1, last: int | None = None,
-    space: str | SpaceScheme = "lobatto4", recovery: float | None = RECOVERY,
-) -> Evaluation:  # fmt: skip
+    robot: System,
+    measured: Recording | Measurements,
+    *,
+    every: int = 1,
+    last: int | None = None,
+    space: str | SpaceScheme = "lobatto4",
+    recovery: float | None = RECOVERY,
+) -> Evaluation:
     """Predict a recording from the equilibrium under its initial tensions, and compare.
 
     Rows of equilibria (`measured.static`) are predicted separately.

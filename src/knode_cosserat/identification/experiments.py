@@ -236,11 +236,20 @@ def of_measurements(
     if measured.unstressed:
         data[0] = np.nan
     return Experiment(
-        measured.dt, control, output, data, None if measured.unstressed else held,
-        "unstressed" if measured.unstressed else "equilibrium", settings, name,
-        int(moving[0]) if len(moving) and not measured.static else 0, measured.static, measured.continuous,
-        steps_per_row(measured.dt, measured.continuous), True,
-    )  # fmt: skip
+        measured.dt,
+        control,
+        output,
+        data,
+        None if measured.unstressed else held,
+        "unstressed" if measured.unstressed else "equilibrium",
+        settings,
+        name,
+        int(moving[0]) if len(moving) and not measured.static else 0,
+        measured.static,
+        measured.continuous,
+        steps_per_row(measured.dt, measured.continuous),
+        True,
+    )
 
 
 def _measured(measured: Measurements, robot: System) -> tuple[Output, np.ndarray]:
@@ -351,7 +360,14 @@ def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
     held = np.concatenate([control[1:], control[-1:]])
     nodes, seen = position.shape[1], np.ones((len(position), position.shape[1] - 1), dtype=bool)
     return Measurements(
-        time=np.asarray(trajectory.time), tension=held, fractions=np.arange(1, nodes) / (nodes - 1),
-        position=position[:, 1:], quaternion=quaternion[:, 1:], measured=seen,
-        simulated=True, source=name, initial_tension=control[0], unstressed=begins_unstressed(trajectory),
-    )  # fmt: skip
+        time=np.asarray(trajectory.time),
+        tension=held,
+        fractions=np.arange(1, nodes) / (nodes - 1),
+        position=position[:, 1:],
+        quaternion=quaternion[:, 1:],
+        measured=seen,
+        simulated=True,
+        source=name,
+        initial_tension=control[0],
+        unstressed=begins_unstressed(trajectory),
+    )

@@ -142,9 +142,13 @@ class _Poses(NamedTuple):
 
 
 def with_residual(
-    nominal: System, recordings: Sequence[Recording | Measurements], identified: Identified, *,
-    space: str | SpaceScheme = "lobatto4", progress: Tell | None = None,
-) -> LearnedResidual:  # fmt: skip
+    nominal: System,
+    recordings: Sequence[Recording | Measurements],
+    identified: Identified,
+    *,
+    space: str | SpaceScheme = "lobatto4",
+    progress: Tell | None = None,
+) -> LearnedResidual:
     """Learn a passive residual on an identified robot from the recordings that it was identified from.
 
     Args:

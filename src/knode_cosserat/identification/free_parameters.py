@@ -217,8 +217,16 @@ def _parameter_effect(owner: System, name: str, parameter: Parameter) -> Possibl
     labels = [f"{name}[{k}]" for k in range(value.size)] if value.ndim else [name]
     log = parameter.low > 0.0
     numbers = [
-        Number(label, parameter.unit, at, 1.0 if log else abs(at) or 1.0, parameter.low, parameter.high, log,
-               flat=True)
+        Number(
+            label,
+            parameter.unit,
+            at,
+            1.0 if log else abs(at) or 1.0,
+            parameter.low,
+            parameter.high,
+            log,
+            flat=True,
+        )
         for label, at in zip(labels, np.atleast_1d(value).tolist(), strict=True)
-    ]  # fmt: skip
+    ]
     return PossibleEffect(name, tuple(numbers))

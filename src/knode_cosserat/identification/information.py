@@ -55,9 +55,11 @@ def normal_equations(
 
 
 def dispersion(
-    rollouts: Sequence[Rollout], units: Sequence[np.ndarray], spacing: Sequence[float],
+    rollouts: Sequence[Rollout],
+    units: Sequence[np.ndarray],
+    spacing: Sequence[float],
     free: Bool[np.ndarray, " n"],
-) -> float:  # fmt: skip
+) -> float:
     """Return the number of differences that count as one: they are correlated in time and between bodies.
 
     It is the mean ratio of the variance of an estimate to that from independent differences. The

@@ -101,9 +101,12 @@ class Misfit:
         return jax.tree.map(with_moving, _system(self.model.robot, np.asarray(x, dtype=float)), self._moving)
 
     def differences(
-        self, x: Float[np.ndarray, " n"], rows: int | None = None, which: Sequence[int] | None = None,
+        self,
+        x: Float[np.ndarray, " n"],
+        rows: int | None = None,
+        which: Sequence[int] | None = None,
         offsets: Sequence[Any] | None = None,
-    ) -> list[Rollout | None]:  # fmt: skip
+    ) -> list[Rollout | None]:
         """Return the rollouts of all experiments, or of those with the given numbers; None if one failed.
 
         Args:

@@ -36,9 +36,11 @@ def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffec
     zero, taken_in, compliance = (
         np.zeros(count) if stated is None else np.asarray(stated)
         for stated, count in (
-            (reels.zero, reels.motor_count(tendons)), (reels.taken_in, tendons), (reels.compliance, tendons)
+            (reels.zero, reels.motor_count(tendons)),
+            (reels.taken_in, tendons),
+            (reels.compliance, tendons),
         )
-    )  # fmt: skip
+    )
     radii = None if reels.radius is None else np.asarray(reels.radius, dtype=float)
     widths = np.broadcast_to(TAKEN_IN * L / (1.0 if radii is None else radii), zero.shape)
     lengths = tuple(

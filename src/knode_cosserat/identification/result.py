@@ -159,8 +159,10 @@ class Identified:
             "95 % intervals: " + ("; ".join(numbers) or "none"),
         ]
         for name, errors in (
-            ("nominal", self.nominal_error), ("identified", self.error), ("held out", self.held_out_error),
-        ):  # fmt: skip
+            ("nominal", self.nominal_error),
+            ("identified", self.error),
+            ("held out", self.held_out_error),
+        ):
             known = [error for error in errors.values() if error is not None]
             if known:
                 parts.append(f"tip error, {name}: {1e3 * sum(known) / len(known):.3g} mm")
@@ -176,10 +178,15 @@ class Identified:
             effect = "" if it.effect in (it.label, it.label.partition("[")[0]) else it.effect
             rows.append(
                 (
-                    effect, it.label, it.unit, f"{it.nominal:.6g}", value, f"{low} to {high}",
+                    effect,
+                    it.label,
+                    it.unit,
+                    f"{it.nominal:.6g}",
+                    value,
+                    f"{low} to {high}",
                     "held by its prior" if it.held else "" if it.probability >= SURE else "undecided",
                 )
-            )  # fmt: skip
+            )
         if not any(row[0] for row in rows[1:]):
             rows = [row[1:] for row in rows]
         lines = _table(rows)
@@ -240,10 +247,17 @@ def estimates_of(
             error = float(abs(number.slope(value)) * spread[k])
             estimates.append(
                 Estimate(
-                    name, number.label, number.unit, number.nominal, value, (first, last), held, error,
+                    name,
+                    number.label,
+                    number.unit,
+                    number.nominal,
+                    value,
+                    (first, last),
+                    held,
+                    error,
                     posterior.probability[name],
                 )
-            )  # fmt: skip
+            )
     return tuple(estimates)
 
 

@@ -21,9 +21,12 @@ MOST_INFLATED = 30.0
 
 
 def sampled(
-    search: ParameterSearch, at: tuple[np.ndarray, Sequence[str]], posterior: Posterior,
-    held_out: Sequence[Float[np.ndarray, "rows e"]], trained: Any,
-) -> Ensemble | None:  # fmt: skip
+    search: ParameterSearch,
+    at: tuple[np.ndarray, Sequence[str]],
+    posterior: Posterior,
+    held_out: Sequence[Float[np.ndarray, "rows e"]],
+    trained: Any,
+) -> Ensemble | None:
     """Return samples of the robots that agree with the data, and can follow their controls; None if none can.
 
     Their spread is, in root mean square, at least that of the differences of held-out recordings, or of all

@@ -211,9 +211,12 @@ class ParameterSearch:
         return point
 
     def over(
-        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], parts: Sequence[float],
+        self,
+        x: Float[np.ndarray, " n"],
+        free: Bool[np.ndarray, " n"],
+        parts: Sequence[float],
         skipped: int = 0,
-    ) -> Float[np.ndarray, " n"]:  # fmt: skip
+    ) -> Float[np.ndarray, " n"]:
         """Return coordinates after searches over parts of the longest motion, without the first ones."""
         used = [] if self.separate_rows else [part for part in parts if part or not self.exact]
         for rows in [*dict.fromkeys(map(self.rows_of, used))][skipped:]:
@@ -233,10 +236,15 @@ class ParameterSearch:
         return int(measured[:count][-1]) if count and len(measured) else count
 
     def run(
-        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset = ALL,
-        effort: tuple[int, float] = FINE, scale: Float[np.ndarray, "R G"] | None = None,
-        equations: Equations = "free", near: Float[np.ndarray, " n"] | None = None,
-    ) -> SearchEnd:  # fmt: skip
+        self,
+        x: Float[np.ndarray, " n"],
+        free: Bool[np.ndarray, " n"],
+        subset: Subset = ALL,
+        effort: tuple[int, float] = FINE,
+        scale: Float[np.ndarray, "R G"] | None = None,
+        equations: Equations = "free",
+        near: Float[np.ndarray, " n"] | None = None,
+    ) -> SearchEnd:
         """Return the end of a search (Levenberg-Marquardt) from a point.
 
         Args:
@@ -319,10 +327,15 @@ class ParameterSearch:
             return None
 
     def _searched(
-        self, x: Float[np.ndarray, " n"], free: Bool[np.ndarray, " n"], subset: Subset,
-        effort: tuple[int, float], scale: Float[np.ndarray, "R G"] | None, equations: Equations,
+        self,
+        x: Float[np.ndarray, " n"],
+        free: Bool[np.ndarray, " n"],
+        subset: Subset,
+        effort: tuple[int, float],
+        scale: Float[np.ndarray, "R G"] | None,
+        equations: Equations,
         near: Float[np.ndarray, " n"] | None,
-    ) -> SearchEnd:  # fmt: skip
+    ) -> SearchEnd:
         most, fall = effort
         begun = None if near is None else self.solved(near, subset)
         rollouts = self.solved(x, subset, begun and [it.offset for it in begun])
@@ -461,9 +474,16 @@ class _Descent:
         if not exact and not rough and self._promise(start, low, high) < fall:
             return 0, True
         ended = least_squares(
-            self.values, start, self.slopes, (low, high), method=METHOD,
-            ftol=fall, xtol=1e-9 if exact else 1e-4, gtol=1e-15, max_nfev=most + 1,
-        )  # fmt: skip
+            self.values,
+            start,
+            self.slopes,
+            (low, high),
+            method=METHOD,
+            ftol=fall,
+            xtol=1e-9 if exact else 1e-4,
+            gtol=1e-15,
+            max_nfev=most + 1,
+        )
         solved = self._at(ended.x)
         assert solved is not None
         self.x, self.rollouts = self._whole(ended.x), solved
@@ -485,8 +505,12 @@ class _Descent:
         values, slopes = self.values(at), self.slopes(at)
         lengths = np.linalg.norm(slopes, axis=0)
         alone = np.linalg.norm(values) / np.where(lengths > 0.0, lengths, np.inf)
-        zero = np.array([not number.logarithmic and number.value(at) == 0.0
-                         for number, at in zip(numbers, begin, strict=True)])  # fmt: skip
+        zero = np.array(
+            [
+                not number.logarithmic and number.value(at) == 0.0
+                for number, at in zip(numbers, begin, strict=True)
+            ]
+        )
         return np.where(zero & (alone > 0.0), alone, 1.0)
 
     def _whole(self, step: np.ndarray) -> np.ndarray:

@@ -67,10 +67,15 @@ def stepped(
 
 
 def simulated_rows(
-    robot: System, tension: Float[np.ndarray, "T c"], dt: float, start: Trajectory | str | None,
-    initial: Float[np.ndarray, " c"] | None, continuous: bool, space: str | SpaceScheme,
+    robot: System,
+    tension: Float[np.ndarray, "T c"],
+    dt: float,
+    start: Trajectory | str | None,
+    initial: Float[np.ndarray, " c"] | None,
+    continuous: bool,
+    space: str | SpaceScheme,
     recovery: float | None,
-) -> Trajectory:  # fmt: skip
+) -> Trajectory:
     """Return a motion in rows under the tensions (or motor angles) of a recording.
 
     Args:
@@ -90,8 +95,13 @@ def simulated_rows(
     tension = stepped(tension, tension[0] if initial is None else initial, count, continuous)
     acting = remove_delay(robot, tension, dt / count, initial)
     motion = simulate(
-        fix_grid(robot), acting, dt / count, time=time_scheme(dt, continuous), start="paper", space=space,
+        fix_grid(robot),
+        acting,
+        dt / count,
+        time=time_scheme(dt, continuous),
+        start="paper",
+        space=space,
         initial="equilibrium" if start is None else start,  # type: ignore[arg-type]
         recovery_budget=recovery,
-    )  # fmt: skip
+    )
     return motion[::count] if count > 1 else motion

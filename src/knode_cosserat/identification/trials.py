@@ -32,9 +32,11 @@ RECOVERY = 2.0
 
 
 def failed_trial(
-    robot: System, data: Sequence[Experiment], space: str | SpaceScheme,
+    robot: System,
+    data: Sequence[Experiment],
+    space: str | SpaceScheme,
     motions: list[Trajectory] | None = None,
-) -> str | None:  # fmt: skip
+) -> str | None:
     """Return the reason why a robot is not accepted; None if it passes all trials.
 
     It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
@@ -44,11 +46,14 @@ def failed_trial(
     # a tendon does not push; a motor turns either way
     low = 0.0 if robot.control_layout.names[0] == "tension" else -np.inf
     trials = [
-        (f"tensions of {it.name} at {amplitude:g} times their amplitude", it,
-         np.maximum(it.held + amplitude * (it.control - it.held), low))
+        (
+            f"tensions of {it.name} at {amplitude:g} times their amplitude",
+            it,
+            np.maximum(it.held + amplitude * (it.control - it.held), low),
+        )
         for amplitude in AMPLITUDES
         for it in data
-    ]  # fmt: skip
+    ]
     for k, (words, like, tension) in enumerate(
         [*trials, ("random tensions", data[0], random_controls(data, SECONDS))]
     ):

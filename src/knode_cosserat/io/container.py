@@ -135,10 +135,14 @@ def write(path: str | Path, content: bytes, kind: Kind) -> None:
 
 
 def encode(
-    kind: Kind, facts: Mapping[str, Any], *, variables: Mapping[str, Variable] | None = None,
-    attributes: Mapping[str, Any] | None = None, classes: Mapping[str, type] | None = None,
+    kind: Kind,
+    facts: Mapping[str, Any],
+    *,
+    variables: Mapping[str, Variable] | None = None,
+    attributes: Mapping[str, Any] | None = None,
+    classes: Mapping[str, type] | None = None,
     others: bool = False,
-) -> bytes:  # fmt: skip
+) -> bytes:
     """Return the bytes of a file. It is made in memory: on a full disk HDF5 crashes the interpreter.
 
     Args:
@@ -403,10 +407,13 @@ def _read_arrays(file: Any, size: int) -> tuple[dict[str, np.ndarray], dict[str,
             f"size; {MORE}"
         )
     variables, arrays = (
-        {name: np.asarray(item[()]) for name, item in items.items() if item.dtype.str in TYPES and not
-         str(item.attrs.get("NAME", "")).startswith(_ONLY_DIMENSION)}
+        {
+            name: np.asarray(item[()])
+            for name, item in items.items()
+            if item.dtype.str in TYPES and not str(item.attrs.get("NAME", "")).startswith(_ONLY_DIMENSION)
+        }
         for items in groups
-    )  # fmt: skip
+    )
     return variables, arrays
 
 

@@ -277,11 +277,14 @@ class FitConfig(_Options):
         return cls(
             NetworkOptions(hidden=hidden, history=history, convex=False, standardised=True),
             Training(
-                epochs=epochs, learning_rate=3e-3, schedule="cosine", loss="standardised",
+                epochs=epochs,
+                learning_rate=3e-3,
+                schedule="cosine",
+                loss="standardised",
                 weight_decay=weight_decay,
             ),
             seed=seed,
-        )  # fmt: skip
+        )
 
     @classmethod
     def network_recordings(cls, seed: int | tuple[int, ...] = 0, *, hidden: int = 8) -> Self:

@@ -102,7 +102,11 @@ def _function(term: Term, axis: int, expansion: Expansion) -> str:
     x, norm = f"{term.name}{_axis(term.size, axis)}", f"|{term.name}|"
     scale = float(expansion.scales[term.scale]) / (term.slope or 1.0)
     return {
-        "linear": x, "square": f"|{x}| {x}", "cube": f"{x}³", "square_norm": f"{norm} {x}",
-        "cube_norm": f"{norm}² {x}", "saturating": f"{scale:.4g} tanh({x} / {scale:.4g})",
+        "linear": x,
+        "square": f"|{x}| {x}",
+        "cube": f"{x}³",
+        "square_norm": f"{norm} {x}",
+        "cube_norm": f"{norm}² {x}",
+        "saturating": f"{scale:.4g} tanh({x} / {scale:.4g})",
         "saturating_norm": f"{x} / √(1 + {norm}² / {scale:.4g}²)",
-    }[term.form]  # fmt: skip
+    }[term.form]

@@ -67,9 +67,12 @@ class KNODE(Wrapped):
     trained: TrainedRange | None = None
 
     def __init__(
-        self, knowledge: System, residual: Residual, about: About | None = None,
+        self,
+        knowledge: System,
+        residual: Residual,
+        about: About | None = None,
         trained: TrainedRange | None = None,
-    ):  # fmt: skip
+    ):
         self.knowledge = knowledge
         self.residual = residual
         self.about = about or About()
@@ -172,9 +175,17 @@ MOST_TEXT = 100_000
 CLASSES: dict[str, type] = {
     cls.__name__: cls
     for cls in (
-        Network, Nothing, Passive, NaturalUnits, Structured, Load, Expansion, Term, TrainedRange,
+        Network,
+        Nothing,
+        Passive,
+        NaturalUnits,
+        Structured,
+        Load,
+        Expansion,
+        Term,
+        TrainedRange,
     )
-}  # fmt: skip
+}
 
 
 def load_model(path: str | Path, *, knowledge: System | None = None, residuals: Iterable[type] = ()) -> KNODE:

@@ -206,9 +206,15 @@ def passive(knowledge: System, controls: Float[np.ndarray, "T c"], seed: int = 0
     sizes = NaturalUnits(float(np.nanmean(np.abs(controls))) or 1.0, force, moment, velocity, damping)
     rng = np.random.default_rng(seed)
     return Passive(
-        jnp.zeros((3, 3)), jnp.zeros((2, 2, count)), jnp.zeros((hidden, 5)), jnp.zeros(3), jnp.zeros(hidden),
-        sizes, rng.normal(size=(hidden, count + 2)), rng.normal(size=(hidden, SEEN)),
-    )  # fmt: skip
+        jnp.zeros((3, 3)),
+        jnp.zeros((2, 2, count)),
+        jnp.zeros((hidden, 5)),
+        jnp.zeros(3),
+        jnp.zeros(hidden),
+        sizes,
+        rng.normal(size=(hidden, count + 2)),
+        rng.normal(size=(hidden, SEEN)),
+    )
 
 
 def require_bending(knowledge: System) -> None:

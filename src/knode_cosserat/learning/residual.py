@@ -203,9 +203,17 @@ def network(knowledge: System, options: NetworkOptions, key: Any, c0: Any = None
     if options.unit_quaternions and "h" in layout.names:
         quaternion = layout.slice("h").start, layout.slice("h").stop
     return Network(
-        first, biases[0], second, biases[1], jnp.zeros(inputs), jnp.ones(inputs), jnp.ones(outputs),
-        options.convex, c0 if options.history else None, quaternion,
-    )  # fmt: skip
+        first,
+        biases[0],
+        second,
+        biases[1],
+        jnp.zeros(inputs),
+        jnp.ones(inputs),
+        jnp.ones(outputs),
+        options.convex,
+        c0 if options.history else None,
+        quaternion,
+    )
 
 
 def input_layout(knowledge: System, history: bool) -> Layout:

@@ -251,9 +251,15 @@ def rollout_errors(nominal: System, model: System, trajectory: Trajectory) -> tu
             # the training data have the same grid
             warnings.simplefilter("ignore")
             motion = simulate(
-                system, np.asarray(trajectory.control)[first:], trajectory.dt, time=settings.time or "bdf2",
-                space=settings.space, start=settings.start, initial=trajectory[:first], on_failure="return",
-            )  # fmt: skip
+                system,
+                np.asarray(trajectory.control)[first:],
+                trajectory.dt,
+                time=settings.time or "bdf2",
+                space=settings.space,
+                start=settings.start,
+                initial=trajectory[:first],
+                on_failure="return",
+            )
         apart = (np.asarray(motion.y)[1:] - np.asarray(trajectory.y)[first:]) / scale
         errors.append(float(np.sqrt(np.mean(apart**2))) if motion.all_valid else float("inf"))
     if np.isinf(errors[1]):

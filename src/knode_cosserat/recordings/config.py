@@ -77,9 +77,13 @@ SENSOR_UNITS: dict[str, dict[str, float]] = {
 }
 #: axes of motion capture that point up, with the rotation vector (rad) that turns them to z
 UP: dict[str, Vector] = {
-    "z": (0.0, 0.0, 0.0), "y": (math.pi / 2, 0.0, 0.0), "x": (0.0, -math.pi / 2, 0.0),
-    "-z": (math.pi, 0.0, 0.0), "-y": (-math.pi / 2, 0.0, 0.0), "-x": (0.0, math.pi / 2, 0.0),
-}  # fmt: skip
+    "z": (0.0, 0.0, 0.0),
+    "y": (math.pi / 2, 0.0, 0.0),
+    "x": (0.0, -math.pi / 2, 0.0),
+    "-z": (math.pi, 0.0, 0.0),
+    "-y": (-math.pi / 2, 0.0, 0.0),
+    "-x": (0.0, math.pi / 2, 0.0),
+}
 #: topics of the sources that a map of columns stands for
 MAPPED = {"tensions": "tension", "commands": "command", "motors": "motor"}
 

@@ -28,9 +28,20 @@ if TYPE_CHECKING:
 
 #: units of length in m
 LENGTHS = {
-    "m": 1.0, "meters": 1.0, "metres": 1.0, "cm": 1e-2, "centimeters": 1e-2, "centimetres": 1e-2, "mm": 1e-3,
-    "millimeters": 1e-3, "millimetres": 1e-3, "in": 0.0254, "inches": 0.0254, "ft": 0.3048, "feet": 0.3048,
-}  # fmt: skip
+    "m": 1.0,
+    "meters": 1.0,
+    "metres": 1.0,
+    "cm": 1e-2,
+    "centimeters": 1e-2,
+    "centimetres": 1e-2,
+    "mm": 1e-3,
+    "millimeters": 1e-3,
+    "millimetres": 1e-3,
+    "in": 0.0254,
+    "inches": 0.0254,
+    "ft": 0.3048,
+    "feet": 0.3048,
+}
 #: largest number of columns: unlabelled markers that come and go have three each
 MOST_COLUMNS = 20_000
 #: beginnings of the names of markers that the motion capture did not recognise

@@ -264,8 +264,10 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str]) -> dict[str, l
             raise RecordingError(f"the columns of the sensor {sensor.topic} are missing; name them")
         titles[sensor.topic] = list(sensor.columns)
     for tendons, named in (
-        (config.tension, mapped.tensions), (config.motors, mapped.motors), (config.command, mapped.commands),
-    ):  # fmt: skip
+        (config.tension, mapped.tensions),
+        (config.motors, mapped.motors),
+        (config.command, mapped.commands),
+    ):
         if tendons is not None:
             count = len(tendons.order)
             usual = tension_titles(tendons.topic, tendons.unit, count)

@@ -54,13 +54,21 @@ class RigidBody(Part):
     name: str = text("name, by which ends refer to it")
     mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
     inertia: Any = parameter(
-        "kg m2", "inertia about its centre of mass, in its frame", shape="matrix", low=0.0, high=1e6,
+        "kg m2",
+        "inertia about its centre of mass, in its frame",
+        shape="matrix",
+        low=0.0,
+        high=1e6,
         default=0.0,
-    )  # fmt: skip
+    )
     force: Any = parameter(
-        "N", "load on its centre of mass, global frame", shape="vector", low=-1e6, high=1e6,
+        "N",
+        "load on its centre of mass, global frame",
+        shape="vector",
+        low=-1e6,
+        high=1e6,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
     moment: Any = parameter(
         "N m", "moment on it, global frame", shape="vector", low=-1e6, high=1e6, default=(0.0, 0.0, 0.0)
     )
@@ -112,9 +120,13 @@ class Assembly(System):
         "contacts of neighbouring rods", NeighbourContact, many=True, default=()
     )
     gravity: Any = parameter(
-        "m/s2", "gravitational acceleration, global frame", shape="vector", low=-100.0, high=100.0,
+        "m/s2",
+        "gravitational acceleration, global frame",
+        shape="vector",
+        low=-100.0,
+        high=100.0,
         default=(0.0, 0.0, -9.81),
-    )  # fmt: skip
+    )
 
     @functools.cached_property
     def members(self) -> tuple[SlenderRod, ...]:
@@ -206,13 +218,14 @@ class Assembly(System):
         return Layout(
             *(
                 field._replace(
-                    name=f"{part.name}_{field.name}", meaning=f"{field.meaning}, {part.name}",
+                    name=f"{part.name}_{field.name}",
+                    meaning=f"{field.meaning}, {part.name}",
                     frame=field.frame and f"{part.name}_{field.frame}",
                 )
                 for part, layout in every
                 for field in layout.fields
             )
-        )  # fmt: skip
+        )
 
     @functools.cached_property
     def y_layout(self) -> Layout:  # type: ignore[override]

@@ -50,9 +50,12 @@ class Chambers(Stretched, Effect):
     radius: Any = parameter("m", "radius of round chambers", low=1e-6, high=1.0, default=None)
     area: Any = parameter("m2", "A₀, area of chambers of another shape", low=1e-12, high=1.0, default=None)
     twist: Any = parameter(
-        "rad", "angle by which they turn about the rod from base to tip; by default they are straight",
-        low=-1e3, high=1e3, default=None,
-    )  # fmt: skip
+        "rad",
+        "angle by which they turn about the rod from base to tip; by default they are straight",
+        low=-1e3,
+        high=1e3,
+        default=None,
+    )
     area_by_stretch: Any = parameter(
         "", "α, relative change of the area by the stretch", low=-10.0, high=10.0, default=None
     )
@@ -61,8 +64,9 @@ class Chambers(Stretched, Effect):
     )
     drive: str = choice(
         "control: pressure (Pa), or volume that a pump delivers (m3), of a liquid or of a gas",
-        ("pressure", "liquid", "gas"), "pressure",
-    )  # fmt: skip
+        ("pressure", "liquid", "gas"),
+        "pressure",
+    )
     lowest: Any = parameter("Pa", "lowest pressure that a control may have", low=-1e9, high=0.0, default=None)
     highest: Any = parameter(
         "Pa", "highest pressure that a control may have", low=0.0, high=1e9, default=None
@@ -186,8 +190,9 @@ class Chambers(Stretched, Effect):
         volume = self.rest_area * sizes["p"]
         return {
             self._name(rod, "pressure"): sizes["n"] / self.rest_area,
-            self._name(rod, "volume"): volume, self._name(rod, "supply"): volume,
-        }  # fmt: skip
+            self._name(rod, "volume"): volume,
+            self._name(rod, "supply"): volume,
+        }
 
     def rest_y(self, rod: Any, s: Any) -> Fields:
         """Return the volume in the unloaded robot from the base to s."""

@@ -52,9 +52,13 @@ class _Immersed(Load):
 
     density: Any = parameter("kg/m3", "density of the fluid", low=0.0, high=25e3, default=1000.0)
     stream: Any = parameter(
-        "m/s", "velocity of the undisturbed fluid, global frame", shape="vector", low=-100.0, high=100.0,
+        "m/s",
+        "velocity of the undisturbed fluid, global frame",
+        shape="vector",
+        low=-100.0,
+        high=100.0,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
 
     def relative(self, motion: Motion) -> Float[Any, "3"]:
         """Return the velocity of the rod relative to the stream (m/s), material frame."""
@@ -68,9 +72,12 @@ class Fluid(_Immersed):
     damps: ClassVar[bool] = True
 
     added_mass: Any = parameter(
-        "", "c, mass that moves with the rod across its axis, over the displaced mass", low=0.0, high=100.0,
+        "",
+        "c, mass that moves with the rod across its axis, over the displaced mass",
+        low=0.0,
+        high=100.0,
         default=1.0,
-    )  # fmt: skip
+    )
     drag: Any = parameter(
         "", "C_D, coefficient of the pressure drag across the rod", low=0.0, high=100.0, default=1.1
     )
@@ -105,9 +112,12 @@ class Tail(_Immersed, PointLoad):
     damps: ClassVar[bool] = True
 
     span: Any = parameter(
-        "m", "b, depth of the trailing edge across the motion; a round rod's diameter", low=0.0, high=10.0,
+        "m",
+        "b, depth of the trailing edge across the motion; a round rod's diameter",
+        low=0.0,
+        high=10.0,
         default=0.0,
-    )  # fmt: skip
+    )
 
     def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
         """Return the force at the edge."""

@@ -35,9 +35,13 @@ class SpinningFrame(Effect):
 
     rate: Any = parameter("rad/s", "rate of rotation", low=-1e5, high=1e5)
     axis: Any = parameter(
-        "1", "direction of the axis, of any length", shape="direction", low=-1e3, high=1e3,
+        "1",
+        "direction of the axis, of any length",
+        shape="direction",
+        low=-1e3,
+        high=1e3,
         default=(0.0, 0.0, 1.0),
-    )  # fmt: skip
+    )
     point: Any = parameter(
         "m", "a point of the axis", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0)
     )
@@ -58,9 +62,13 @@ class SpinningFrame(Effect):
         Q, r = self.turn(point.t), p - self.point
         carried, spin = dot(R.T, cross(self.spin, r)), dot(R.T, self.spin)
         return Motion(
-            self.point + dot(Q, r), Q @ R, q + carried, w + spin,
-            q_t - cross(w, carried) + cross(spin, q), w_t - cross(w, spin),
-        )  # fmt: skip
+            self.point + dot(Q, r),
+            Q @ R,
+            q + carried,
+            w + spin,
+            q_t - cross(w, carried) + cross(spin, q),
+            w_t - cross(w, spin),
+        )
 
     def seen(self, t: Any, vector: Float[Any, "3"]) -> Float[Any, "3"]:
         """Return a vector of the global frame in this frame."""

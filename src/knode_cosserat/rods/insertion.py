@@ -65,13 +65,19 @@ class Insertion(Effect):
     actuates: ClassVar[bool] = True
 
     reserve: Any = parameter(
-        "m", "length behind the hole without insertion; the rod cannot be inserted by more", low=0.0,
-        high=20.0, default=0.0,
-    )  # fmt: skip
-    retraction: Any = parameter(
-        "m", "largest length to draw back into the hole, less than the robot's length", low=0.0, high=20.0,
+        "m",
+        "length behind the hole without insertion; the rod cannot be inserted by more",
+        low=0.0,
+        high=20.0,
         default=0.0,
-    )  # fmt: skip
+    )
+    retraction: Any = parameter(
+        "m",
+        "largest length to draw back into the hole, less than the robot's length",
+        low=0.0,
+        high=20.0,
+        default=0.0,
+    )
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
@@ -170,16 +176,19 @@ class Insertion(Effect):
         c, c_t, layout = self.speed(point, point.y), self.speed(point, point.y_t), point.rod.z_layout
         (v, u), (v_t, u_t) = ([layout.get(z, name) for name in "vu"] for z in (point.z, point.z_t))
         return motion._replace(
-            q=motion.q + c * v, w=motion.w + c * u,
-            q_t=motion.q_t + c_t * v + c * v_t, w_t=motion.w_t + c_t * u + c * u_t,
-        )  # fmt: skip
+            q=motion.q + c * v,
+            w=motion.w + c * u,
+            q_t=motion.q_t + c_t * v + c * v_t,
+            w_t=motion.w_t + c_t * u + c * u_t,
+        )
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
         """Return the law of the strains from n and m less the momentum that is carried along."""
         c, motion = self.speed(point, point.y), point.motion
         for name, mass, velocity in (
-            ("v", point.material.rhoA * np.eye(3), motion.q), ("u", point.material.rhoJ, motion.w)
-        ):  # fmt: skip
+            ("v", point.material.rhoA * np.eye(3), motion.q),
+            ("u", point.material.rhoJ, motion.w),
+        ):
             strain = law.strains[name]
             carried = strain._replace(stress=strain.stress + c * dot(mass, velocity))
             law = law.with_strain(name, carried.soften(c * c * mass))

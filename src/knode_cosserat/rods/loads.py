@@ -192,11 +192,15 @@ class AttachedMass(PointLoad):
     mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
     inertia: Any = parameter(
         "kg m2", "moments of inertia about its centre", shape="vector", low=0.0, high=1e6, default=None
-    )  # fmt: skip
+    )
     offset: Any = parameter(
-        "m", "its centre of mass from the rod's axis, material frame", shape="vector", low=-10.0, high=10.0,
+        "m",
+        "its centre of mass from the rod's axis, material frame",
+        shape="vector",
+        low=-10.0,
+        high=10.0,
         default=None,
-    )  # fmt: skip
+    )
 
     @property
     def body(self) -> BodyInertia:

@@ -81,8 +81,9 @@ class DipoleField(MagneticField):
     )
     controlled: tuple[str, ...] = choice(
         "values to which controls add: x, y, z (m) to the position, mx, my, mz (A m2) to the moment",
-        ("position", "moment"), (),
-    )  # fmt: skip
+        ("position", "moment"),
+        (),
+    )
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
@@ -125,9 +126,13 @@ class Magnet(_Magnetic, SpreadLoad):
     kind: ClassVar[str] = "magnet"
 
     magnetisation: Any = parameter(
-        "A m", "magnetic moment per length, material frame; for a section of area A, magnetisation times A",
-        shape="vector", low=-1e6, high=1e6, default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+        "A m",
+        "magnetic moment per length, material frame; for a section of area A, magnetisation times A",
+        shape="vector",
+        low=-1e6,
+        high=1e6,
+        default=(0.0, 0.0, 0.0),
+    )
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return force and couple of the field per length."""

@@ -85,17 +85,29 @@ class ParallelRobot(Bundle):
     )
     platform_mass: Any = parameter("kg", "mass of the platform", low=0.0, high=1e4)
     platform_inertia: Any = parameter(
-        "kg m2", "inertia of the platform about its centre; by default of a disc as wide as its joints",
-        shape="matrix", low=0.0, high=1e6, default=None,
-    )  # fmt: skip
+        "kg m2",
+        "inertia of the platform about its centre; by default of a disc as wide as its joints",
+        shape="matrix",
+        low=0.0,
+        high=1e6,
+        default=None,
+    )
     platform_force: Any = parameter(
-        "N", "load on the platform's centre, global frame", shape="vector", low=-1e6, high=1e6,
+        "N",
+        "load on the platform's centre, global frame",
+        shape="vector",
+        low=-1e6,
+        high=1e6,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
     platform_moment: Any = parameter(
-        "N m", "moment on the platform, global frame", shape="vector", low=-1e6, high=1e6,
+        "N m",
+        "moment on the platform, global frame",
+        shape="vector",
+        low=-1e6,
+        high=1e6,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
     shear_modulus: Any = _of_rod("shear_modulus")
     shear_damping: Any = _of_rod("shear_damping")
     bending_damping: Any = _of_rod("bending_damping")

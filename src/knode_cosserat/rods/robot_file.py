@@ -66,9 +66,15 @@ REQUIRED = ("format", "kind", "parameters")
 KINDS: dict[str, type[System]] = {
     cls.kind: cls
     for cls in (
-        TendonRobot, RoutedTendonRobot, SlenderRod, VirtualRobot, ParallelRobot, ConcentricTubeRobot, Assembly
+        TendonRobot,
+        RoutedTendonRobot,
+        SlenderRod,
+        VirtualRobot,
+        ParallelRobot,
+        ConcentricTubeRobot,
+        Assembly,
     )
-}  # fmt: skip
+}
 
 #: distance (m) of the tendons from the axis of the paper's robot
 PAPER_OFFSET = 0.02

@@ -79,8 +79,9 @@ class SlenderRod(System):
     kind: ClassVar[str] = "slender-rod"
     mixed: ClassVar[bool] = False
     alternatives: ClassVar[tuple[tuple[str, ...], ...]] = (
-        ("radius", "density", "youngs_modulus"), ("cross_section",)
-    )  # fmt: skip
+        ("radius", "density", "youngs_modulus"),
+        ("cross_section",),
+    )
 
     length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
     # required, unless the cross-section states them
@@ -119,9 +120,13 @@ class SlenderRod(System):
         "kg/(m s)", "drag in proportion to velocity", shape="matrix", low=0.0, high=1e4, default=None
     )
     gravity: Any = parameter(
-        "m/s2", "gravitational acceleration, global frame", shape="vector", low=-100.0, high=100.0,
+        "m/s2",
+        "gravitational acceleration, global frame",
+        shape="vector",
+        low=-100.0,
+        high=100.0,
         default=(0.0, 0.0, -9.81),
-    )  # fmt: skip
+    )
     loads: tuple[Load, ...] = slot("loads beside gravity and drag", Load, many=True, default=())
     surroundings: tuple[Obstacle, ...] = slot("obstacles that it may touch", Obstacle, many=True, default=())
     effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
@@ -168,9 +173,11 @@ class SlenderRod(System):
         A subclass adds its own to these.
         """
         lists: dict[str, tuple[Contribution, ...]] = {
-            "section": self.sections, "obstacle": self.surroundings, "load": self.loads,
+            "section": self.sections,
+            "obstacle": self.surroundings,
+            "load": self.loads,
             "effect": self.effects,
-        }  # fmt: skip
+        }
         present: dict[str, Contribution] = {"base": self.base_end, "tip": self.tip_end}
         if self.cross_section is not None:
             present["cross_section"] = self.cross_section
@@ -307,18 +314,30 @@ class SlenderRod(System):
         part = self._part(s, control)
         section = self.section_at(part)
         plain = Material(
-            self.Kse_at(part), self.shear_damping, self.Kbt_at(part), self.bending_damping, self.u_star,
-            section.rhoA, section.rhoJ, section.radius,
-        )  # fmt: skip
+            self.Kse_at(part),
+            self.shear_damping,
+            self.Kbt_at(part),
+            self.bending_damping,
+            self.u_star,
+            section.rhoA,
+            section.rhoJ,
+            section.radius,
+        )
         if not self.changes:
             return plain
         radius, stiffness, curvature, extension = self.differences(s, control)
         area = radius * radius
         return Material(
-            plain.Kse * (area * stiffness), plain.Bse * area, plain.Kbt * (area * area * stiffness),
-            plain.Bbt * (area * area), curvature, plain.rhoA * area, plain.rhoJ * (area * area),
-            plain.radius * radius, plain.v_star * (1.0 + extension),
-        )  # fmt: skip
+            plain.Kse * (area * stiffness),
+            plain.Bse * area,
+            plain.Kbt * (area * area * stiffness),
+            plain.Bbt * (area * area),
+            curvature,
+            plain.rhoA * area,
+            plain.rhoJ * (area * area),
+            plain.radius * radius,
+            plain.v_star * (1.0 + extension),
+        )
 
     def differences(self, s: Any, control: Any) -> Differences:
         """Return the sections' changes at s (m) of the grid."""
@@ -417,9 +436,13 @@ class SlenderRod(System):
         n_s = dot(R, rhoA * (cross(w, q) + q_t) + dragged) - rhoA * self.seen(t, self.gravity)
         m_s = dot(R, cross(w, dot(rhoJ, w)) + dot(rhoJ, w_t)) - cross(p_s, n)
         rates: Fields = {
-            "p": p_s, "h": quaternion_rate(h, u), "n": n_s, "m": m_s,
-            "q": v_t - cross(u, relative.q) + cross(relative.w, v), "w": u_t - cross(u, relative.w),
-        }  # fmt: skip
+            "p": p_s,
+            "h": quaternion_rate(h, u),
+            "n": n_s,
+            "m": m_s,
+            "q": v_t - cross(u, relative.q) + cross(relative.w, v),
+            "w": u_t - cross(u, relative.w),
+        }
         parts = self.at_parts(point)
         for part, at in parts:
             load = part.load(at)

@@ -104,9 +104,14 @@ def homogeneous(rod: Any, area: Any, moments: tuple[Any, Any, Any], torsion: Any
     E, G, rho = rod.youngs_modulus, rod.G, rod.density
     xx, yy, xy = moments
     return Section(
-        G * area, E * area, (E * xx, E * yy, E * xy), G * torsion,
-        rho * area, (rho * xx, rho * yy, rho * xy), radius,
-    )  # fmt: skip
+        G * area,
+        E * area,
+        (E * xx, E * yy, E * xy),
+        G * torsion,
+        rho * area,
+        (rho * xx, rho * yy, rho * xy),
+        radius,
+    )
 
 
 def round_section(rod: Any, radius: Any, inner_radius: Any = 0.0) -> Section:
@@ -245,9 +250,12 @@ class TabulatedSection(CrossSection):
     shear_stiffness: Any = _table_field("N", "G A; by default E A / 2.6", 1e-9, 1e15, None)
     angle: Any = _angle()
     radius: Any = parameter(
-        "m", "outer radius, for contact and drawings; by default of a round section with its E I and E A",
-        low=1e-6, high=0.5, default=None,
-    )  # fmt: skip
+        "m",
+        "outer radius, for contact and drawings; by default of a round section with its E I and E A",
+        low=1e-6,
+        high=0.5,
+        default=None,
+    )
 
     def __check_init__(self) -> None:
         super().__check_init__()
@@ -285,9 +293,12 @@ class TabulatedSection(CrossSection):
         about_x, GJ, EA, rhoA = (
             self._value(values, part)
             for values in (
-                self.bending_stiffness, self.torsional_stiffness, self.axial_stiffness, self.mass_per_length
+                self.bending_stiffness,
+                self.torsional_stiffness,
+                self.axial_stiffness,
+                self.mass_per_length,
             )
-        )  # fmt: skip
+        )
         about_y = about_x if self.bending_stiffness_y is None else self._value(self.bending_stiffness_y, part)
         GA = EA / (2.0 * (1.0 + POISSON_RATIO))
         if self.shear_stiffness is not None:
@@ -354,22 +365,34 @@ class Stretch(SectionChange):
         "", "factor of the stiffness, coefficients in ξ", shape="list", low=-1e6, high=1e6, default=(1.0,)
     )
     curvature: Any = parameter(
-        "1/m", "curvature at rest, material frame", shape="vector", low=-1e4, high=1e4,
+        "1/m",
+        "curvature at rest, material frame",
+        shape="vector",
+        low=-1e4,
+        high=1e4,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
     curvature_slope: Any = parameter(
-        "1/m", "increase of that curvature from its beginning to its end", shape="vector", low=-1e4, high=1e4,
+        "1/m",
+        "increase of that curvature from its beginning to its end",
+        shape="vector",
+        low=-1e4,
+        high=1e4,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
     extension: Any = parameter("", "ε, relative extension at rest", low=-0.9, high=10.0, default=0.0)
     controlled: bool = choice("true if a control acts on it", (False, True), False)
     stiffness_gain: Any = parameter(
         "", "increase of the stiffness factor by a control of 1", low=-1e6, high=1e6, default=0.0
     )
     curvature_gain: Any = parameter(
-        "1/m", "increase of the curvature at rest by a control of 1", shape="vector", low=-1e4, high=1e4,
+        "1/m",
+        "increase of the curvature at rest by a control of 1",
+        shape="vector",
+        low=-1e4,
+        high=1e4,
         default=(0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
     extension_gain: Any = parameter(
         "", "increase of the extension at rest by a control of 1", low=-10.0, high=10.0, default=0.0
     )

@@ -93,10 +93,11 @@ def number_fields(layout: Layout, count: int) -> Layout:
     return Layout(
         *(
             field._replace(
-                name=f"{field.name}{k}", meaning=f"{field.meaning}, {k}",
+                name=f"{field.name}{k}",
+                meaning=f"{field.meaning}, {k}",
                 frame=field.frame and f"{field.frame}{k}",
             )
             for k in range(1, count + 1)
             for field in layout.fields
         )
-    )  # fmt: skip
+    )

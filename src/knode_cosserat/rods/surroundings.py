@@ -36,9 +36,12 @@ class ContactLaw(Part):
     )
     smoothing: Any = parameter("m", "δ, depth over which contact sets in", low=1e-9, high=1.0, default=1e-4)
     damping: Any = parameter(
-        "s/m", "d, relative increase of the contact force by the speed of approach", low=0.0, high=1e4,
+        "s/m",
+        "d, relative increase of the contact force by the speed of approach",
+        low=0.0,
+        high=1e4,
         default=0.0,
-    )  # fmt: skip
+    )
     friction: Any = parameter("", "μ, coefficient of friction", low=0.0, high=10.0, default=0.0)
     slip: Any = parameter(
         "m/s", "ε, speed of sliding at which friction is full", low=1e-9, high=1e3, default=1e-3
@@ -141,9 +144,13 @@ class Cylinder(Obstacle):
         "m", "a point of its axis", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0)
     )
     axis: Any = parameter(
-        "1", "direction of its axis, of any length", shape="direction", low=-1e3, high=1e3,
+        "1",
+        "direction of its axis, of any length",
+        shape="direction",
+        low=-1e3,
+        high=1e3,
         default=(0.0, 1.0, 0.0),
-    )  # fmt: skip
+    )
     radius: Any = parameter("m", "its radius", low=1e-6, high=1e3, default=0.1)
     inside: bool = choice(_INSIDE, (False, True), False)
 

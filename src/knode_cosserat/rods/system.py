@@ -97,9 +97,15 @@ class System(Parametrised):
         raise NotImplementedError(f"{type(self).__name__} gives no `constitutive`")
 
     def balance(
-        self, s: Any, t: Any, y: Float[Any, " y"], y_t: Float[Any, " y"], z: Float[Any, " z"],
-        z_t: Float[Any, " z"], control: Any,
-    ) -> tuple[Any, Any, Any] | Float[Any, " y"]:  # fmt: skip
+        self,
+        s: Any,
+        t: Any,
+        y: Float[Any, " y"],
+        y_t: Float[Any, " y"],
+        z: Float[Any, " z"],
+        z_t: Float[Any, " z"],
+        control: Any,
+    ) -> tuple[Any, Any, Any] | Float[Any, " y"]:
         """Return A (y, y), B (y, y) and f1 (y,) of A y_s + B y_st = f1, at arclength s (m) and time t (s).
 
         If B is zero, y_s may be returned itself.

@@ -40,9 +40,12 @@ class TendonRod(SlenderRod):
     """A rod with tendons around it. A subclass defines the part `tendons`, their action on the rod."""
 
     tendon_offset: Any = parameter(
-        "m", "distance of the tendons from the rod's axis; the paper's tendon-robot ignores it", low=0.0,
-        high=1.0, default=0.0,
-    )  # fmt: skip
+        "m",
+        "distance of the tendons from the rod's axis; the paper's tendon-robot ignores it",
+        low=0.0,
+        high=1.0,
+        default=0.0,
+    )
     tendon_angles: Any = parameter(
         "rad", "angles of the tendons about the rod", shape="list", low=-10.0, high=10.0, default=FOUR_TENDONS
     )
@@ -126,13 +129,18 @@ class RoutedTendonRobot(TendonRod):
     kind: ClassVar[str] = "routed-tendon-robot"
 
     routing: tuple[Routing, ...] | None = slot(
-        "paths of the tendons; by default straight, at their offset and angles", Routing, many=True,
+        "paths of the tendons; by default straight, at their offset and angles",
+        Routing,
+        many=True,
         default=None,
-    )  # fmt: skip
+    )
     tendon_twist: Any = parameter(
-        "rad", "angle by which the tendons turn about the rod from base to tip; by default they are straight",
-        low=-10.0, high=10.0, default=None,
-    )  # fmt: skip
+        "rad",
+        "angle by which the tendons turn about the rod from base to tip; by default they are straight",
+        low=-10.0,
+        high=10.0,
+        default=None,
+    )
     drive: str = choice(
         "control of the tendons: tension, or length that reels take in", ("tension", "reel"), "tension"
     )
@@ -141,8 +149,9 @@ class RoutedTendonRobot(TendonRod):
     )
     reels: Reels | None = slot(
         "motors of the reels; none: one length for each tendon",
-        Reels, default=None,
-    )  # fmt: skip
+        Reels,
+        default=None,
+    )
     friction: TendonFriction | None = slot(
         "friction of the tendons; none: they slide freely", TendonFriction, default=None
     )
@@ -150,24 +159,27 @@ class RoutedTendonRobot(TendonRod):
         "loss of friction by vibration under high tensions; none: no vibration", Vibration, default=None
     )
     rib_spacing: RibSpacing | None = slot(
-        "softening by tendons that are straight between ribs; none: tendons follow the rod", RibSpacing,
+        "softening by tendons that are straight between ribs; none: tendons follow the rod",
+        RibSpacing,
         default=None,
-    )  # fmt: skip
+    )
     relaxation: Relaxation | None = slot(
         "relaxation of the material, a Maxwell branch; none: it does not creep", Relaxation, default=None
     )
     anchors: EarlyAnchors | None = slot(
-        "anchors before the tip; none: at the tip, or at the end of `routing`", EarlyAnchors,
+        "anchors before the tip; none: at the tip, or at the end of `routing`",
+        EarlyAnchors,
         default=None,
-    )  # fmt: skip
+    )
     load_cells: LoadCells | None = slot(
         "correction of measured tensions; none: controls are tensions", LoadCells, default=None
     )
 
     trained: TrainedRange | None = slot(
-        "range of the data of its identification; outside it extrapolates", TrainedRange,
+        "range of the data of its identification; outside it extrapolates",
+        TrainedRange,
         default=None,
-    )  # fmt: skip
+    )
 
     def __check_init__(self) -> None:
         if isinstance(self.routing, tuple) and not self.routing:

@@ -72,21 +72,36 @@ class Reels(Part):
     kind: ClassVar[str] = "reels"
 
     motors: Any = parameter(
-        "", "motor of each tendon, from 1 on; negative if its angle lets the tendon out", shape="list",
-        low=-1e3, high=1e3,
-    )  # fmt: skip
+        "",
+        "motor of each tendon, from 1 on; negative if its angle lets the tendon out",
+        shape="list",
+        low=-1e3,
+        high=1e3,
+    )
     radius: Any = parameter(
-        "m", "R of each motor's reel; without it controls are lengths in m", shape="list", low=1e-6, high=1.0,
+        "m",
+        "R of each motor's reel; without it controls are lengths in m",
+        shape="list",
+        low=1e-6,
+        high=1.0,
         default=None,
-    )  # fmt: skip
+    )
     zero: Any = parameter(
-        "rad", "φ₀, angle of each motor at which its reel has taken in nothing", shape="list", low=-1e3,
-        high=1e3, default=None,
-    )  # fmt: skip
+        "rad",
+        "φ₀, angle of each motor at which its reel has taken in nothing",
+        shape="list",
+        low=-1e3,
+        high=1e3,
+        default=None,
+    )
     taken_in: Any = parameter(
-        "m", "t, length of each tendon that is taken in at the motors' zeros", shape="list", low=-1.0,
-        high=1.0, default=None,
-    )  # fmt: skip
+        "m",
+        "t, length of each tendon that is taken in at the motors' zeros",
+        shape="list",
+        low=-1.0,
+        high=1.0,
+        default=None,
+    )
     compliance: Any = parameter(
         "m/N", "of a spring in series with each tendon", shape="list", low=0.0, high=1.0, default=None
     )
@@ -164,13 +179,21 @@ class LoadCells(Part):
     kind: ClassVar[str] = "load-cells"
 
     gain: Any = parameter(
-        "", "true over measured tension, one for each tendon", shape="list", low=1e-3, high=1e3,
+        "",
+        "true over measured tension, one for each tendon",
+        shape="list",
+        low=1e-3,
+        high=1e3,
         default=(1.0, 1.0, 1.0, 1.0),
-    )  # fmt: skip
+    )
     offset: Any = parameter(
-        "N", "true tension where none is measured, one for each tendon", shape="list", low=-1e3, high=1e3,
+        "N",
+        "true tension where none is measured, one for each tendon",
+        shape="list",
+        low=-1e3,
+        high=1e3,
         default=(0.0, 0.0, 0.0, 0.0),
-    )  # fmt: skip
+    )
 
     latency: Any = parameter(
         "s", "delay of the readings behind the poses of a recording", low=-10.0, high=10.0, default=0.0
@@ -365,9 +388,13 @@ class EarlyAnchors(Part):
 
     at: float = place("where tendons are anchored")
     share: Any = parameter(
-        "", "part of each tendon's tension beyond that place", shape="list", low=-1.0, high=2.0,
+        "",
+        "part of each tendon's tension beyond that place",
+        shape="list",
+        low=-1.0,
+        high=2.0,
         default=(1.0, 1.0, 1.0, 1.0),
-    )  # fmt: skip
+    )
 
     @property
     def cuts(self) -> tuple[float, ...]:
@@ -398,9 +425,12 @@ class TendonFriction(Part):
         "1/m", "κ₀, change of curvature that builds friction up", low=1e-4, high=100.0, default=0.1
     )
     at_rest: Any = parameter(
-        "", "part of the friction of a motion from the unloaded rod that acts in an equilibrium", low=-1.0,
-        high=1.0, default=0.0,
-    )  # fmt: skip
+        "",
+        "part of the friction of a motion from the unloaded rod that acts in an equilibrium",
+        low=-1.0,
+        high=1.0,
+        default=0.0,
+    )
 
     def y_fields(self, rod: Any) -> tuple[tuple[Any, ...], ...]:
         """Return λ."""
@@ -512,9 +542,12 @@ class RibSpacing(Part):
     )
     at: tuple[float, ...] | None = places("where the ribs are, in order")
     share: Any = parameter(
-        "", "loss between ribs at these places, over that of tendons that are straight there", low=0.0,
-        high=10.0, default=1.0,
-    )  # fmt: skip
+        "",
+        "loss between ribs at these places, over that of tendons that are straight there",
+        low=0.0,
+        high=10.0,
+        default=1.0,
+    )
 
     def __check_init__(self) -> None:
         super().__check_init__()

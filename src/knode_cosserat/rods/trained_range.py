@@ -74,9 +74,12 @@ class TrainedRange(Part):
         return cls(*ends[0], *ends[1], *(ends[2] if ends[2].shape[1] else (None, None)))
 
     def outside(
-        self, system: System, time: Float[Any, " T"], control: Float[Any, "*batch T c"],
+        self,
+        system: System,
+        time: Float[Any, " T"],
+        control: Float[Any, "*batch T c"],
         z: Float[Any, "*batch T N z"],
-    ) -> Bool[Any, "*batch T"]:  # fmt: skip
+    ) -> Bool[Any, "*batch T"]:
         """Return True for rows of a motion outside the range; the first control of several is ignored."""
         numeric = array_module((time, control, z))
         strain = system.z_layout

@@ -67,9 +67,12 @@ class Tube(Part):
         "m", "c, length of the curved part; by default all of the tube", low=0.0, high=20.0, default=None
     )
     transmission: Any = parameter(
-        "m", "d, length behind the plate without insertion; the tube cannot be inserted by more", low=0.0,
-        high=20.0, default=0.0,
-    )  # fmt: skip
+        "m",
+        "d, length behind the plate without insertion; the tube cannot be inserted by more",
+        low=0.0,
+        high=20.0,
+        default=0.0,
+    )
     shear_modulus: Any = parameter(
         "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
     )
@@ -282,9 +285,12 @@ class ConcentricTubeRobot(SlenderRod):
 
     tubes: tuple[Tube, ...] = slot("tubes, the innermost first", Tube, many=True, default=())
     tube_friction: Any = parameter(
-        "N s", "viscous torque between neighbouring tubes, by length and relative rate of rotation", low=0.0,
-        high=1e3, default=1e-5,
-    )  # fmt: skip
+        "N s",
+        "viscous torque between neighbouring tubes, by length and relative rate of rotation",
+        low=0.0,
+        high=1e3,
+        default=1e-5,
+    )
 
     def __check_init__(self) -> None:
         if not self.tubes:
@@ -292,9 +298,10 @@ class ConcentricTubeRobot(SlenderRod):
         if max(tube.end for tube in self.tubes) < 1.0:
             raise ParameterError("no tube ends at the tip; allowed is an end of 1 for the longest")
         moved = [
-            name for name, part in self.parts.items()
+            name
+            for name, part in self.parts.items()
             if not isinstance(part, _Tubes) and any(cut < 1.0 for cut in part.cuts)
-        ]  # fmt: skip
+        ]
         if moved:
             raise ParameterError(
                 f"{', '.join(moved)} within the rod; allowed on tubes, which move with their insertion, "
@@ -347,9 +354,15 @@ class ConcentricTubeRobot(SlenderRod):
         tubes, input = self._tubes_of(control)
         section = tubes.section(self, s, tubes.present(self, s, input)[0])
         return Material(
-            section.Kse, self.shear_damping, section.Kbt, self.bending_damping, self.u_star,
-            section.rhoA, section.rhoJ, section.radius,
-        )  # fmt: skip
+            section.Kse,
+            self.shear_damping,
+            section.Kbt,
+            self.bending_damping,
+            self.u_star,
+            section.rhoA,
+            section.rhoJ,
+            section.radius,
+        )
 
 
 class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
@@ -378,8 +391,9 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
         sliding = (("sliding", n - 1, "rad/s", "relative rate of rotation of neighbours"),) if n > 1 else ()
         return super().layout + Layout(
             ("twisting", n, "N m", "torsion of the tubes that are present"),
-            ("torque", n, "1/m2", "torque about each tube, by its bending stiffness"), *sliding,
-        )  # fmt: skip
+            ("torque", n, "1/m2", "torque about each tube, by its bending stiffness"),
+            *sliding,
+        )
 
     def observables(self, point: RodPoint) -> Float[Any, " o"]:
         """Return those of a rod, and torsion, torque and sliding of the tubes."""
@@ -405,7 +419,7 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
         return super().law_layout + Layout(
             ("stretched", 3 * n, "1", "shear and extension of each tube"),
             ("bent", 2 * n, "1/m", "bending of each tube, x and y"),
-        )  # fmt: skip
+        )
 
     def law_inputs(self, s: Any, y: Float[Any, " y"], control: Any) -> Callable[[Any, Any], Any]:
         """Return the function of z and z_t: those of a rod, and the strains of each tube."""

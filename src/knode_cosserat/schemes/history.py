@@ -262,7 +262,13 @@ def no_rows(system: System, shape: tuple[int, ...], stages: int = 1) -> StepRows
     """Return rows of steps that were not reached, (steps,) or (robots, steps)."""
     row, k = (system.nodes, no_history(system, LOBATTO2).shape[-1]), unknown_count(system)
     return StepRows(
-        np.zeros((*shape, *row)), np.zeros((*shape, k)), np.zeros(shape), np.zeros(shape, dtype=int),
-        np.zeros(shape), np.full(shape, int(Result.NOT_REACHED)), np.full(shape, np.nan),
-        np.zeros((*shape, stages - 1, *row)), np.zeros((*shape, stages - 1, k)),
-    )  # fmt: skip
+        np.zeros((*shape, *row)),
+        np.zeros((*shape, k)),
+        np.zeros(shape),
+        np.zeros(shape, dtype=int),
+        np.zeros(shape),
+        np.full(shape, int(Result.NOT_REACHED)),
+        np.full(shape, np.nan),
+        np.zeros((*shape, stages - 1, *row)),
+        np.zeros((*shape, stages - 1, k)),
+    )

@@ -85,9 +85,14 @@ class Settings:
 
     @classmethod
     def of(
-        cls, time: str | TimeScheme | None, space: str | SpaceScheme, start: str, newton: NewtonOptions,
-        between: str = "held", errors: Errors = True,
-    ) -> Self:  # fmt: skip
+        cls,
+        time: str | TimeScheme | None,
+        space: str | SpaceScheme,
+        start: str,
+        newton: NewtonOptions,
+        between: str = "held",
+        errors: Errors = True,
+    ) -> Self:
         """Return settings from names or schemes; `time` is None for statics.
 
         Raises `ValueError` with the accepted names.

@@ -53,8 +53,9 @@ def equilibrium(
     newton: NewtonOptions = NewtonOptions(),
     position_tolerance: float | None = None,
     recovery_budget: float | None = None,
-    on_failure: Literal["raise", "return"] = "raise", with_stability: bool = True,
-) -> Trajectory:  # fmt: skip
+    on_failure: Literal["raise", "return"] = "raise",
+    with_stability: bool = True,
+) -> Trajectory:
     """Return the static equilibrium under a constant control.
 
     Args:
@@ -92,10 +93,14 @@ def equilibrium(
     control = _checked_control(robot, control)
     check_tolerance(robot, initial, position_tolerance)
     solve = functools.partial(
-        _solve, controls=control[..., None, :], settings=Settings.of(None, space, "paper", newton),
-        initial=initial, recovery_budget=recovery_budget, on_failure=on_failure,
+        _solve,
+        controls=control[..., None, :],
+        settings=Settings.of(None, space, "paper", newton),
+        initial=initial,
+        recovery_budget=recovery_budget,
+        on_failure=on_failure,
         with_stability=with_stability,
-    )  # fmt: skip
+    )
     return refine(solve, robot, solve.keywords["settings"].space, position_tolerance)
 
 
@@ -107,8 +112,9 @@ def equilibria(
     initial: Any = None,
     newton: NewtonOptions = NewtonOptions(),
     recovery_budget: float | None = None,
-    on_failure: Literal["raise", "return"] = "raise", with_stability: bool = True,
-) -> Trajectory:  # fmt: skip
+    on_failure: Literal["raise", "return"] = "raise",
+    with_stability: bool = True,
+) -> Trajectory:
     """Return the static equilibria under a list of controls, each found from the one before.
 
     Args:
@@ -132,16 +138,26 @@ def equilibria(
     # refuses what is no robot
     stack_robots(robot)
     solve = functools.partial(
-        _solve, controls=controls, settings=Settings.of(None, space, "paper", newton), initial=initial,
-        recovery_budget=recovery_budget, on_failure=on_failure, with_stability=with_stability,
-    )  # fmt: skip
+        _solve,
+        controls=controls,
+        settings=Settings.of(None, space, "paper", newton),
+        initial=initial,
+        recovery_budget=recovery_budget,
+        on_failure=on_failure,
+        with_stability=with_stability,
+    )
     return refine(solve, robot, solve.keywords["settings"].space)
 
 
 def _solve(
-    robot: Any, controls: Any, settings: Settings, initial: Any, recovery_budget: float | None,
-    on_failure: str, with_stability: bool,
-) -> Solved[Trajectory]:  # fmt: skip
+    robot: Any,
+    controls: Any,
+    settings: Settings,
+    initial: Any,
+    recovery_budget: float | None,
+    on_failure: str,
+    with_stability: bool,
+) -> Solved[Trajectory]:
     """Return the equilibria of a robot or a batch on its grid; arguments as in `equilibria`."""
     system, batch = stack_robots(robot)
     controls, batch = checked_controls(system, controls, batch)
@@ -181,9 +197,7 @@ def _solve(
             functools.partial(warn_outside_rod_theory, system, rows),
         )
     time = np.arange(float(task.steps))
-    found = Trajectory(
-        system, settings, time, control=controls, **rows_of(system, rows), stability=tested
-    )  # fmt: skip
+    found = Trajectory(system, settings, time, control=controls, **rows_of(system, rows), stability=tested)
     return Solved.of(mark_extrapolated(found, None), said)
 
 
@@ -225,7 +239,13 @@ def _guess(robot: Any, positions: Any, control: Any) -> Trajectory:
     record, ny = state_from_positions(robot, positions, np.asarray(control)), robot.y_layout.size
     nothing = np.zeros(1)
     return Trajectory(
-        system=robot, settings=None, time=nothing, y=record[None, :, :ny], z=record[None, :, ny:],
-        control=np.asarray(control)[None], result=nothing.astype(int), residual=nothing,
+        system=robot,
+        settings=None,
+        time=nothing,
+        y=record[None, :, :ny],
+        z=record[None, :, ny:],
+        control=np.asarray(control)[None],
+        result=nothing.astype(int),
+        residual=nothing,
         iterations=nothing.astype(int),
-    )  # fmt: skip
+    )

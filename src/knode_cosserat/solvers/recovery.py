@@ -146,9 +146,12 @@ class Recovery(abc.ABC):
             # the first guess is the newest of the earlier states
             start = step.past._replace(y=np.stack([guess, *step.past.y[:-1]]), weights=weights, t0=0.0)
         _, state, rows = engine.solve_steps(
-            system or self.system, steps._replace(tip_offset=tip_offset), np.asarray(control)[None], start,
+            system or self.system,
+            steps._replace(tip_offset=tip_offset),
+            np.asarray(control)[None],
+            start,
             (0, 1),
-        )  # fmt: skip
+        )
         if step is not None:
             y = np.stack([state.y[0], *step.past.y[:-1]])
             state = state._replace(y=y, weights=weights, t0=step.past.t0)
@@ -383,11 +386,12 @@ def recovered_stages(whole: StepRecovery, controls: tuple[Any, Any]) -> SolvedSt
         past, last = solved.state, own
     else:
         row = found[-1]._replace(
-            error=max(each.error for each in found), corrections=sum(each.corrections for each in found),
+            error=max(each.error for each in found),
+            corrections=sum(each.corrections for each in found),
             result=max(int(each.result) for each in found),
             stages=np.stack([each.records for each in found[:-1]]),
             stage_unknowns=np.stack([each.unknowns for each in found[:-1]]),
-        )  # fmt: skip
+        )
         past = past._replace(time_error=np.full_like(past.time_error, np.nan))
         return SolvedStep(past, row)
     one = history.TimeStep(step.past, pad_coefficients(BDF1().coefficients(dt), settings.memory), step.t[-1])

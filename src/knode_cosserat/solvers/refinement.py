@@ -52,9 +52,12 @@ class Solved(NamedTuple, Generic[Found]):
 
 
 def refine(
-    solve: Callable[[Any], Solved[Found]], robot: Any, space: SpaceScheme, tolerance: float | None = None,
+    solve: Callable[[Any], Solved[Found]],
+    robot: Any,
+    space: SpaceScheme,
+    tolerance: float | None = None,
     stays: bool = False,
-) -> Found:  # fmt: skip
+) -> Found:
     """Return what is found on the first grid that is fine enough, of one robot or a batch.
 
     Args:

@@ -243,13 +243,17 @@ def _pull(core: CotangentCore, spec: Solves, *arrays: np.ndarray) -> list[np.nda
 
 DATA, RESULTS = 0, 1
 push_p = _primitive(
-    "push", functools.partial(_linear_shapes, RESULTS), functools.partial(_core_of_linear, TangentCore),
+    "push",
+    functools.partial(_linear_shapes, RESULTS),
+    functools.partial(_core_of_linear, TangentCore),
     _push,
-)  # fmt: skip
+)
 pull_p = _primitive(
-    "pull", functools.partial(_linear_shapes, DATA), functools.partial(_core_of_linear, CotangentCore),
+    "pull",
+    functools.partial(_linear_shapes, DATA),
+    functools.partial(_core_of_linear, CotangentCore),
     _pull,
-)  # fmt: skip
+)
 
 
 def _batched_linear(primitive: Primitive, operands: Arrays, axes: Arrays, *, spec: Solves) -> Any:
@@ -319,9 +323,10 @@ def rollout(
         # first guesses, error estimates and the extra stages of these count as constants
         d_last = jax.tree.map(jnp.zeros_like, last)
         d_last = d_last._replace(
-            records=d_last.records.at[:, :used].set(d_records), rate=d_last.rate.at[:used].set(d_rate),
+            records=d_last.records.at[:, :used].set(d_records),
+            rate=d_last.rate.at[:used].set(d_rate),
             t0=d_past.t0,
-        )  # fmt: skip
+        )
         return (rows, last), (d_rows, d_last)
 
     run.defjvp(tangent, symbolic_zeros=True)

@@ -88,9 +88,13 @@ class TimeIntegration:
         return StepCoefficients.of(self.settings, self.dt, self.known)
 
     def solve(
-        self, system: System, controls: Any, state: Any, span: tuple[int, int] | None = None,
+        self,
+        system: System,
+        controls: Any,
+        state: Any,
+        span: tuple[int, int] | None = None,
         rows: StepRows | None = None,
-    ) -> Any:  # fmt: skip
+    ) -> Any:
         """Solve steps, all by default, until one fails: the number done, the last state, rows of the span.
 
         A batch of robots has controls (B, T, c) and as many states; each is solved until one of its steps
@@ -127,9 +131,13 @@ class TimeIntegration:
 
 
 def run_one(
-    task: TimeIntegration, system: System, controls: np.ndarray, start: tuple[Any, Any],
-    watch: Literal["signals", "bar"] | None = "signals", rows: StepRows | None = None,
-) -> tuple[StepRows, Any, str]:  # fmt: skip
+    task: TimeIntegration,
+    system: System,
+    controls: np.ndarray,
+    start: tuple[Any, Any],
+    watch: Literal["signals", "bar"] | None = "signals",
+    rows: StepRows | None = None,
+) -> tuple[StepRows, Any, str]:
     """Return all steps of one robot, with recovery, the last state, and the likely cause of a failure.
 
     They start from a state and the control before it. To watch for signals, the compiled loop returns about
@@ -372,9 +380,13 @@ def rows_of(system: System, rows: StepRows) -> dict[str, Any]:
 
 
 def run_batch(
-    task: TimeIntegration, system: System, controls: np.ndarray, start: tuple[Any, Any],
-    watch: Literal["signals", "bar"] | None = "signals", rows: StepRows | None = None,
-) -> tuple[StepRows, Any, dict[int, str]]:  # fmt: skip
+    task: TimeIntegration,
+    system: System,
+    controls: np.ndarray,
+    start: tuple[Any, Any],
+    watch: Literal["signals", "bar"] | None = "signals",
+    rows: StepRows | None = None,
+) -> tuple[StepRows, Any, dict[int, str]]:
     """Return the rows and last states of all robots, and the likely cause for each robot that failed.
 
     Arguments as in `run_one`. Robots are solved in chunks, one thread a core. A robot with a failed step is

@@ -188,9 +188,11 @@ def predict_segment(
 
 
 def samples(
-    knowledge: System, trajectories: Sequence[Trajectory], nodes: Sequence[int] | None = None,
+    knowledge: System,
+    trajectories: Sequence[Trajectory],
+    nodes: Sequence[int] | None = None,
     model: System | None = None,
-) -> Dataset:  # fmt: skip
+) -> Dataset:
     """Return one-segment samples of trajectories; `nodes` selects the predicted nodes (1 to N - 1).
 
     Trajectories hold the nodes only. The history at stages between nodes is interpolated, or evaluated by a
@@ -300,9 +302,14 @@ def _of_one(
         origin=np.stack([np.full(count, k), spread(rows)], axis=1),
     )
     tips = TipSamples(
-        t=time[rows], c0=c0, y=y[rows, -1], control=control[rows], history=history[:, -1],
-        weight=np.full(len(rows), 1.0 / len(rows)), origin=np.stack([np.full(len(rows), k), rows], axis=1),
-    )  # fmt: skip
+        t=time[rows],
+        c0=c0,
+        y=y[rows, -1],
+        control=control[rows],
+        history=history[:, -1],
+        weight=np.full(len(rows), 1.0 / len(rows)),
+        origin=np.stack([np.full(len(rows), k), rows], axis=1),
+    )
     return segments, tips, doubt
 
 

@@ -68,9 +68,12 @@ class TangentState(NamedTuple):
 
 
 def tangent_time_loop(
-    steps: StepCoefficients, solved: tuple[Any, Any], at: tuple[System, Any], changes: Changes,
+    steps: StepCoefficients,
+    solved: tuple[Any, Any],
+    at: tuple[System, Any],
+    changes: Changes,
     state: TangentState,
-) -> tuple[TangentState, tuple[Any, Any]]:  # fmt: skip
+) -> tuple[TangentState, tuple[Any, Any]]:
     """Return the state after the last of some solved rows, and the tangents of all rows and unknowns.
 
     They are linear in `changes` and in the tangents of `state`. `solved` are all rows and unknowns, and

@@ -413,6 +413,11 @@ def _trajectory(system: System, run: Any, every: StepRows, history: Any) -> Traj
     final = at_start.state.after(final, dt, task.steps, settings)
     initial, final = jax.tree.map(numeric.asarray, (at_start.state, final))
     return Trajectory(
-        system, settings, time, control=acted, **rows_of(system, every), initial_state=initial,
+        system,
+        settings,
+        time,
+        control=acted,
+        **rows_of(system, every),
+        initial_state=initial,
         final_state=final,
-    )  # fmt: skip
+    )

@@ -225,9 +225,14 @@ class Stepper:
             row, state = solved()
             row = StepRows(*(np.asarray(leaf)[None] for leaf in row))
             found = Trajectory(
-                robot, self._task.settings, np.array([time]), control=control[None],
-                **rows_of(robot, row), initial_state=state, final_state=state,
-            )  # fmt: skip
+                robot,
+                self._task.settings,
+                np.array([time]),
+                control=control[None],
+                **rows_of(robot, row),
+                initial_state=state,
+                final_state=state,
+            )
             return vars(mark_extrapolated(found, None))
 
         return Trajectory.deferred(fields)

@@ -161,10 +161,14 @@ def configuration(
         found = first_solved(robot, settings, pose, control)
         turned = None if found.quaternion is None else np.asarray(found.quaternion)
         linearised = Configuration(
-            control, np.asarray(found.position), turned, np.asarray(found.jacobian),
-            np.asarray(found.compliance), float(robot.length),
+            control,
+            np.asarray(found.position),
+            turned,
+            np.asarray(found.jacobian),
+            np.asarray(found.compliance),
+            float(robot.length),
             bool(is_too_coarse(settings.space, found.result)),
-        )  # fmt: skip
+        )
         return Solved(linearised, found.result, found.position_error)
 
     return refine(solve, robot, settings.space)

@@ -78,10 +78,17 @@ class EquilibriumPath:
 
 
 def equilibrium_path(
-    robot: System, first: Any, last: Any, *, initial: Any = None, space: str | SpaceScheme = "lobatto2",
-    newton: NewtonOptions = NewtonOptions(), points: int = 200, with_stability: bool = True,
+    robot: System,
+    first: Any,
+    last: Any,
+    *,
+    initial: Any = None,
+    space: str | SpaceScheme = "lobatto2",
+    newton: NewtonOptions = NewtonOptions(),
+    points: int = 200,
+    with_stability: bool = True,
     progress: bool = False,
-) -> EquilibriumPath:  # fmt: skip
+) -> EquilibriumPath:
     """Follow the equilibria of a robot from one control to another, through limit points.
 
     Args:
@@ -258,9 +265,12 @@ def _directions(
 
 
 def _correct(
-    system: System, settings: Settings, ends: tuple[Any, Any], start: tuple[np.ndarray, float],
+    system: System,
+    settings: Settings,
+    ends: tuple[Any, Any],
+    start: tuple[np.ndarray, float],
     tangent: tuple[np.ndarray, float],
-) -> tuple[np.ndarray, float, float, int, tuple[np.ndarray, float]]:  # fmt: skip
+) -> tuple[np.ndarray, float, float, int, tuple[np.ndarray, float]]:
     """Return y, part, error, corrections and the new tangent, by Newton's method across the tangent."""
     scale, (ty, tp), (y, part) = np.asarray(system.scales().y), tangent, start
 
@@ -285,7 +295,13 @@ def _trajectory(system: System, settings: Settings, walk: _PathPoints) -> Trajec
     y, z = (np.stack([np.asarray(row[k]) for row in rows]) for k in (0, 1))
     count = len(rows)
     return Trajectory(
-        system=system, settings=settings, time=np.arange(float(count)), y=y, z=z, control=controls,
-        result=np.full(count, int(Result.CONVERGED)), residual=np.array(walk.errors),
+        system=system,
+        settings=settings,
+        time=np.arange(float(count)),
+        y=y,
+        z=z,
+        control=controls,
+        result=np.full(count, int(Result.CONVERGED)),
+        residual=np.array(walk.errors),
         iterations=np.zeros(count, dtype=int),
-    )  # fmt: skip
+    )

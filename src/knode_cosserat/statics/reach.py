@@ -285,14 +285,29 @@ def _outcome(
         same = _from_rest(search, control, found)
         y, z = node_values(system, search.settings, control, found.y)
     rest = Trajectory(
-        system=system, settings=search.settings, time=np.zeros(1), control=control[None],
-        y=np.asarray(y)[None], z=np.asarray(z)[None], result=np.array([int(code)]),
-        residual=np.array([residual]), iterations=np.zeros(1, int), position_error=np.array([off]),
-    )  # fmt: skip
+        system=system,
+        settings=search.settings,
+        time=np.zeros(1),
+        control=control[None],
+        y=np.asarray(y)[None],
+        z=np.asarray(z)[None],
+        result=np.array([int(code)]),
+        residual=np.array([residual]),
+        iterations=np.zeros(1, int),
+        position_error=np.array([off]),
+    )
     return InverseKinematics(
-        result, control, np.asarray(position), None if quaternion is None else np.asarray(quaternion),
-        *errors, control <= search.low, control >= search.high, same, search.trials, rest,
-    )  # fmt: skip
+        result,
+        control,
+        np.asarray(position),
+        None if quaternion is None else np.asarray(quaternion),
+        *errors,
+        control <= search.low,
+        control >= search.high,
+        same,
+        search.trials,
+        rest,
+    )
 
 
 def _from_rest(search: _ReachSearch, control: np.ndarray, found: Response) -> bool:

@@ -103,9 +103,12 @@ class Stability(NamedTuple):
     def __repr__(self) -> str:
         count = f"unstable in {count_of(max(self.unstable_directions, 0), 'direction')}"
         kind = {
-            "stable": "stable", "neutral": "neutral", "divergence": count, "flutter": f"{count} by flutter",
+            "stable": "stable",
+            "neutral": "neutral",
+            "divergence": count,
+            "flutter": f"{count} by flutter",
             "undecided": f"undecided: {self.reason}",
-        }[self.kind]  # fmt: skip
+        }[self.kind]
         if self.eigenvalue is None:
             return f"Stability: {kind}; smallest eigenvalue {self.least:.4g} (in units of EI/L)"
         growth, frequency = self.eigenvalue.real, abs(self.eigenvalue.imag) / (2.0 * np.pi)
@@ -155,9 +158,16 @@ def stability(equilibrium: Trajectory, row: int = -1) -> Stability:
     result = equilibrium.result[row]
     if not isinstance(space, Lobatto4):
         one = Trajectory(
-            system=system, settings=equilibrium.settings, time=np.zeros(1), y=y[None], z=z[None],
-            control=control[None], result=np.zeros(1, int), residual=np.zeros(1), iterations=np.zeros(1, int),
-        )  # fmt: skip
+            system=system,
+            settings=equilibrium.settings,
+            time=np.zeros(1),
+            y=y[None],
+            z=z[None],
+            control=control[None],
+            result=np.zeros(1, int),
+            residual=np.zeros(1),
+            iterations=np.zeros(1, int),
+        )
         found = rests(
             fix_grid(system),
             control,

@@ -54,10 +54,14 @@ class Workspace:
 
     def __repr__(self) -> str:
         solved = self.position[self.valid]
-        spans = [
-            f"{axis} {quantity([low, high], 'm')}"
-            for axis, low, high in zip("xyz", solved.min(axis=0), solved.max(axis=0), strict=False)
-        ] if len(solved) else []  # fmt: skip
+        spans = (
+            [
+                f"{axis} {quantity([low, high], 'm')}"
+                for axis, low, high in zip("xyz", solved.min(axis=0), solved.max(axis=0), strict=False)
+            ]
+            if len(solved)
+            else []
+        )
         return wrap_lines(
             f"Workspace of a {robot_text(self.system)}: {len(self.result)} samples, "
             f"{self.unsolved} without a solution; {', '.join(spans)}"

@@ -28,8 +28,12 @@ STORED = {
 #: samplers by name, and their largest numbers of samples: SciPy's Sobol points have 30 bits, and its Latin
 #: hypercube is computed as a whole by every worker
 SAMPLERS = {
-    "grid": math.inf, "sobol": 2**30, "halton": math.inf, "latin-hypercube": 10**7, "random": math.inf,
-}  # fmt: skip
+    "grid": math.inf,
+    "sobol": 2**30,
+    "halton": math.inf,
+    "latin-hypercube": 10**7,
+    "random": math.inf,
+}
 #: most cases of a sweep
 MOST_CASES = 10**12
 
@@ -239,17 +243,20 @@ class Sweep:
         """Return the sweep as plain data, as in a YAML file."""
         varied = {
             name: {key: value for key, value in dataclasses.asdict(values).items() if value is not None}
-            if isinstance(values, Range) else list(values)
+            if isinstance(values, Range)
+            else list(values)
             for name, values in self.vary.items()
-        }  # fmt: skip
+        }
         return {field.name: getattr(self, field.name) for field in dataclasses.fields(self)} | {
             "robots": [
                 {"robot": robot.name, "set": dict(robot.changes)} if robot.changes else robot.name
                 for robot in self.robots
             ],
-            "controls": list(self.controls), "vary": varied, "seeds": list(self.seeds),
+            "controls": list(self.controls),
+            "vary": varied,
+            "seeds": list(self.seeds),
             "store": list(self.store),
-        }  # fmt: skip
+        }
 
     def __repr__(self) -> str:
         varied = ", ".join(

@@ -96,9 +96,13 @@ def solve_shard(plan: Plan, number: int, threads: int | None = None) -> dict[str
         kind = np.float32 if plan.sweep.precision == "single" else np.float64
         columns[name] = columns[name].astype(kind, copy=False)
     return {
-        "case": cases.case, "robot": np.full(size, robot, dtype=np.int32),
-        "word": cases.word.astype(np.int32), "seed": cases.seed, **cases.values, **columns,
-    }  # fmt: skip
+        "case": cases.case,
+        "robot": np.full(size, robot, dtype=np.int32),
+        "word": cases.word.astype(np.int32),
+        "seed": cases.seed,
+        **cases.values,
+        **columns,
+    }
 
 
 def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:

@@ -225,8 +225,9 @@ class FollowedTarget:
         rows = kept(np.shape(first.y), first.system.z_layout.size)[1]
         shown["tracks"] = _for_loop(shown["tracks"])
         shown["loop"] = self.facts.for_page() | {
-            "rows": encoded_array(numbers[rows], "f4"), "reasons": [moments[k].reason for k in rows],
-        }  # fmt: skip
+            "rows": encoded_array(numbers[rows], "f4"),
+            "reasons": [moments[k].reason for k in rows],
+        }
         return shown
 
     def checked(self, target: Any) -> Float[np.ndarray, "3"]:
@@ -277,8 +278,9 @@ class LoopSession(PageSession):
         self.begin_anew, self.reason = True, ""
         self.newest, self.fresh = b"", asyncio.Event()
         self.commands |= {
-            "export": lambda: self._offer(self._exported), "log": lambda: self._offer(self._log),
-        }  # fmt: skip
+            "export": lambda: self._offer(self._exported),
+            "log": lambda: self._offer(self._log),
+        }
         self._offers: set[asyncio.Task[None]] = set()
 
     def _motions(self) -> list[Coroutine[Any, Any, None]]:

@@ -183,10 +183,13 @@ def last_row(system: System, trajectory: Trajectory, names: Sequence[str]) -> np
     nodes, _ = kept(np.shape(trajectory.y), system.z_layout.size)
     y = np.asarray(trajectory.y)[-1:]
     curves = list(Drawing.of(system).curves(y)) if any(name.startswith("curve") for name in names) else []
-    functions = {"y": lambda: y[:, nodes], "z": lambda: np.asarray(trajectory.z)[-1:, nodes],
-           "control": lambda: np.asarray(trajectory.control)[-1:],
-           "position": lambda: positions_of(system, y)[:, nodes],
-           "orientation": lambda: np.asarray(Drawing.of(system).quaternions(y))[:, nodes]}  # fmt: skip
+    functions = {
+        "y": lambda: y[:, nodes],
+        "z": lambda: np.asarray(trajectory.z)[-1:, nodes],
+        "control": lambda: np.asarray(trajectory.control)[-1:],
+        "position": lambda: positions_of(system, y)[:, nodes],
+        "orientation": lambda: np.asarray(Drawing.of(system).quaternions(y))[:, nodes],
+    }
     parts = []
     for name in names:
         if name in functions:
@@ -309,12 +312,16 @@ def fields(system: System) -> list[dict[str, Any]]:
     layouts = (("y", system.y_layout), ("z", system.z_layout), ("control", system.control_layout))
     return [
         {
-            "array": array, "name": field.name, "unit": field.unit, "meaning": field.meaning,
-            "offset": layout.slice(field.name).start, "components": _components(field, array == "control"),
+            "array": array,
+            "name": field.name,
+            "unit": field.unit,
+            "meaning": field.meaning,
+            "offset": layout.slice(field.name).start,
+            "components": _components(field, array == "control"),
         }
         for array, layout in layouts
         for field in layout.fields
-    ]  # fmt: skip
+    ]
 
 
 def _components(field: Field, control: bool) -> list[str]:
@@ -332,14 +339,20 @@ def sliders(system: System) -> list[dict[str, Any]]:
     """Return a slider for each component of the control: names, unit, range and initial value."""
     return [
         {
-            "name": f"{field.name} {component}".strip(), "group": field.name, "label": component,
-            "unit": field.unit, "meaning": field.meaning, "low": low, "high": high, "start": start,
+            "name": f"{field.name} {component}".strip(),
+            "group": field.name,
+            "label": component,
+            "unit": field.unit,
+            "meaning": field.meaning,
+            "low": low,
+            "high": high,
+            "start": start,
             "step": (high - low) / 500.0,
         }
         for field in system.control_layout.fields
         for low, high, start in [_range(system, field)]
         for component in _components(field, control=True)
-    ]  # fmt: skip
+    ]
 
 
 def _range(system: System, field: Field) -> tuple[float, float, float]:

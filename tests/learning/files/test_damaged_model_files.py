@@ -229,10 +229,14 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         decoded_model(forged(BYTES, arrays=fewer), "model")
     with fails("model: its residual is a Load; allowed is a Residual"):
         decoded_model(
-            forged(BYTES, lambda h: h["residual"].update({"$class": "Load", "fields": {"material": None,
-                                                                                       "ambient": None}})),
+            forged(
+                BYTES,
+                lambda h: h["residual"].update(
+                    {"$class": "Load", "fields": {"material": None, "ambient": None}}
+                ),
+            ),
             "model",
-        )  # fmt: skip
+        )
 
     def impossible(header):
         header["residual"] = {

@@ -145,9 +145,10 @@ def test_predictions_whose_model_is_damaged(prediction, tmp_path):
     (tmp_path / "a.nc").write_bytes(path.read_bytes())
     edited(tmp_path / "a.nc", lambda file: file["arrays/model"].__setitem__(500, 77))
     with fails(
-        "a.nc: its system, a KNODE: its model: damaged", "load_trajectory(path, system=…)",
+        "a.nc: its system, a KNODE: its model: damaged",
+        "load_trajectory(path, system=…)",
         error=TrajectoryFileError,
-    ):  # fmt: skip
+    ):
         kc.load_trajectory(tmp_path / "a.nc")
     edited(tmp_path / "a.nc", lambda file: file.attrs.__setitem__("system", "os.system"))
     with fails("there is no reader of its system, a os.system", error=TrajectoryFileError):

@@ -179,9 +179,15 @@ def test_a_job_says_how_well_its_knowledge_does(monkeypatch):
 def cell(name, control, method, error, seed=0):
     failed = {"failed": "it broke"} if error is None else {}
     return {
-        "imperfection": name, "control": control, "method": method, "seed": seed, "tip_dtw": error,
-        "pose_mse": error, "rotation_rmse": error, **failed,
-    }  # fmt: skip
+        "imperfection": name,
+        "control": control,
+        "method": method,
+        "seed": seed,
+        "tip_dtw": error,
+        "pose_mse": error,
+        "rotation_rmse": error,
+        **failed,
+    }
 
 
 CELLS = [

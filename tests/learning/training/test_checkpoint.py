@@ -225,8 +225,9 @@ def test_another_fit_is_refused(bars, kept):
     found = fit_states(WRONG, bars, dataclasses.replace(CONFIG, seed=1), checkpoint=kept.parent)
     assert found.about.facts["seed"] == 1
     assert sorted(file.name for file in kept.parent.iterdir()) == [
-        "segments-0.checkpoint", "segments-1.checkpoint",
-    ]  # fmt: skip
+        "segments-0.checkpoint",
+        "segments-1.checkpoint",
+    ]
     kept.with_name("segments-1.checkpoint").rename(kept)
     with pytest.raises(CheckpointError, match="it is of 'segments-1'"):
         fit_states(WRONG, bars, CONFIG, checkpoint=kept.parent)

@@ -14,6 +14,11 @@ from knode_cosserat_hardware.cad.materials import Item, bill_of_materials
 from knode_cosserat_hardware.cad.parts import export_parts
 
 __all__ = [
-    "Item", "PartDimensions", "PartError",
-    "bill_of_materials", "export_parts", "load_dimensions", "part_dimensions",
-]  # fmt: skip
+    "Item",
+    "PartDimensions",
+    "PartError",
+    "bill_of_materials",
+    "export_parts",
+    "load_dimensions",
+    "part_dimensions",
+]

@@ -308,9 +308,21 @@ def part_dimensions(robot: System, hardware: HardwareDescription | None = None) 
     height = max(2.0 * HEAD, spool.flange_radius + 2.0 - (cell.thickness - bracket.axis[1]))
     mount = Mount(cell.end, cell.width, height, (cell.end / 4, 0.75 * cell.end))
     return PartDimensions(
-        length, radius, angles, offset, heights, rib, spool, base, _plate(base, spool, cell, bracket), cell,
-        mount, bracket, bracket.motor_radius, 1e3 * sizes.marker_diameter,
-    )  # fmt: skip
+        length,
+        radius,
+        angles,
+        offset,
+        heights,
+        rib,
+        spool,
+        base,
+        _plate(base, spool, cell, bracket),
+        cell,
+        mount,
+        bracket,
+        bracket.motor_radius,
+        1e3 * sizes.marker_diameter,
+    )
 
 
 def _require(is_met: Any, message: str) -> None:
@@ -361,18 +373,30 @@ def _rib(sizes: Dimensions, radius: float, offset: float, angles: tuple[float, .
     hub = rod_hole / 2.0 + 3.0
     window = (hub + 1.0, outer - max(2.5, 2.0 * MIN_WALL))
     rib = Rib(
-        outer_radius=outer, thickness=thickness, rod_hole=rod_hole, hub_radius=hub,
-        hub_height=thickness + 5.0, tendon_hole=hole, tendon_radius=offset, angles=angles,
-        spoke_width=max(6.0, hole + 4.0 * MIN_WALL), window=window if window[1] - window[0] >= 4.0 else None,
-    )  # fmt: skip
+        outer_radius=outer,
+        thickness=thickness,
+        rod_hole=rod_hole,
+        hub_radius=hub,
+        hub_height=thickness + 5.0,
+        tendon_hole=hole,
+        tendon_radius=offset,
+        angles=angles,
+        spoke_width=max(6.0, hole + 4.0 * MIN_WALL),
+        window=window if window[1] - window[0] >= 4.0 else None,
+    )
     _require_least(
-        "hardware.rib_diameter", 2.0 * outer, 2.0 * (offset + hole / 2.0 + MIN_WALL),
-        f"for walls of {MIN_WALL:g} mm around the tendons' holes", "or reduce tendon_offset",
-    )  # fmt: skip
+        "hardware.rib_diameter",
+        2.0 * outer,
+        2.0 * (offset + hole / 2.0 + MIN_WALL),
+        f"for walls of {MIN_WALL:g} mm around the tendons' holes",
+        "or reduce tendon_offset",
+    )
     _require_least(
-        "tendon_offset", offset, hub + hole / 2.0 + MIN_WALL,
+        "tendon_offset",
+        offset,
+        hub + hole / 2.0 + MIN_WALL,
         f"for a hub around the rod of radius {_metres(radius)} m",
-    )  # fmt: skip
+    )
     least, gap = hole + MIN_WALL, _gap(rib.tendon_holes)
     _require(
         gap >= least - EPSILON,
@@ -406,17 +430,25 @@ def capacity(spool: Spool) -> float:
 def _spool(sizes: Dimensions, travel: float) -> Spool:
     radius, bore = 1e3 * sizes.spool_radius, 1e3 * sizes.shaft_diameter + SHAFT_FIT
     spool = Spool(
-        drum_radius=radius - TENDON / 2.0, width=1e3 * sizes.spool_width,
-        flange_radius=radius + 1e3 * sizes.flange_height, flange_thickness=1.5, hub_radius=bore / 2.0 + 3.5,
-        hub_length=6.0, bore=bore, across_flat=bore - SHAFT_CUT, tie_hole=2.0 * TENDON + 0.2,
-    )  # fmt: skip
+        drum_radius=radius - TENDON / 2.0,
+        width=1e3 * sizes.spool_width,
+        flange_radius=radius + 1e3 * sizes.flange_height,
+        flange_thickness=1.5,
+        hub_radius=bore / 2.0 + 3.5,
+        hub_length=6.0,
+        bore=bore,
+        across_flat=bore - SHAFT_CUT,
+        tie_hole=2.0 * TENDON + 0.2,
+    )
     _require_least(
         "hardware.spool_radius", radius, bore / 2.0 + MIN_WALL + TENDON / 2.0, "for the motor's shaft"
     )
     _require_least(
-        "hardware.flange_height", 1e3 * sizes.flange_height, spool.tie_hole + 2.0 * MIN_WALL,
+        "hardware.flange_height",
+        1e3 * sizes.flange_height,
+        spool.tie_hole + 2.0 * MIN_WALL,
         "for the hole that ties the tendon",
-    )  # fmt: skip
+    )
     _require(
         capacity(spool) >= travel - EPSILON,
         f"hardware.spool_width must hold {_metres(travel)} m of tendon in one layer (got room for "
@@ -435,14 +467,24 @@ def _base(sizes: Dimensions, rib: Rib) -> Base:
     first = (around[0] + around[1]) / 2.0
     socket, count = min(40.0, height - 8.0), sizes.mount_hole_count
     base = Base(
-        flange_radius=500.0 * sizes.base_diameter, flange_thickness=6.0, height=height,
+        flange_radius=500.0 * sizes.base_diameter,
+        flange_thickness=6.0,
+        height=height,
         column_radius=min(rib.rod_hole / 2.0 + 7.0, offset - passage / 2.0 - 0.5),
-        top_radius=rib.outer_radius, top_thickness=8.0, rod_hole=rib.rod_hole, socket_depth=socket,
-        eyelet=SLEEVE, passage=passage, tendon_radius=offset, angles=rib.angles,
-        mount_radius=500.0 * sizes.mount_diameter, mount_hole=1e3 * sizes.mount_hole_diameter,
+        top_radius=rib.outer_radius,
+        top_thickness=8.0,
+        rod_hole=rib.rod_hole,
+        socket_depth=socket,
+        eyelet=SLEEVE,
+        passage=passage,
+        tendon_radius=offset,
+        angles=rib.angles,
+        mount_radius=500.0 * sizes.mount_diameter,
+        mount_hole=1e3 * sizes.mount_hole_diameter,
         mount_angles=tuple(first + 2.0 * math.pi * k / count for k in range(count)),
-        screw_depths=(13.0, socket - 6.0), screw_angle=first,
-    )  # fmt: skip
+        screw_depths=(13.0, socket - 6.0),
+        screw_angle=first,
+    )
     least = base.rod_hole / 2.0 + 4.0 + passage / 2.0 + 0.5
     _require_least("tendon_offset", offset, least, "for the base's column between the tendons")
     _require(
@@ -450,9 +492,11 @@ def _base(sizes: Dimensions, rib: Rib) -> Base:
         f"hardware.base_height must be at least 0.033 m, for the rod's socket (got {_metres(height)})",
     )
     _require_least(
-        "hardware.rib_diameter", 2.0 * base.top_radius, 2.0 * (offset + base.eyelet / 2.0 + MIN_WALL),
+        "hardware.rib_diameter",
+        2.0 * base.top_radius,
+        2.0 * (offset + base.eyelet / 2.0 + MIN_WALL),
         "the diameter of the base's top, which leads the tendons",
-    )  # fmt: skip
+    )
     gap = _gap(base.eyelets)
     _require(
         gap >= passage + MIN_WALL,
@@ -494,10 +538,15 @@ def _bracket(spool_radius: float, motor_radius: float, cell: Cell) -> Bracket:
     return Bracket(
         left=min(-cell.width / 2.0, spool_radius - half),
         right=spool_radius + max(motor_radius + 0.5, half) + gusset,
-        face=face, foot=foot, foot_length=face + cell.end, height=foot + gap + 2.0 * motor_radius + 1.5,
-        axis=(spool_radius, -(foot + gap + motor_radius)), foot_holes=tuple(face + y for y in cell.holes[:2]),
-        motor_radius=motor_radius, gusset=gusset,
-    )  # fmt: skip
+        face=face,
+        foot=foot,
+        foot_length=face + cell.end,
+        height=foot + gap + 2.0 * motor_radius + 1.5,
+        axis=(spool_radius, -(foot + gap + motor_radius)),
+        foot_holes=tuple(face + y for y in cell.holes[:2]),
+        motor_radius=motor_radius,
+        gusset=gusset,
+    )
 
 
 def _placed(x: float, y: float, angle: float, base: Base) -> tuple[float, float]:
@@ -532,13 +581,17 @@ def _plate(base: Base, spool: Spool, cell: Cell, bracket: Bracket) -> Plate:
     turns = np.diff([*around, around[0] + 2.0 * math.pi])
     middle = tuple(float(angle + turn / 2.0) for angle, turn in zip(around, turns, strict=True))
     plate = Plate(
-        radius=radius, thickness=6.0, passages=base.eyelets, passage=base.passage,
-        mount_holes=base.mount_holes, mount_hole=base.mount_hole,
+        radius=radius,
+        thickness=6.0,
+        passages=base.eyelets,
+        passage=base.passage,
+        mount_holes=base.mount_holes,
+        mount_hole=base.mount_hole,
         cell_holes=tuple(
             _placed(0.0, start + y, angle, base) for angle in base.angles for y in cell.holes[2:]
         ),
         leg_holes=on_circle(radius - 9.0, middle),
-    )  # fmt: skip
+    )
     for (k, first), (j, second) in itertools.combinations(enumerate(outlines), 2):
         _require(
             not any(_overlap(a, b) for a in first for b in second),

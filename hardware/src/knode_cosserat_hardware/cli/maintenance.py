@@ -38,9 +38,10 @@ READINGS = 25
 def reading_facts(reading: Reading) -> dict[str, Any]:
     """Return a reading as plain values."""
     return {
-        "state": reading.state.value, "fault": reading.fault,
+        "state": reading.state.value,
+        "fault": reading.fault,
         "tension": [round(float(value), 4) for value in reading.tension],
-    }  # fmt: skip
+    }
 
 
 def tension_text(values: Any) -> str:
@@ -62,9 +63,11 @@ def connect(port: Port, robot: RobotFile = None, yes: Yes = False, as_json: Json
     with connected(machine, yes) as driver:
         reading, limits = driver.read(), driver.limits
         facts = {
-            "port": machine.name, "tendons": driver.tendon_count, **reading_facts(reading),
+            "port": machine.name,
+            "tendons": driver.tendon_count,
+            **reading_facts(reading),
             "limits": {"low": limits.low, "high": limits.high, "rate": limits.rate, "total": limits.total},
-        }  # fmt: skip
+        }
     lines = [
         f"{machine.name}: {reading.state.value}",
         *(
@@ -247,8 +250,11 @@ def _weighed(driver: Driver, index: int, weights: list[float]) -> Any:
         else:
             typer.prompt(
                 f"Hang {weight / GRAVITY:g} kg on tendon {index + 1}, wait until it is still, press Enter",
-                default="", show_default=False, prompt_suffix=" ", err=True,
-            )  # fmt: skip
+                default="",
+                show_default=False,
+                prompt_suffix=" ",
+                err=True,
+            )
         driver.wait(0.1)
         readings.append(float(_mean(driver, READINGS)[index]))
         if fault := driver.read().fault:

@@ -105,9 +105,12 @@ def record(
                 typer.echo(f"kept {recorder.written} messages in {out}", err=True)
             raise
     facts = {
-        "commands": len(rows), "reduced": reduced, "messages": recorder.written, "bodies": names,
+        "commands": len(rows),
+        "reduced": reduced,
+        "messages": recorder.written,
+        "bodies": names,
         "config": str(out.with_suffix(".yaml")),
-    }  # fmt: skip
+    }
     lines = [f"recorded {len(rows)} commands, {reduced} of them reduced by limits, and {len(names)} bodies"]
     if not names:
         lines.append("no motion capture: the bag has tensions only, and no model can be identified from it")
@@ -166,7 +169,8 @@ def run(
     out: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Write one row a period to this CSV file.",
+            metavar="FILE",
+            help="Write one row a period to this CSV file.",
             show_default="after a fault: run-TIME.csv",
         ),
     ] = None,
@@ -179,7 +183,7 @@ def run(
     ] = None,
     yes: Yes = False,
     as_json: Json = False,
-) -> None:  # fmt: skip
+) -> None:
     """Close the loop around a robot: the tip follows a reference.
 
     The tip is measured by motion capture. The robot stops at a fault, outside --radius, and by the emergency
@@ -310,9 +314,13 @@ def steer(
             if others is not None and not emergency.has_keys:
                 raise ValueError("the keyboard needs a terminal; give --device /dev/input/js0 for a gamepad")
             count = teleoperate(
-                driver, inputs, mapping if window is None else None, emergency,
-                seconds=float("inf") if seconds is None else seconds, shown=shown,
-            )  # fmt: skip
+                driver,
+                inputs,
+                mapping if window is None else None,
+                emergency,
+                seconds=float("inf") if seconds is None else seconds,
+                shown=shown,
+            )
     facts = {"commands": count, "tension": [round(float(value), 4) for value in last[0]]}
     write_output(as_json, facts, [f"{count} commands; the last tensions were {tension_text(last[0])}"])
 

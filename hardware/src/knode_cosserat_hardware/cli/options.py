@@ -40,11 +40,13 @@ Port = Annotated[
 RobotFile = Annotated[
     str | None,
     typer.Option(
-        "--robot", metavar="FILE",
+        "--robot",
+        metavar="FILE",
         help="Robot file with the tension limits of the hardware (section hardware); also the robot that is "
-        "simulated.", show_default="limits of 15 N",
+        "simulated.",
+        show_default="limits of 15 N",
     ),
-]  # fmt: skip
+]
 Yes = Annotated[bool, typer.Option("--yes", help="Move the robot without asking.")]
 Capture = Annotated[
     str | None,

@@ -29,6 +29,11 @@ Vector3 = _message("geometry_msgs", "Vector3", x=float64, y=float64, z=float64)
 Wrench = _message("geometry_msgs", "Wrench", force=Vector3, torque=Vector3)
 WrenchStamped = _message("geometry_msgs", "WrenchStamped", header=Header, wrench=Wrench)
 JointState = _message(
-    "sensor_msgs", "JointState", header=Header, name=sequence[str], position=sequence[float64],
-    velocity=sequence[float64], effort=sequence[float64],
-)  # fmt: skip
+    "sensor_msgs",
+    "JointState",
+    header=Header,
+    name=sequence[str],
+    position=sequence[float64],
+    velocity=sequence[float64],
+    effort=sequence[float64],
+)

@@ -212,9 +212,11 @@ class SimulatedCapture(MotionCapture):
     """
 
     def __init__(
-        self, robot: TrueShape, config: RecordingConfig | None = None,
+        self,
+        robot: TrueShape,
+        config: RecordingConfig | None = None,
         clock: Callable[[], float] | None = None,
-    ):  # fmt: skip
+    ):
         config = RecordingConfig.paper_robot() if config is None else config
         base = [] if config.base is None else ["base"]
         given: Any = robot

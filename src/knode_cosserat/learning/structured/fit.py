@@ -478,9 +478,10 @@ def _weights(
     enough = max(3.0 * floors.max(), WELL * float(np.sqrt(np.mean(values**2))))
     if len(simple) + 1 < own and max(remainder) > enough:
         groups = [np.flatnonzero(owner == AMBIENT), np.flatnonzero(owner == 0)] + [
-            np.flatnonzero(np.isin(owner, where)) for term, where in terms
+            np.flatnonzero(np.isin(owner, where))
+            for term, where in terms
             if term.form == "linear" or target.curved is None or term.name in target.curved
-        ]  # fmt: skip
+        ]
         root = np.sqrt(shares)[:, None]
         moments = regression.moments(columns * root, values * root, fold)
         selected, error = regression.selected_columns(

@@ -161,10 +161,12 @@ class Load(eqx.Module):
         if self.material is not None:
             load = self.material(jnp.concatenate([observables, control]))
             parts = layout.split(load)
-            total = jnp.concatenate([
-                dot(rotation_matrix(frames.get(y, field.frame)), part) if field.frame else part
-                for field, part in zip(layout.fields, parts, strict=True)
-            ])  # fmt: skip
+            total = jnp.concatenate(
+                [
+                    dot(rotation_matrix(frames.get(y, field.frame)), part) if field.frame else part
+                    for field, part in zip(layout.fields, parts, strict=True)
+                ]
+            )
         return total if self.ambient is None else total + self.ambient(control)
 
 
@@ -172,9 +174,14 @@ class Structured(Residual):
     """Structured residual (see the module). Unused parts are None, and cost nothing."""
 
     linear_in: ClassVar[tuple[str, ...]] = (
-        "stretch", "stress.weights", "load.material.weights", "load.ambient.weights",
-        "tip_load.material.weights", "tip_load.ambient.weights", "at_base.weights",
-    )  # fmt: skip
+        "stretch",
+        "stress.weights",
+        "load.material.weights",
+        "load.ambient.weights",
+        "tip_load.material.weights",
+        "tip_load.ambient.weights",
+        "at_base.weights",
+    )
 
     stretch: Float[Any, ""]
     stress: Expansion | None

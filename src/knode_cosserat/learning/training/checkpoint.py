@@ -63,9 +63,10 @@ class Identity:
         if changed:
             return f"of other settings: {changed}"
         for name, words in (
-            ("knowledge", "another knowledge"), ("trajectories", "other trajectories"),
+            ("knowledge", "another knowledge"),
+            ("trajectories", "other trajectories"),
             ("held_out", "other held-out trajectories"),
-        ):  # fmt: skip
+        ):
             value = getattr(self, name)
             if (list(value) if isinstance(value, tuple) else value) != other.get(name):
                 return f"of {words}"

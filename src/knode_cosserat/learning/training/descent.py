@@ -350,10 +350,15 @@ def prepared(knowledge: System, residual: Residual, dataset: Dataset, training: 
     known = _known(residual, knowledge, segments, space) if adds else None
     names = ("learning_rate", "patience", "factor", "weight_decay", "epochs")
     data = _TrainingData(
-        knowledge, runs.split(residual)[1], None if adds else segments, known,
-        loss_for(training.loss, knowledge, segments), {name: getattr(training, name) for name in names},
-        space, training.schedule,
-    )  # fmt: skip
+        knowledge,
+        runs.split(residual)[1],
+        None if adds else segments,
+        known,
+        loss_for(training.loss, knowledge, segments),
+        {name: getattr(training, name) for name in names},
+        space,
+        training.schedule,
+    )
     return jax.tree.map(jnp.asarray, data)
 
 

@@ -124,10 +124,16 @@ def simulated_batch(
 
     def one(control: Any) -> Any:
         return simulate(
-            model, control, batches.dt, space=settings.space, start=settings.start, newton=settings.newton,
-            between=settings.between, initial=batch.initial,
+            model,
+            control,
+            batches.dt,
+            space=settings.space,
+            start=settings.start,
+            newton=settings.newton,
+            between=settings.between,
+            initial=batch.initial,
             time=settings.time,  # type: ignore[arg-type]  # None is refused there
-        ).y  # fmt: skip
+        ).y
 
     return jax.lax.map(one, batch.control)
 
@@ -234,9 +240,13 @@ class RolloutRun(runs.Run):
     loss_after = True
 
     def __init__(
-        self, options: RolloutTraining, batches: TrajectoryBatches, held_out: runs.HeldOut, model: KNODE,
+        self,
+        options: RolloutTraining,
+        batches: TrajectoryBatches,
+        held_out: runs.HeldOut,
+        model: KNODE,
         seed: int,
-    ):  # fmt: skip
+    ):
         super().__init__(options, options.updates, held_out, model, seed)
         self._batches, self._options = batches, options
 

@@ -206,9 +206,12 @@ class Run(abc.ABC):
     def snapshot(self) -> dict[str, Any]:
         """Return the state as arrays, and lists of arrays."""
         return {
-            "state": packed_tree(self.state), "best": packed_tree(self.best), "losses": self.losses,
-            "rates": self.rates, "checks": self.checks,
-        }  # fmt: skip
+            "state": packed_tree(self.state),
+            "best": packed_tree(self.best),
+            "losses": self.losses,
+            "rates": self.rates,
+            "checks": self.checks,
+        }
 
     def restore(self, snapshot: dict[str, Any]) -> None:
         """Go back to a snapshot. Raises `CheckpointError` if it is of something else."""
