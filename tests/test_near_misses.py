@@ -197,6 +197,7 @@ OTHERS = {
     "register_controller",
     "parameter",
     "effects_of",
+    "numbers_at",
     "make",
     "curves",
     "error",

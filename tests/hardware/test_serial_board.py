@@ -140,6 +140,9 @@ def test_plain_lines_can_be_chosen_and_repeats_end_with_the_program(board):
         assert eventually(lambda: board.state == "armed")
         assert eventually(lambda: board.state == "ready")  # no calls: the board disarms itself
         assert robot.state is DriverState.READY
+        # a call after the timeout does not repeat the earlier tensions either
+        robot.wait(0.15)
+        assert board.state == "ready"
         with pytest.raises(HardwareError, match="not armed"):
             robot.command([1.0] * 4)
         robot.arm()

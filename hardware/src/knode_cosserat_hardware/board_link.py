@@ -251,6 +251,7 @@ class BoardLink:
         """Note that the user's program is alive."""
         with self.lock:
             self.check()
+            self._is_left()
             self._called = self.transport.now()
 
     def pump(self, timeout: float) -> None:
@@ -379,10 +380,17 @@ class BoardLink:
             self.error = error
         self.lock.notify_all()
 
+    def _is_left(self) -> bool:
+        """True if the user's program was silent for too long; its tensions are then not repeated any more."""
+        left = self.transport.now() - self._called > self.host_timeout
+        if left:
+            self.plain_line = b""
+        return left
+
     def _keep(self) -> None:
         """Feed the board's watchdog while the user's program is alive."""
         now = self.transport.now()
-        if now - self._called > self.host_timeout or self.error is not None:
+        if self._is_left() or self.error is not None:
             return
         if self.mode == "framed" and now - self.arrival > SILENT_BOARD:
             # it cannot be supervised, or it starts again: its boot loader would take the lines
