@@ -85,11 +85,11 @@ def reel() -> dict[str, Any]:
     )
     pulled = kc.controls.parse("reel=ramp:0.01619,start=1,end=1.3", 500, DT, robot)
     released = kc.controls.parse("reel=ramp:0.01619,start=13,end=13.3", 500, DT, robot)
-    hanging = kc.equilibrium(robot, np.zeros(1))
-    moved = kc.simulate(robot, pulled - released, DT, initial=hanging, **PAPER)
-    times = [
-        seconds(lambda: kc.simulate(robot, pulled - released, DT, initial=hanging, **PAPER)) for _ in range(5)
-    ]
+    run = functools.partial(
+        kc.simulate, robot, pulled - released, DT, **PAPER | {"initial": kc.equilibrium(robot, np.zeros(1))}
+    )
+    moved = run()
+    times = [seconds(run) for _ in range(5)]
     tension = np.asarray(moved.part("tension"))[:, 0, 0]
     return {
         "seconds": statistics.median(times),
