@@ -20,7 +20,7 @@ BASE = (
 ORDER = (
     *("io", "rods", "robots", "controls", "schemes", "engine", "trajectory", "solvers", "metrics"),
     *("estimation", "recordings", "statics", "control", "learning", "loading", "figures"),
-    *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli"),
+    *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli", "__main__"),
 )
 LAYERS = (BASE.split(), *([name] for name in ORDER))
 #: folders of the repository beside the package

@@ -158,7 +158,10 @@ def measured_rows(data: Any) -> list[Measurements]:
     rows = listed_rows(data)
     for it in rows:
         if not isinstance(it, Measurements):
-            raise DataError(f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of")
+            raise DataError(
+                f"data holds a {type(it).__name__}; effects need recordings, or Measurements.of; "
+                "name parameters to identify them from trajectories"
+            )
     return rows  # type: ignore[return-value]
 
 
