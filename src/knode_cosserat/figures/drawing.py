@@ -48,10 +48,16 @@ def equal_scales(axes: Any, points: NDArray[np.float64], zoom: float = 0.95) -> 
     beside = axes.get_subplotspec().get_gridspec().ncols
     inches = axes.get_figure(root=False).bbox.width / axes.get_figure(root=True).dpi / beside
     small = inches < 4.5
-    for name, label_pad, tick_pad in (("x", 4.0, -2.0 * small), ("y", 7.0, -2.0 * small), ("z", 9.5, 3.0)):
+    pads = (("x", 4.0, -2.0 * small), ("y", 7.0, -2.0 * small), ("z", 9.5, 3.0))
+    steps = 3 if small else 4
+    for (name, label_pad, tick_pad), c, h in zip(pads, centre, half, strict=True):
         axis = getattr(axes, f"{name}axis")
-        # no ticks at the ends, where labels of two axes collide
-        axis.set_major_locator(MaxNLocator(4 if small else 5, prune="both"))
+        # no ticks near the ends, where labels of two axes collide; but at least two, for a scale
+        for most in range(steps, steps + 4):
+            ticks = [tick for tick in MaxNLocator(most).tick_values(c - h, c + h) if abs(tick - c) < 0.75 * h]
+            if len(ticks) > 1:
+                break
+        axis.set_ticks(ticks)
         axis.labelpad = label_pad - 7.0 * small
         axes.tick_params(axis=name, pad=tick_pad)
 
