@@ -1,13 +1,14 @@
 """A budget of time: the best robot so far is returned in each stage, and a later run resumes."""
 
 import importlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.identification import journal
-from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError
+from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError, SearchError
 from knode_cosserat.identification.search import ParameterSearch
 from tests.identification.recorded import measured, tensions
 from tests.identification.test_identify import NOMINAL, TRUE
@@ -91,6 +92,29 @@ def test_the_best_robot_belongs_to_an_interruption(monkeypatch, use):
     with pytest.raises(KeyboardInterrupt) as stopped:
         _run(monkeypatch, use(Clock()), [*STAGES, KeyboardInterrupt])
     assert stopped.value.best.robot is TRUE and "interrupted" in stopped.value.best.steps[-1]
+
+
+def test_a_search_in_a_part_of_the_rows_that_cannot_be_simulated_ends_as_the_nominal_robot(monkeypatch, use):
+    class Unsolvable:
+        misfit = SimpleNamespace(model=SimpleNamespace(effects=()))
+
+        def run(self, *_, **__):
+            raise SearchError("the robot that the search begins from cannot be simulated")
+
+    def stopped(searched, *_):
+        journal = searched(NOMINAL).journal
+        journal.last = Unsolvable(), SimpleNamespace(x=np.zeros(0), free=np.zeros(0, dtype=bool))
+        raise OutOfTimeError
+
+    use(Clock())
+    monkeypatch.setattr(
+        IDENTIFY, "ParameterSearch", lambda misfit, journal: ParameterSearch(Curve(), journal)
+    )
+    monkeypatch.setattr(IDENTIFY, "Misfit", lambda *_: None)
+    monkeypatch.setattr(IDENTIFY, "identify_effects", stopped)
+    found = kc.identify(NOMINAL, [ROWS], minutes=1.0)
+    assert found.robot is NOMINAL and not found.complete
+    assert "nominal robot is returned: the robot that the search begins from" in found.steps[-2]
 
 
 @pytest.mark.parametrize("minutes", [0.0, -1.0, np.nan])

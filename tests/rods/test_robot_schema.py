@@ -82,7 +82,7 @@ def test_it_knows_every_parameter_of_every_kind():
         ("delrin-tendon-robot", ("colour",), "red"),
         ("delrin-tendon-robot", ("parameters",), [1.0]),
         ("delrin-tendon-robot", ("parameters", "lenght"), 0.6),
-        ("delrin-tendon-robot", ("parameters", "length"), "0.6 m"),
+        ("delrin-tendon-robot", ("parameters", "length"), "long"),
         ("delrin-tendon-robot", ("parameters", "length"), True),
         ("delrin-tendon-robot", ("parameters", "length"), None),
         ("delrin-tendon-robot", ("parameters", "length"), 635.0),

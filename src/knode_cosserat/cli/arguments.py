@@ -16,6 +16,7 @@ import typer
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.recordings.formats import read_suffixes
+from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.wrapped import nominal_model
 
 if TYPE_CHECKING:
@@ -229,7 +230,8 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
         if name in values:
             other = "--nodes" if name == "nodes" and nodes is not None else "another --set"
             raise ValueError(f"--set {change!r}: {name} is given by {other} too; allowed is each name once")
-        values[name] = value
+        stated = parameter_at(nominal_model(system), name)
+        values[name] = value if stated is None else stated.in_si(name, value)
     changed = system.replace(**values)
     if "tendon_offset" in values:
         from knode_cosserat.rods.robot_file import warn_of_paper_tendons

@@ -15,7 +15,7 @@ from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.effects import library_model, place_effects
 from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
 from knode_cosserat.identification.free_parameters import identify_parameters, parameter_effects
-from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError
+from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError, SearchError
 from knode_cosserat.identification.library import identify_effects
 from knode_cosserat.identification.misfit import Misfit
 from knode_cosserat.identification.posterior import Posterior
@@ -132,8 +132,11 @@ def _best(nominal: System, journal: Journal, reason: str) -> Identified:
         search, last = journal.last
         model, journal.deadline = search.misfit.model, np.inf
         names = [it.name for it in model.effects if last.free[model.slice(it.name)].any()]
-        point = search.run(last.x, last.free, effort=(0, 0.0))
-        found = Identified.of(search, last.x, names, Posterior.of(model, point, names))
+        try:
+            point = search.run(last.x, last.free, effort=(0, 0.0))
+            found = Identified.of(search, last.x, names, Posterior.of(model, point, names))
+        except SearchError as error:  # it was searched in a part of the rows only
+            journal.step(f"the nominal robot is returned: {error}")
     missing = ", ".join(STAGES[STAGES.index(journal.stage) :]) if journal.stage else "the search"
     journal.step(f"not complete, {reason}; not done: {missing}")
     return dataclasses.replace(found, steps=tuple(journal.steps), complete=False)

@@ -7,6 +7,7 @@ describes them in the schema.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import inspect
 import math
@@ -20,6 +21,7 @@ import numpy as np
 
 from knode_cosserat._files.yaml_text import did_you_mean, excerpt, flow
 from knode_cosserat._reprs import object_text
+from knode_cosserat._units import UnitError, in_unit
 from knode_cosserat.errors import KnodeCosseratError
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows
@@ -38,6 +40,8 @@ Shape = Literal["scalar", "vector", "direction", "quaternion", "matrix", "list"]
 AT_END = 1e-9
 #: pattern of a name, or none
 NAME = "([A-Za-z][A-Za-z0-9_-]*)?"
+#: pattern of a number with its unit in a robot file
+WITH_UNIT = r"^\s*[-+]?[.\d]\S*\s*\S+"
 #: largest number of elements of a list in an error message
 MOST_SHOWN = 12
 #: by unit: the typical range
@@ -152,14 +156,29 @@ class Parameter:
 
     def _hint_of_text(self, text: str) -> str:
         """Return the hint for a text that is a number with its unit; else an empty string."""
-        match = re.fullmatch(r"([-+.\deE]*\d\.?) *([a-zA-Z][\w/]*)", text.strip())
-        factor = {self.unit: 1.0, **_OTHER_UNITS.get(self.unit, {})}.get(match[2]) if match else None
-        if match is None or factor is None or self.shape != "scalar":
-            return ""
-        return f". Did you mean {numbers_text(float(match[1]) * factor)}?"
+        with contextlib.suppress(UnitError):
+            number = in_unit(text, self.unit)
+            if number is not None and self.shape == "scalar":
+                return f". Did you mean {numbers_text(number)}?"
+        return ""
+
+    def in_si(self, name: str, value: Any) -> Any:
+        """Return a value in which numbers may have units, such as `250 mm`, without them.
+
+        Raises:
+            ParameterError: a unit that is not known, or of another kind.
+        """
+        if isinstance(value, list):
+            return [self.in_si(name, one) for one in value]
+        try:
+            number = in_unit(value, self.unit) if isinstance(value, str) else None
+        except UnitError as error:
+            raise ParameterError(f"{name} must be {self.allowed} (got {excerpt(value)}): {error}") from None
+        return value if number is None else number
 
     def read(self, name: str, value: Any) -> Any:
-        """Return a value of a file. Raises `ParameterError`."""
+        """Return a value of a file, whose numbers may have units. Raises `ParameterError`."""
+        value = self.in_si(name, value)
         array = _array(value)
         if array is not None and self.shape == "matrix" and array.shape in ((), (3,)):
             array = np.diag(np.broadcast_to(array, 3))
@@ -178,7 +197,8 @@ class Parameter:
 
     def schema(self, default: Any, families: dict[str, Any]) -> dict[str, Any]:
         """Return the JSON Schema of the values."""
-        one: Any = {"type": "number", "minimum": self.low, "maximum": self.high}
+        number = {"type": "number", "minimum": self.low, "maximum": self.high}
+        one: Any = {"anyOf": [number, {"type": "string", "pattern": WITH_UNIT}]}
         shape: dict[str, Any] = {
             "scalar": one,
             "vector": _array_schema(one, 3),
