@@ -14,7 +14,8 @@ ROOT = Path(knode_cosserat.__file__).parent
 
 #: small modules that depend on each other only; the longest prefix of a name counts
 BASE = (
-    "_arguments _blas _files _jax _lazy _numbers _processes _program_cache _reprs _settings _units errors rotation"
+    "_arguments _blas _files _jax _lazy _numbers _processes _program_cache _reprs _settings _units errors "
+    "rotation"
 )
 #: packages and modules, each depends on those before it only; the empty name is `import knode_cosserat`
 ORDER = (
