@@ -10,6 +10,7 @@ from studies.__main__ import app as studies
 
 ROBOT = "delrin-tendon-robot"
 COMMANDS = (
+    "init",
     "simulate",
     "equilibrium",
     "info",
