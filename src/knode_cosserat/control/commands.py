@@ -221,7 +221,7 @@ def controller_named(
     if name not in CONTROLLERS:
         raise ValueError(
             f"there is no controller {name!r}; there are {', '.join(CONTROLLERS)}"
-            f"{did_you_mean(name, CONTROLLERS)}"
+            + (did_you_mean(name, CONTROLLERS) or "; one of your own is known once its file is imported (--import)")
         )
     cls = CONTROLLERS[name]
     if adapt and not cls.has_observer:
