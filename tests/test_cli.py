@@ -464,7 +464,7 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     assert "calibrated model" in calibrated and float(calibrated.split()[-1]) < 5.0
 
 
-CONTROLLER = '''
+CONTROLLER = """
 from knode_cosserat.control import Command, Controller, register_controller
 
 @register_controller("still", "no control")
@@ -477,7 +477,7 @@ class Still(Controller):
 
     def command(self, time, measured, reference):
         return Command(self.limits.safe)
-'''
+"""
 
 
 @pytest.fixture
@@ -513,5 +513,5 @@ def test_a_file_that_cannot_be_imported_is_told_in_one_line(name, text, message,
     if text is not None:
         (tmp_path / name).write_text(text)
     refused = run("--import", tmp_path / name, "info")
-    assert refused.exit_code == 2
-    assert refused.stderr.startswith("error: ") and message in refused.stderr and refused.stderr.count("\n") == 1
+    assert refused.exit_code == 2 and refused.stderr.startswith("error: ")
+    assert message in refused.stderr and refused.stderr.count("\n") == 1

@@ -211,7 +211,7 @@ def test_loads_at_one_place_do_what_each_does():
         (load, weight, np.zeros(0)) for load, weight in zip(loads, [1.0, 0.0, 1.0, 0.5, 1.0], strict=True)
     ]
     force, moment = point_wrench(acting, motion, gravity)
-    each = [(weight, point_wrench([(load, 1.0, control)], motion, gravity)) for load, weight, control in acting]
+    each = [(weight, point_wrench([(load, 1.0, none)], motion, gravity)) for load, weight, none in acting]
     np.testing.assert_allclose(force, sum(weight * own.force for weight, own in each), rtol=1e-12)
     np.testing.assert_allclose(moment, sum(weight * own.moment for weight, own in each), rtol=1e-12)
 

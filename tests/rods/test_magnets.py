@@ -145,9 +145,7 @@ def test_a_dipole_and_a_magnet_exchange_momentum():
     own, motion = np.array([0.2, 0.5, -0.4]), pose(7)
     there = motion._replace(p=PLACE, R=np.eye(3))
     force, couple = PointMagnet(moment=own, field=DipoleField(PLACE, MOMENT)).wrench(motion, None)
-    back, turned = PointMagnet(moment=MOMENT, field=DipoleField(motion.p, motion.R @ own)).wrench(
-        there, None
-    )
+    back, turned = PointMagnet(moment=MOMENT, field=DipoleField(motion.p, motion.R @ own)).wrench(there, None)
     np.testing.assert_allclose(force, -np.asarray(back), rtol=1e-9)
     total = couple + turned + np.cross(motion.p - PLACE, force)
     np.testing.assert_allclose(total, 0.0, atol=1e-9 * np.abs(couple).max())

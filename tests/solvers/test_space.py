@@ -194,11 +194,16 @@ def test_no_shape_of_a_coarse_grid_is_called_converged():
 @pytest.mark.parametrize(
     ("order", "formula", "check", "message"),
     [
-        (3, RADAU, Formula((SIMPSON,), (1 / 6, 1 / 6, 2 / 3)), "the stages of check do not begin with those of"),
-        (4, RADAU, Formula((*RADAU.stages, SIMPSON), (1 / 6, 1 / 6, 0.0, 2 / 3)), "formula has order 3; allowed is 4"),
+        (3, RADAU, Formula((SIMPSON,), (1 / 6, 1 / 6, 2 / 3)), "stages of check do not begin with those of"),
+        (4, RADAU, Formula((*RADAU.stages, SIMPSON), (1 / 6, 1 / 6, 0.0, 2 / 3)), "formula has order 3; "),
         (3, RADAU, RADAU, "check has order 3; allowed is 4 or more"),
-        (1, Formula((Stage(0.5, 0.0, (0.4,)),), (0.0, 0.0, 1.0)), RADAU, "Stage.* is not consistent; allowed are"),
-        (1, Formula((), (1.0,)), RADAU, "a formula has 1 weights; allowed are 2: of the start, the end and 0 st"),
+        (
+            1,
+            Formula((Stage(0.5, 0.0, (0.4,)),), (0.0, 0.0, 1.0)),
+            RADAU,
+            "Stage.* is not consistent;",
+        ),
+        (1, Formula((), (1.0,)), RADAU, "a formula has 1 weights; allowed are 2: of the start, the end"),
     ],
 )
 def test_formulas_that_do_not_fit_are_refused(order, formula, check, message):

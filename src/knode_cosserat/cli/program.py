@@ -278,8 +278,7 @@ Verbose = Annotated[
 def import_file(path: Path) -> None:
     """Import a Python file, so that the program knows the loads, schemes and others that it defines.
 
-    Its folder joins the end of the module path, so that it may import its neighbours, and worker processes of a
-    sweep find its classes.
+    Its folder joins the end of the module path: it may import its neighbours, and worker processes find it.
 
     Raises:
         ImportError: there is no such file, its name is that of another module, or its code fails.

@@ -109,7 +109,9 @@ class MaterialLaw(NamedTuple):
     internal: Callable[[Fields, Fields], dict[str, Evolution]] | None = None
 
     def with_strain(self, name: str, strain: Viscoelastic) -> MaterialLaw:
-        """Return the law with another law of one strain: "v" of shear and extension, "u" of bending and twisting.
+        """Return the law with another law of one strain.
+
+        The strains are "v" of shear and extension, and "u" of bending and twisting.
 
         Raises:
             ValueError: a strain that the law has not, or a moment that is no `Partial` or no vector.

@@ -115,7 +115,7 @@ class PointLoad(Load):
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench | None:
-        """Return the load on the rod (N, N·m) in the global frame; None if there is none beside its body's."""
+        """Return the load on the rod (N, N·m), global frame; None if there is only that of its body."""
 
 
 class SpreadLoad(Stretched, Load):
@@ -128,7 +128,7 @@ class SpreadLoad(Stretched, Load):
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """Return the load on the rod per length (N/m, N) in the global frame, within its stretch."""
+        """Return the load on the rod per length (N/m, N), global frame, within its stretch."""
 
 
 class _Prescribed(Load):

@@ -18,7 +18,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._files.yaml_text import did_you_mean, excerpt, flow
+from knode_cosserat._files.yaml_text import UNKNOWN_HERE, did_you_mean, excerpt, flow
 from knode_cosserat._reprs import object_text
 from knode_cosserat.errors import KnodeCosseratError
 
@@ -338,7 +338,7 @@ class _Slot:
             raise ParameterError(f"{name} is {excerpt(value)}; allowed is a mapping with a kind: {names}")
         kind = value["kind"]
         if not isinstance(kind, str) or kind not in known:
-            hint = did_you_mean(kind, known) or "; one of your own is known once its file is imported (--import)"
+            hint = did_you_mean(kind, known) or UNKNOWN_HERE
             raise ParameterError(f"{name}.kind is {excerpt(kind)}; allowed is {names}{hint}")
         return read_object(known[kind], {key: value[key] for key in value if key != "kind"}, name)
 
@@ -403,8 +403,8 @@ def parameter(
     Args:
         unit: SI unit, such as "N m2"; empty for a number without one.
         meaning: a few words, for errors, files and the schema.
-        shape: "scalar" (a number), "vector" (3 numbers), "direction" (3, not all zero), "quaternion" (4, scalar
-            first), "matrix" (symmetric 3 x 3; also one number, or its diagonal) or "list" (any count).
+        shape: "scalar" (a number), "vector" (3 numbers), "direction" (3, not all zero), "quaternion" (4,
+            scalar first), "matrix" (symmetric 3 x 3; also one number, or its diagonal) or "list" (any count).
         low: lowest allowed number; of a matrix, lowest eigenvalue.
         high: highest one.
         default: value by default; without one the parameter is required.

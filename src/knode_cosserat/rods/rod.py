@@ -416,8 +416,8 @@ class SlenderRod(System):
                 total = part.law(point, total, internal)
                 if not isinstance(total, MaterialLaw):
                     raise TypeError(
-                        f"{type(part).__name__}.law returns a {type(total).__name__}; allowed is the law with the"
-                        " part, such as law.with_strain(name, strain)"
+                        f"{type(part).__name__}.law returns a {type(total).__name__}; allowed is the law with"
+                        " the part, such as law.with_strain(name, strain)"
                     )
             return total
 

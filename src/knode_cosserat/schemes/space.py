@@ -64,8 +64,8 @@ def _order_of(formula: Formula) -> int:
         places.append(stage.place)
     if len(formula.weights) != len(values):
         raise ValueError(
-            f"a formula has {len(formula.weights)} weights; allowed are {len(values)}: of the start, the end and"
-            f" {len(formula.stages)} stages"
+            f"a formula has {len(formula.weights)} weights; allowed are {len(values)}: of the start, the end"
+            f" and {len(formula.stages)} stages"
         )
     step = np.append(0.0, np.dot(formula.weights, values)[:-1])
     moments = [np.dot(formula.weights, np.power(places, k)) - 1.0 / (k + 1) for k in range(MOST)]

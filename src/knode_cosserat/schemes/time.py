@@ -33,7 +33,7 @@ class TimeScheme(abc.ABC):
     uses_rate = False
     #: ends of the stages as parts of a step; multistep schemes have one stage
     ends: ClassVar[tuple[float, ...]] = (1.0,)
-    #: weights of the states (newest first) in a sum d: the rate's error is J d in a step of y_t = J y, so that
+    #: weights of the states (newest first) in a sum d: in a step of y_t = J y the rate's error is J d, and
     #: the step adds the error J d / c0. Where the leading error is C dt^p y^(p+1), d is C dt^p y^(p) by
     #: differences of the states, for equal steps. Empty: no estimate
     defect: ClassVar[tuple[float, ...]] = ()
@@ -84,9 +84,9 @@ class SDIRK(TimeScheme):
         gamma = A[-1, -1]
         if count < 2 or gamma <= 0.0 or np.any(np.diag(A) != gamma):
             raise ValueError(
-                f"{cls.__name__}: the last weights of the tableau's rows are {np.diag(A).tolist()}; allowed are"
-                " two or more rows of 1, 2, … weights that end in one γ > 0, the last row for the step. A scheme"
-                " with an explicit stage is a TimeScheme that states its `stages`"
+                f"{cls.__name__}: the last weights of the tableau's rows are {np.diag(A).tolist()}; allowed"
+                " are two or more rows of 1, 2, … weights that end in one γ > 0, the last row for the step."
+                " A scheme with an explicit stage is a TimeScheme that states its `stages`"
             )
         if np.any(abs(excess[:-1]) > 1e-9):
             lower = int(np.argmax(abs(excess) > 1e-9)) - 1
@@ -206,7 +206,8 @@ def check_scheme(scheme: TimeScheme) -> None:
         *c, d1 = pad_coefficients(coefficients, scheme.memory)
         if d1 and not scheme.uses_rate:
             raise ValueError(
-                f"{name}: the last coefficient, of the last rate, is {d1:.4g}; allowed is 0, or uses_rate = True"
+                f"{name}: the last coefficient, of the last rate, is {d1:.4g}; allowed is 0, or"
+                " uses_rate = True"
             )
         times = -np.arange(len(c), dtype=float)
         for power in range(order + 1 if len(stages) == 1 else 1):
@@ -215,8 +216,8 @@ def check_scheme(scheme: TimeScheme) -> None:
                 raise ValueError(
                     f"{name}: for steps of 1 s, its coefficients make {rate:.4g} of the rate of t^{power} at"
                     f" t = 0, which is {int(power == 1)}; order {order} allows no error up to t^{order}."
-                    " Coefficients are c0, c1, c2, … of the states, newest first, and last d1 of the last rate"
-                    " (0: none)"
+                    " Coefficients are c0, c1, c2, … of the states, newest first, and last d1 of the last"
+                    " rate (0: none)"
                 )
 
 
