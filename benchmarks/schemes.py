@@ -26,7 +26,8 @@ class Midpoint(SpaceScheme):
 
     order = 2
     formula = Formula((Stage(0.5, 0.5, (0.0, 0.0)),), (0.0, 0.0, 1.0))
-    check = Lobatto2.check
+    # Simpson's rule: its middle is the cubic's, not the mean of the ends
+    check = Formula((*formula.stages, *Lobatto2.check.stages), (1 / 6, 1 / 6, 0.0, 2 / 3))
 
 
 SCHEMES: dict[str, SpaceScheme] = {

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
 
@@ -461,3 +462,56 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     assert "held-out recording (simulated)" in title
     assert "nominal model" in nominal and float(nominal.split()[-1]) > 15.0
     assert "calibrated model" in calibrated and float(calibrated.split()[-1]) < 5.0
+
+
+CONTROLLER = """
+from knode_cosserat.control import Command, Controller, register_controller
+
+@register_controller("still", "no control")
+class Still(Controller):
+    def __init__(self, robot, dt, limits):
+        self.dt, self.limits = dt, limits.of(robot)
+
+    def reset(self, control):
+        pass
+
+    def command(self, time, measured, reference):
+        return Command(self.limits.safe)
+"""
+
+
+@pytest.fixture
+def forgotten(monkeypatch):
+    """Modules, folders and controllers that a test imports are gone after it."""
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    yield
+    sys.modules.pop("my_controller", None)
+    CONTROLLERS.pop("still", None)
+
+
+def test_a_file_is_imported_before_the_command(tmp_path, forgotten):
+    (tmp_path / "my_controller.py").write_text(CONTROLLER)
+    command = ("control", "delrin-tendon-robot", "--method")
+    refused = run(*command, "still", "--reference", "circle")
+    assert "; one of your own is known once its file is imported (--import)" in refused.stderr
+    for _ in range(2):
+        listed = succeeded("--import", tmp_path / "my_controller.py", *command, "list")
+        assert "still: no control" in listed
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("none.py", None, "none.py is not a Python file; allowed for --import is a file such as my_loads.py"),
+        ("robot.yaml", "", "robot.yaml is not a Python file"),
+        ("json.py", "", "json.py has the name of the module json; allowed is a name of its own"),
+        ("divides.py", "import math\n\n1 / 0\n", "divides.py, line 3: ZeroDivisionError: division by zero"),
+        ("unclosed.py", "x = (\n", "unclosed.py: SyntaxError: "),
+    ],
+)
+def test_a_file_that_cannot_be_imported_is_told_in_one_line(name, text, message, tmp_path, forgotten):
+    if text is not None:
+        (tmp_path / name).write_text(text)
+    refused = run("--import", tmp_path / name, "info")
+    assert refused.exit_code == 2 and refused.stderr.startswith("error: ")
+    assert message in refused.stderr and refused.stderr.count("\n") == 1

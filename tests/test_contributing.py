@@ -1,4 +1,4 @@
-"""The examples of CONTRIBUTING.md are those of tests; here is one of an effect that `identify` finds."""
+"""The examples of CONTRIBUTING.md are those of tests; here are those of effects that `identify` finds."""
 
 import ast
 import json
@@ -6,14 +6,16 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any, ClassVar
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification import effects, reel_effects, rod_effects, tendon_effects
-from knode_cosserat.identification.effects import PossibleEffect, along_axes, register
+from knode_cosserat.identification import effects, numbers_at, reel_effects, rod_effects, tendon_effects
+from knode_cosserat.identification.effects import PossibleEffect, along_axes, library_model, register
+from knode_cosserat.robots import Wrench, loads, parameter
 
 ROOT = Path(__file__).parents[1]
 EXAMPLES = re.findall(
@@ -23,6 +25,23 @@ EXAMPLES = re.findall(
 
 def tilted(robot, values):
     return robot.replace(gravity=jnp.asarray(robot.gravity) + jnp.stack([*values, 0.0 * values[0]]))
+
+
+class Wind(loads.SpreadLoad):
+    """A steady wind."""
+
+    kind: ClassVar[str] = "wind"
+
+    force: Any = parameter(
+        "N/m", "force per length, global frame", shape="vector", low=-1e3, high=1e3, default=(0.0, 0.0, 0.0)
+    )
+
+    def wrench(self, motion, control):
+        return Wrench(self.force, jnp.zeros(3))
+
+
+def in_wind(robot):
+    return robot.replace(loads=(*robot.loads, Wind()))
 
 
 #: they register themselves when they are imported, and that is to last
@@ -39,8 +58,30 @@ def tilt(monkeypatch):
         return [PossibleEffect("tilt", along_axes("gravity", "m/s2", 0.5, "xy"), tilted)]
 
 
+@pytest.fixture
+def wind(monkeypatch):
+    monkeypatch.setattr(effects, "_libraries", dict(effects._libraries))
+
+    @register()
+    def wind_effects(nominal, usual):
+        """Return the effect of a wind of some 0.05 N/m."""
+        return [PossibleEffect("wind", numbers_at(in_wind(nominal), "loads.wind.force", 0.05), part=in_wind)]
+
+
+def test_an_effect_finds_its_part_among_those_of_others(wind):
+    """The tip mass of the library is a load too, and stands before the wind."""
+    nominal = kc.load_robot("delrin-routed-tendon-robot")
+    model = library_model(nominal, np.ones((2, 4)))
+    x = np.zeros(model.size)
+    x[model.slice("wind")] = 1.0, -2.0, 0.0
+    for names, added in ((model.names, ["attached-mass", "wind"]), (("wind",), ["wind"])):
+        robot = model.reduced(x, names)
+        assert [load.kind for load in robot.loads[len(nominal.loads) :]] == added
+        np.testing.assert_allclose(robot.loads[-1].force, [0.05, -0.1, 0.0])
+
+
 def test_each_way_to_extend_the_package_has_an_example():
-    assert len(EXAMPLES) == 9
+    assert len(EXAMPLES) == 12
 
 
 @pytest.mark.parametrize(("code", "file"), EXAMPLES, ids=[file for _, file in EXAMPLES])

@@ -57,7 +57,7 @@ def test_the_power_of_the_fluid_is_the_rate_of_its_energy(seed):
     q, q_t = q - still, q_t + np.cross(w, still)
     assert power == pytest.approx(-ADDED * (q[:2] @ q_t[:2]), rel=1e-12)
     # a tail leaves the energy of the fluid behind it, at the speed at which it moves on
-    span = Tail(span=2 * RADIUS, stream=STREAM).wrench(motion, None, None)
+    span = Tail(span=2 * RADIUS, stream=STREAM).wrench(motion, None)
     assert span.force @ relative == pytest.approx(0.5 * ADDED * q[2] * (q[:2] @ q[:2]), rel=1e-12)
     # drag takes energy only
     dragged = Fluid(added_mass=0.0, stream=STREAM).load(at(motion)).force
@@ -136,7 +136,7 @@ def test_it_bends_a_rod_as_the_theory_of_elongated_bodies_does():
         parts = jax.vmap(at_part)(jnp.asarray(GAUSS))
         own, theirs = ((1.0 - cut) * jnp.asarray(WEIGHT) @ part for part in parts)
         end = motion_of(1.0, t)
-        return own + jnp.cross(end.p - place(cut, t), tail.wrench(end, None, None).force), theirs
+        return own + jnp.cross(end.p - place(cut, t), tail.wrench(end, None).force), theirs
 
     for cut in (0.0, 0.3, 0.8):
         own, theirs = moments(cut)

@@ -189,7 +189,7 @@ def test_the_wrench_of_a_moving_body_is_the_rate_of_its_momentum(offset, inertia
     p, R = pose(t)
     q, w, q_t, w_t = np.split(np.concatenate([velocities(t), rate(velocities, t)]), 4)
     body = AttachedMass(mass=mass, offset=offset, inertia=inertia)
-    force, moment = body.wrench(Motion(p, R, q, w, q_t, w_t), g, np.zeros(0))
+    force, moment = body.body.wrench(Motion(p, R, q, w, q_t, w_t), g)
     weight = np.concatenate([mass * g, np.cross(p + R @ r, mass * g)])
     taken = weight - rate(momentum, t, 1e-3)
     np.testing.assert_allclose(force, taken[:3], atol=1e-6)
@@ -211,7 +211,7 @@ def test_loads_at_one_place_do_what_each_does():
         (load, weight, np.zeros(0)) for load, weight in zip(loads, [1.0, 0.0, 1.0, 0.5, 1.0], strict=True)
     ]
     force, moment = point_wrench(acting, motion, gravity)
-    each = [(weight, load.wrench(motion, gravity, control)) for load, weight, control in acting]
+    each = [(weight, point_wrench([(load, 1.0, none)], motion, gravity)) for load, weight, none in acting]
     np.testing.assert_allclose(force, sum(weight * own.force for weight, own in each), rtol=1e-12)
     np.testing.assert_allclose(moment, sum(weight * own.moment for weight, own in each), rtol=1e-12)
 

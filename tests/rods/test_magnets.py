@@ -127,7 +127,7 @@ def flux(p, position, moment):
 @pytest.mark.parametrize("seed", range(4))
 def test_the_wrench_of_a_dipole_is_the_slope_of_its_energy(seed):
     motion, own = pose(seed), np.array([0.2, 0.5, -0.4])
-    force, couple = PointMagnet(moment=own, field=DipoleField(PLACE, MOMENT)).wrench(motion, None, None)
+    force, couple = PointMagnet(moment=own, field=DipoleField(PLACE, MOMENT)).wrench(motion, None)
 
     def energy(x, turn=(0.0, 0.0, 0.0)):
         m = Rotation.from_rotvec(turn).apply(motion.R @ own)
@@ -144,10 +144,8 @@ def test_a_dipole_and_a_magnet_exchange_momentum():
     """Forces are opposite, and couples with the moments of the forces cancel."""
     own, motion = np.array([0.2, 0.5, -0.4]), pose(7)
     there = motion._replace(p=PLACE, R=np.eye(3))
-    force, couple = PointMagnet(moment=own, field=DipoleField(PLACE, MOMENT)).wrench(motion, None, None)
-    back, turned = PointMagnet(moment=MOMENT, field=DipoleField(motion.p, motion.R @ own)).wrench(
-        there, None, None
-    )
+    force, couple = PointMagnet(moment=own, field=DipoleField(PLACE, MOMENT)).wrench(motion, None)
+    back, turned = PointMagnet(moment=MOMENT, field=DipoleField(motion.p, motion.R @ own)).wrench(there, None)
     np.testing.assert_allclose(force, -np.asarray(back), rtol=1e-9)
     total = couple + turned + np.cross(motion.p - PLACE, force)
     np.testing.assert_allclose(total, 0.0, atol=1e-9 * np.abs(couple).max())

@@ -31,6 +31,16 @@ class AddedMass(loads.SpreadLoad):
         return Wrench(-self.mass * dot(motion.R, acceleration * np.array([1.0, 1.0, 0.0])), jnp.zeros(3))
 
 
+class Spring(loads.PointLoad):
+    """A spring from a place of the rod to a fixed point."""
+
+    stiffness: Any = parameter("N/m", "k, of the spring", low=0.0, high=1e6)
+    anchor: Any = parameter("m", "its fixed end, global frame", shape="vector", low=-10.0, high=10.0)
+
+    def wrench(self, motion, control):
+        return Wrench(self.stiffness * (self.anchor - motion.p), jnp.zeros(3))
+
+
 class FrictionLayer(Effect):
     """Bristles that hold the rod: x_t = velocity while |x| < reach, and the force -k x per length."""
 
@@ -67,6 +77,26 @@ def layered(stiffness=2.0, reach=0.01):
 def motion(robot):
     batch = (len(robot),) if isinstance(robot, list) else ()
     return kc.simulate(robot, np.zeros((*batch, STEPS, 0)), DT, initial="unstressed")
+
+
+def test_a_spring_bends_a_beam_as_in_the_books():
+    """Its force is k X / (1 + k c), with the compliance c of the beam there; at the tip the slope adds."""
+    L, r, E, k, X = 0.4, 0.004, 200e9, 200.0, 0.05
+    beam = SlenderRod(
+        L,
+        radius=r,
+        density=1.0,
+        youngs_modulus=E,
+        gravity=(0.0, 0.0, 0.0),
+        nodes=41,
+        loads=(Spring(at=0.5, stiffness=k, anchor=(X, 0.0, 0.5 * L)),),
+    )
+    found = kc.equilibrium(beam, space="lobatto4")
+    EI, GA, a = E * np.pi * r**4 / 4, E / 2.6 * np.pi * r**2, 0.5 * L
+    c = a**3 / (3 * EI) + a / GA
+    force = k * X / (1 + k * c)
+    # the deflection is small: its square is 2e-5
+    assert found.tip_position[0, 0] == pytest.approx(force * (c + a**2 / (2 * EI) * (L - a)), rel=1e-4)
 
 
 def test_bristles_follow_the_rod_until_they_slide():

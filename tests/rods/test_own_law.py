@@ -48,3 +48,28 @@ def test_a_stiffening_rod_bends_to_a_circle(cubic):
     found = kc.equilibrium(rod, np.zeros(0), space="lobatto4")
     height = np.sin(curvature * length) / curvature
     assert found.tip_position[0, 2] == pytest.approx(height, rel=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        (lambda law: law.with_strain("k", law.strains["u"]), "strain is 'k'; allowed is v, u"),
+        (lambda law: law.strains["u"], "Wrong.law returns a Viscoelastic; allowed is the law with the part"),
+        (lambda law: with_moment(law, lambda u, u_t: u), "moment is a function; allowed is jax.tree_util.P"),
+        (lambda law: with_moment(law, Partial(lambda u, u_t: u[0])), r"moment returns .* of shape \(3,\)"),
+    ],
+)
+def test_a_law_of_another_form_is_refused(changed, message):
+    """A moment that is one number bent the rod about all axes without a word."""
+
+    class Wrong(Effect):
+        def law(self, point, law, internal):
+            return changed(law)
+
+    rod = kc.robots.SlenderRod(0.3, radius=2e-3, density=1e3, youngs_modulus=2e9, effects=(Wrong(),))
+    with pytest.raises((TypeError, ValueError), match=message):
+        kc.equilibrium(rod, np.zeros(0))
+
+
+def with_moment(law, moment):
+    return law.with_strain("u", law.strains["u"]._replace(moment=moment))

@@ -24,3 +24,30 @@ def test_dependent_stiffness_follows_unless_given(robot):
 @pytest.mark.parametrize("given", [0.1, [0.1, 0.1, 0.1], 0.1 * np.eye(3)])
 def test_matrices_in_three_ways(robot, given):
     np.testing.assert_array_equal(robot.replace(bending_damping=given).bending_damping, 0.1 * np.eye(3))
+
+
+def test_a_part_is_named_by_its_number_or_its_kind():
+    """An effect names the part that it adds, wherever it stands among those of other effects."""
+    loads = kc.robots.loads
+    rod = kc.robots.SlenderRod(
+        0.4,
+        radius=0.004,
+        density=1000.0,
+        youngs_modulus=1e8,
+        loads=(loads.AttachedMass(mass=0.1), loads.PointWrench(), loads.AttachedMass(mass=0.2, at=0.5)),
+    )
+    pushed = rod.replace(**{"loads.point-wrench.force": [1.0, 2.0, 3.0]})
+    np.testing.assert_array_equal(pushed.loads[1].force, [1.0, 2.0, 3.0])
+    assert [float(load.mass) for load in (pushed.loads[0], pushed.loads[2])] == [0.1, 0.2]
+    for name, message in (
+        ("loads.attached-mass.mass", "may be any of several parts of the kind attached-mass; .* 0, 2"),
+        ("loads.point-wrnch.force", "no 'point-wrnch' among .*, attached-mass, point-wrench; did you mean"),
+        ("loads.3.mass", "no '3' among 0, 1, 2, attached-mass, point-wrench"),
+    ):
+        with pytest.raises(kc.robots.ParameterError, match=message):
+            rod.replace(**{name: 1.0})
+
+
+def test_a_parameter_has_one_of_the_shapes():
+    with pytest.raises(ValueError, match=r"shape is \(3,\); allowed is scalar, vector, direction, q"):
+        kc.robots.parameter("m", "a place", shape=(3,), low=0.0, high=1.0)

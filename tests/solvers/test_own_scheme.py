@@ -9,7 +9,7 @@ from scipy.linalg import expm
 
 import knode_cosserat as kc
 from knode_cosserat.schemes.history import StepCoefficients, TimeStep
-from knode_cosserat.schemes.time import SDIRK, TimeScheme
+from knode_cosserat.schemes.time import BDF2, SDIRK, TimeScheme
 from knode_cosserat.solvers.recovery import Budget, StepRecovery
 from tests.physics.test_closed_forms import Bar
 
@@ -31,6 +31,15 @@ class BDF3(TimeScheme):
             slopes = [np.prod(-np.delete(others, j)) for j in range(len(others))]
             c.append(float(np.sum(slopes) / np.prod(time - others)))
         return *c, 0.0
+
+
+@dataclasses.dataclass(frozen=True)
+class EstimatedBDF2(BDF2):
+    """BDF2 with an estimate of its error: the rate's is dt² y_ttt / 3, which is J d with d = dt² y_tt / 3."""
+
+    name = "bdf2-estimated"
+    # dt² y_tt is the second difference of the states
+    defect = (1 / 3, -2 / 3, 1 / 3)
 
 
 #: root of γ³ - 3γ² + 3γ/2 - 1/6, for which the scheme is L-stable (Alexander 1977)
@@ -101,10 +110,54 @@ def test_a_tableau_has_its_order_and_the_estimate_of_its_error(time, order):
     assert np.log2(largest[0] / largest[1]) == pytest.approx(order, abs=0.1)
 
 
-@pytest.mark.parametrize("tableau", [((0.5,), (0.5, 0.5)), ((G,), (1.0 - G, 0.5)), ((1.0,),)])
-def test_a_tableau_of_another_order_is_refused(tableau):
-    with pytest.raises(ValueError, match="Wrong: the tableau has not order 2; allowed are two or more rows"):
+def test_a_scheme_of_several_steps_estimates_its_error_by_its_defect():
+    """Against the same closed form; the error of the first step, by BDF1, is not estimated."""
+    bar, s, largest = Bar(damping=0.1, nodes=41), np.linspace(0.0, 1.0, 41), []
+    square = bar.wave_number**2
+    matrix = np.array([[0.0, 1.0, 0.0], [-square, -bar.damping * square, 1.0], [0.0, 0.0, 0.0]])
+    for count in (40, 80):
+        found = kc.simulate(bar, np.ones((count, 1)), 1.0 / count, time="bdf2-estimated", space="lobatto4")
+        exact = np.array([expm(matrix * t)[0, 2] for t in found.time])
+        errors = found.part("p")[..., 0] - s - exact[:, None] * np.sin(bar.wave_number * s)
+        largest.append(np.abs(errors).max())
+        assert found.time_error[1:].max() == pytest.approx(largest[-1], rel=0.25)
+    assert np.log2(largest[0] / largest[1]) == pytest.approx(2, abs=0.2)
+
+
+@pytest.mark.parametrize(
+    ("tableau", "message"),
+    [
+        (((0.5,), (0.5, 0.5)), r"Wrong: the tableau has order 1 \(order states 2\)"),
+        (((G,), (1.0 - G, 0.5)), r"Wrong: the last weights of the tableau's rows are \[.*; allowed are two"),
+        # TR-BDF2, of order 2, has an explicit stage
+        (((0.0,), (0.29, 0.29), (0.35, 0.36, 0.29)), "Wrong: the last weights .* a TimeScheme that"),
+        (((1.0,),), "Wrong: the last weights .*; allowed are two or more rows"),
+    ],
+)
+def test_a_tableau_of_another_form_or_order_is_refused(tableau, message):
+    with pytest.raises(ValueError, match=message):
         type("Wrong", (SDIRK,), {"order": 2, "tableau": tableau})
+
+
+@pytest.mark.parametrize(
+    ("coefficients", "more", "message"),
+    [
+        ((1.5, -2.0, 0.5), {}, "the last coefficient, of the last rate, is .*; allowed is 0, or uses_r"),
+        ((1.5, -2.0, 0.4, 0.0), {}, r"of the rate of t\^0 .* which is 0; order 2 allows no error up to t\^2"),
+        ((1.0, -1.0, 0.0, 0.0), {}, r"of the rate of t\^2 .* which is 0; order 2 allows no error up to t\^2"),
+        ((1.5, -2.0, 0.5, 0.0), {"defect": (1.0, -1.0)}, r"defect is .*; allowed are memory \+ 1 = 3 w"),
+        ((1.5, -2.0, 0.5, 0.0), {"defect": (1.0, -1.0, 1.0)}, "allowed are .* with the sum zero"),
+    ],
+)
+def test_coefficients_of_another_order_are_refused(coefficients, more, message):
+    """A scheme that forgot the last zero ran, and its motion was wrong without a word."""
+
+    def stated(self, dt, *previous):
+        return tuple(np.array(coefficients) / dt)
+
+    wrong = type("Wrong", (TimeScheme,), {"order": 2, "coefficients": stated, **more})
+    with pytest.raises(ValueError, match=f"Wrong: .*{message}"):
+        kc.simulate(ROBOT, *pulled(4), time=wrong())
 
 
 @pytest.mark.parametrize("cut", [1, 2, 5])

@@ -9,7 +9,7 @@ import pytest
 import knode_cosserat as kc
 from benchmarks.motions import soft_rod
 from knode_cosserat.schemes.settings import schemes
-from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.schemes.space import Formula, SpaceScheme, Stage
 
 SCHEMES = {name: scheme() for name, scheme in schemes(SpaceScheme).items()}
 LOBATTO = ("lobatto2", "lobatto4")
@@ -29,6 +29,10 @@ def amplification(formula, z):
     start, end = sum(b * z * own for b, own in zip(formula.weights, stages, strict=True))
     return (1.0 + start) / (1.0 - end)
 
+
+#: Radau's quadrature, of order 3, with the value at its place of the parabola through both ends and a rate
+RADAU = Formula((Stage(2 / 3, 4 / 9, (2 / 9,)),), (0.25, 0.0, 0.75))
+SIMPSON = Stage(0.5, 0.5, (0.125, -0.125))
 
 TURNS = np.linspace(-1.57, 1.57, 41)
 LEFT = [-size * np.exp(1j * turn) for size in np.logspace(-3, 4, 71) for turn in TURNS]
@@ -185,3 +189,26 @@ def test_no_shape_of_a_coarse_grid_is_called_converged():
         "solved", both.sum(), "off", np.nanmax(off), "estimate", np.nanmax(found.position_error), found.result
     )
     assert np.any(both) and not np.any(found.result[wrong] == kc.Result.CONVERGED)
+
+
+@pytest.mark.parametrize(
+    ("order", "formula", "check", "message"),
+    [
+        (3, RADAU, Formula((SIMPSON,), (1 / 6, 1 / 6, 2 / 3)), "stages of check do not begin with those of"),
+        (4, RADAU, Formula((*RADAU.stages, SIMPSON), (1 / 6, 1 / 6, 0.0, 2 / 3)), "formula has order 3; "),
+        (3, RADAU, RADAU, "check has order 3; allowed is 4 or more"),
+        (
+            1,
+            Formula((Stage(0.5, 0.0, (0.4,)),), (0.0, 0.0, 1.0)),
+            RADAU,
+            "Stage.* is not consistent;",
+        ),
+        (1, Formula((), (1.0,)), RADAU, "a formula has 1 weights; allowed are 2: of the start, the end"),
+    ],
+)
+def test_formulas_that_do_not_fit_are_refused(order, formula, check, message):
+    """A check with other stages gave estimates of another order without a word."""
+    if "not consistent" in message:
+        check = Formula((*formula.stages, SIMPSON), (1 / 6, 1 / 6, 0.0, 2 / 3))
+    with pytest.raises(ValueError, match=message):
+        type("Wrong", (SpaceScheme,), {"order": order, "formula": formula, "check": check})

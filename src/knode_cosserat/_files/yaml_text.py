@@ -99,6 +99,10 @@ def excerpt(value: Any) -> str:
     return text if len(text) <= 250 else text[:250] + "…"
 
 
+#: end of an error about a name that no class has
+UNKNOWN_HERE = "; one of your own is known once its file is imported (--import)"
+
+
 def did_you_mean(given: Any, known: Any) -> str:
     """Return the hint of an error about an unknown name: the closest known name, or an empty string."""
     close = difflib.get_close_matches(str(given), list(known), n=1)

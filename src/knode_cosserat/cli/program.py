@@ -7,13 +7,17 @@ and its typer application. They are imported when they are called, or listed in 
 from __future__ import annotations
 
 import functools
+import importlib
+import importlib.util
 import inspect
 import io
 import logging
 import re
 import sys
+import traceback
 import warnings
 from importlib.metadata import entry_points
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
@@ -271,6 +275,29 @@ Verbose = Annotated[
 ]
 
 
+def import_file(path: Path) -> None:
+    """Import a Python file, so that the program knows the loads, schemes and others that it defines.
+
+    Its folder joins the end of the module path: it may import its neighbours, and worker processes find it.
+
+    Raises:
+        ImportError: there is no such file, its name is that of another module, or its code fails.
+    """
+    path = path.absolute()
+    if path.suffix != ".py" or not path.is_file():
+        raise ImportError(f"{path} is not a Python file; allowed for --import is a file such as my_loads.py")
+    sys.path.append(str(path.parent))
+    spec = importlib.util.find_spec(path.stem)
+    if spec is None or spec.origin is None or not path.samefile(spec.origin):
+        raise ImportError(f"{path} has the name of the module {path.stem}; allowed is a name of its own")
+    try:
+        importlib.import_module(path.stem)
+    except Exception as error:
+        lines = [it.lineno for it in traceback.extract_tb(error.__traceback__) if it.filename == spec.origin]
+        place = f"{path}, line {lines[-1]}" if lines else str(path)
+        raise ImportError(f"{place}: {type(error).__name__}: {error}") from error
+
+
 def log_details(*packages: str) -> None:
     """Log the details of some packages on stderr."""
     handler = logging.StreamHandler()
@@ -299,6 +326,15 @@ def program(
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
     ] = False,
     verbose: Verbose = False,
+    imported: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--import",
+            metavar="FILE.py",
+            help="Run this Python file first: the command then knows its loads, schemes, effects, controllers"
+            " and formats by their names. May be repeated.",
+        ),
+    ] = None,
 ) -> None:
     """Simulate Cosserat-rod robots, learn residual models and identify parameters.
 
@@ -306,6 +342,8 @@ def program(
     """
     if verbose:
         log_details("knode_cosserat")
+    for path in imported or ():
+        import_file(path)
 
 
 @app.command(

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._arguments import check_arguments
-from knode_cosserat._files.yaml_text import did_you_mean
+from knode_cosserat._files.yaml_text import UNKNOWN_HERE, did_you_mean
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
 
@@ -219,10 +219,8 @@ def controller_named(
     check_arguments(controller_named, locals())
     name, _, text = name.partition(":")
     if name not in CONTROLLERS:
-        raise ValueError(
-            f"there is no controller {name!r}; there are {', '.join(CONTROLLERS)}"
-            f"{did_you_mean(name, CONTROLLERS)}"
-        )
+        hint = did_you_mean(name, CONTROLLERS) or UNKNOWN_HERE
+        raise ValueError(f"there is no controller {name!r}; there are {', '.join(CONTROLLERS)}{hint}")
     cls = CONTROLLERS[name]
     if adapt and not cls.has_observer:
         observing = ", ".join(key for key, entry in CONTROLLERS.items() if entry.has_observer)

@@ -63,7 +63,8 @@ def identify(
     same in every run. An interruption by Ctrl-C is a `KeyboardInterrupt`, whose `best` is this robot.
 
     Args:
-        robot: nominal robot, where the search begins; effects need a robot with tendons.
+        robot: nominal robot, where the search begins; effects need a robot with tendons. A `TendonRobot`,
+            whose tendons push it sideways, is searched as a `RoutedTendonRobot`, whose tendons bend it.
         data: recordings (`load_recording`, or rows of them, `Recording.sampled(0.0125, mean=True)`), each
             starting at rest, at least two to select effects; full states; or experiments.
         effects: names of effects (`effects_of`) that are all identified; None: select effects, unless there

@@ -119,7 +119,7 @@ class Tail(_Immersed, PointLoad):
         default=0.0,
     )
 
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+    def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return the force at the edge."""
         q, m = self.relative(motion), self.density * np.pi * self.span**2 / 4.0
         across = ACROSS * q

@@ -14,6 +14,9 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Layout
@@ -106,7 +109,17 @@ class MaterialLaw(NamedTuple):
     internal: Callable[[Fields, Fields], dict[str, Evolution]] | None = None
 
     def with_strain(self, name: str, strain: Viscoelastic) -> MaterialLaw:
-        """Return the law with another law of one strain."""
+        """Return the law with another law of one strain.
+
+        The strains are "v" of shear and extension, and "u" of bending and twisting.
+
+        Raises:
+            ValueError: a strain that the law has not, or a moment that is no `Partial` or no vector.
+        """
+        if name not in self.strains:
+            raise ValueError(f"strain is {name!r}; allowed is {', '.join(self.strains)}")
+        if strain.moment is not None:
+            _check_moment(strain.moment)
         return self._replace(strains={**self.strains, name: strain})
 
     def with_internal(self, internal: Callable[[Fields, Fields], dict[str, Evolution]]) -> MaterialLaw:
@@ -115,6 +128,17 @@ class MaterialLaw(NamedTuple):
         if others is None:
             return self._replace(internal=internal)
         return self._replace(internal=lambda *strains: others(*strains) | internal(*strains))
+
+
+def _check_moment(moment: Any) -> None:
+    if not isinstance(moment, Partial):
+        raise ValueError(
+            "moment is a function; allowed is jax.tree_util.Partial(function, parameters), which is called as"
+            " function(parameters, strain, rate), so that derivatives reach the parameters"
+        )
+    found = jax.eval_shape(moment, jnp.zeros(3), jnp.zeros(3))
+    if getattr(found, "shape", None) != (3,):
+        raise ValueError(f"moment returns {found}; allowed is an array of shape (3,)")
 
 
 class InternalState(NamedTuple):

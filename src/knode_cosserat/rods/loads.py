@@ -96,7 +96,7 @@ class Load(Part):
 class PointLoad(Load):
     """A load at one place, `at`, as a fraction of the rod's length."""
 
-    at: float = place("where it acts", default=1.0)
+    at: float = place("where it acts", default=1.0, kw_only=True)
 
     @property
     def applied_at(self) -> float:  # type: ignore[override]
@@ -110,12 +110,12 @@ class PointLoad(Load):
 
     @property
     def body(self) -> BodyInertia | None:
-        """The load as a rigid body about the rod's axis, or None. Bodies at one place are summed."""
+        """Rigid body about the rod's axis, whose weight and inertia act beside the wrench; None: none."""
         return None
 
     @abc.abstractmethod
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
-        """Return the load on the rod (N, N·m)."""
+    def wrench(self, motion: Motion, control: Any) -> Wrench | None:
+        """Return the load on the rod (N, N·m), global frame; None if there is only that of its body."""
 
 
 class SpreadLoad(Stretched, Load):
@@ -128,7 +128,7 @@ class SpreadLoad(Stretched, Load):
 
     @abc.abstractmethod
     def wrench(self, motion: Motion, control: Any) -> Wrench:
-        """Return the load on the rod per length (N/m, N) within its stretch."""
+        """Return the load on the rod per length (N/m, N), global frame, within its stretch."""
 
 
 class _Prescribed(Load):
@@ -159,7 +159,7 @@ class PointWrench(_Prescribed, PointLoad):
     force: Any = parameter("N", "force", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
     moment: Any = parameter("N m", "moment", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
 
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+    def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return the force and the moment."""
         return self.prescribed(motion, control)
 
@@ -212,9 +212,8 @@ class AttachedMass(PointLoad):
         off_axis = self.mass * (jnp.sum(r * r) * np.eye(3) - r[:, None] * r)
         return BodyInertia(self.mass, self.mass * r, off_axis if J is None else J + off_axis)
 
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
-        """Return weight less inertial forces."""
-        return self.body.wrench(motion, gravity)
+    def wrench(self, motion: Motion, control: Any) -> None:
+        """Return None: there is no load beside that of its body."""
 
 
 def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: Any) -> Wrench:
@@ -223,9 +222,9 @@ def point_wrench(acting: list[tuple[Any, Any, Any]], motion: Motion, gravity: An
     for load, weight, control in acting:
         if load.body is not None:
             bodies.append((load.body, weight))
-            continue
-        wrench = load.wrench(motion, gravity, control)
-        total = total + Wrench(weight * wrench.force, weight * wrench.moment)
+        wrench = load.wrench(motion, control)
+        if wrench is not None:
+            total = total + Wrench(weight * wrench.force, weight * wrench.moment)
     if bodies:
         # summed before the wrench: their equations are compiled once for any number of bodies
         total = total + BodyInertia.of(bodies).wrench(motion, gravity)

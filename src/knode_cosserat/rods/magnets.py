@@ -148,6 +148,6 @@ class PointMagnet(_Magnetic, PointLoad):
         "A m2", "magnetic moment, material frame", shape="vector", low=-1e6, high=1e6, default=(0.0, 0.0, 0.0)
     )
 
-    def wrench(self, motion: Motion, gravity: Any, control: Any) -> Wrench:
+    def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return force and couple of the field."""
         return self.field.wrench(motion, self.moment, control)

@@ -13,13 +13,13 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, get_args
 
 import equinox as eqx
 import jax
 import numpy as np
 
-from knode_cosserat._files.yaml_text import did_you_mean, excerpt, flow
+from knode_cosserat._files.yaml_text import UNKNOWN_HERE, did_you_mean, excerpt, flow
 from knode_cosserat._reprs import object_text
 from knode_cosserat._units import UnitError, in_unit
 from knode_cosserat.errors import KnodeCosseratError
@@ -358,7 +358,7 @@ class _Slot:
             raise ParameterError(f"{name} is {excerpt(value)}; allowed is a mapping with a kind: {names}")
         kind = value["kind"]
         if not isinstance(kind, str) or kind not in known:
-            hint = did_you_mean(kind, known)
+            hint = did_you_mean(kind, known) or UNKNOWN_HERE
             raise ParameterError(f"{name}.kind is {excerpt(kind)}; allowed is {names}{hint}")
         return read_object(known[kind], {key: value[key] for key in value if key != "kind"}, name)
 
@@ -418,7 +418,22 @@ def parameter(
     high: float,
     default: Any = dataclasses.MISSING,
 ) -> Any:
-    """Return a dataclass field for a physical parameter (see `Parameter`); default None makes it optional."""
+    """Return a dataclass field for a physical parameter; default None makes it optional.
+
+    Args:
+        unit: SI unit, such as "N m2"; empty for a number without one.
+        meaning: a few words, for errors, files and the schema.
+        shape: "scalar" (a number), "vector" (3 numbers), "direction" (3, not all zero), "quaternion" (4,
+            scalar first), "matrix" (symmetric 3 x 3; also one number, or its diagonal) or "list" (any count).
+        low: lowest allowed number; of a matrix, lowest eigenvalue.
+        high: highest one.
+        default: value by default; without one the parameter is required.
+
+    Raises:
+        ValueError: another shape.
+    """
+    if shape not in get_args(Shape):
+        raise ValueError(f"shape is {shape!r}; allowed is {', '.join(get_args(Shape))}")
     stated = Parameter(unit, meaning, shape, low, high, optional=default is None)
     return _field(stated, default, _as_matrix if shape == "matrix" else _as_array)
 
@@ -664,7 +679,7 @@ def object_schema(cls: type[Parametrised], families: dict[str, Any], **more: Any
 
 
 def value_at(owner: Any, path: str) -> Any:
-    """Return a parameter, or a part, at a path such as `loads.0.mass`.
+    """Return a parameter, or a part, at a path such as `loads.0.mass` or `loads.attached-mass.mass`.
 
     Raises:
         ParameterError: it does not exist; the message lists the names that do.
@@ -702,8 +717,8 @@ def with_value(owner: Any, path: str, value: Any, name: str) -> Any:
     inner = _entry(owner, first, name)
     changed = with_value(inner, rest, value, name) if rest else value
     if isinstance(owner, tuple):
-        known = zip(names_of(owner), owner, strict=True)
-        return tuple(changed if own == first else part for own, part in known)
+        place = _index(owner, first, name)
+        return (*owner[:place], changed, *owner[place + 1 :])
     return dataclasses.replace(owner, **{first: changed})
 
 
@@ -715,11 +730,28 @@ def names_of(parts: tuple[Any, ...]) -> list[str]:
 def _entry(owner: Any, part: str, name: str) -> Any:
     """Return a field of a robot or part, or an entry of a tuple of parts. Raises `ParameterError`."""
     if isinstance(owner, tuple):
-        known = names_of(owner)
-    else:
-        known = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
+        return owner[_index(owner, part, name)]
+    known = [field.name for field in dataclasses.fields(owner)] if dataclasses.is_dataclass(owner) else []
     if part not in known:
-        raise ParameterError(
-            f"there is no parameter {name!r}: no {part!r} among {', '.join(known) or 'nothing'}"
-        )
-    return owner[known.index(part)] if isinstance(owner, tuple) else getattr(owner, part)
+        raise _unknown_path(part, name, known)
+    return getattr(owner, part)
+
+
+def _index(parts: tuple[Any, ...], part: str, name: str) -> int:
+    """Return the place of a part by its name, its number, or its kind if it is the only one of that kind."""
+    known = names_of(parts)
+    if part in known:
+        return known.index(part)
+    same = [k for k, one in enumerate(parts) if getattr(one, "kind", "") == part]
+    if len(same) > 1:
+        places = ", ".join(known[k] for k in same)
+        raise ParameterError(f"{name!r} may be any of several parts of the kind {part}; allowed are {places}")
+    if not same:
+        kinds = dict.fromkeys(kind for one in parts if (kind := getattr(one, "kind", "")))
+        raise _unknown_path(part, name, [*known, *kinds])
+    return same[0]
+
+
+def _unknown_path(part: str, name: str, known: list[str]) -> ParameterError:
+    listed = (", ".join(known) or "nothing") + did_you_mean(part, known)
+    return ParameterError(f"there is no parameter {name!r}: no {part!r} among {listed}")

@@ -414,6 +414,11 @@ class SlenderRod(System):
             total = self.linear_law(s, y, control)
             for part, point in parts:
                 total = part.law(point, total, internal)
+                if not isinstance(total, MaterialLaw):
+                    raise TypeError(
+                        f"{type(part).__name__}.law returns a {type(total).__name__}; allowed is the law with"
+                        " the part, such as law.with_strain(name, strain)"
+                    )
             return total
 
         return InternalState(evolutions, law) if evolutions else law({})

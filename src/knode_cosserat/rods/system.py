@@ -151,8 +151,9 @@ class System(Parametrised):
 
         The nodes stay, unless other parts need more and nobody stated them.
 
-        Parameters of parts have names with dots, and indices if there are several parts:
-        `base_end.position`, `loads.0.mass`. They are passed as `replace(**{"loads.0.mass": 0.1})`.
+        Parameters of parts have names with dots. One of several parts is named by its number, or by its kind
+        if no other is of that kind: `base_end.position`, `loads.0.mass`, `loads.attached-mass.mass`. They are
+        passed as `replace(**{"loads.0.mass": 0.1})`.
 
         Raises `ParameterError` for a name that does not exist or a value that is not allowed. Values may be
         JAX tracers: `replace` is differentiable with respect to a parameter.

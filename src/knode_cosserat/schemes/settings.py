@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import Any, Literal, Self
 
 from knode_cosserat.schemes.space import LOBATTO2, SpaceScheme
-from knode_cosserat.schemes.time import BDF2, TWO_STAGES, TimeScheme
+from knode_cosserat.schemes.time import BDF2, TWO_STAGES, TimeScheme, check_scheme
 
 Start = Literal["paper", "consistent"]
 Between = Literal["held", "linear"]
@@ -105,8 +105,11 @@ class Settings:
             raise ValueError(f'errors is {errors!r}; allowed is True, False or "grid"')
         if between not in ("held", "linear"):
             raise ValueError(f'between is {between!r}; allowed is "held" or "linear"')
+        in_time = None if time is None else _scheme("time", time, TimeScheme)
+        if in_time is not None:
+            check_scheme(in_time)
         return cls(
-            None if time is None else _scheme("time", time, TimeScheme),
+            in_time,
             _scheme("space", space, SpaceScheme),
             start,  # type: ignore[arg-type]
             newton,

@@ -15,7 +15,15 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+import math
 from typing import ClassVar, NamedTuple
+
+import numpy as np
+
+#: orders of formulas are found up to this one
+MOST = 8
+#: rounding of the weights of a formula
+TOLERANCE = 1e-9
 
 
 class Stage(NamedTuple):
@@ -34,6 +42,35 @@ class Formula(NamedTuple):
 
     stages: tuple[Stage, ...]
     weights: tuple[float, ...]
+
+
+def _order_of(formula: Formula) -> int:
+    """Return the order at y' = y, and as a quadrature; an order above `MOST` counts as `MOST`.
+
+    Raises `ValueError` if the weights of a formula or a stage are not consistent.
+    """
+    powers = np.array([1.0 / math.factorial(k) for k in range(MOST + 1)])
+    start, places = np.eye(MOST + 1)[0], [0.0, 1.0]
+    # series in h of y at the start, at the end and at each stage
+    values = [start, powers]
+    for stage in formula.stages:
+        if len(stage.rates) > len(values) or abs(stage.end + sum(stage.rates) - stage.place) > TOLERANCE:
+            raise ValueError(
+                f"{stage} is not consistent; allowed are rates of the start, the end and earlier stages that,"
+                " with `end`, have the sum `place`"
+            )
+        change = sum((w * value for w, value in zip(stage.rates, values, strict=False)), np.zeros(MOST + 1))
+        values.append((1.0 - stage.end) * start + stage.end * powers + np.append(0.0, change[:-1]))
+        places.append(stage.place)
+    if len(formula.weights) != len(values):
+        raise ValueError(
+            f"a formula has {len(formula.weights)} weights; allowed are {len(values)}: of the start, the end"
+            f" and {len(formula.stages)} stages"
+        )
+    step = np.append(0.0, np.dot(formula.weights, values)[:-1])
+    moments = [np.dot(formula.weights, np.power(places, k)) - 1.0 / (k + 1) for k in range(MOST)]
+    wrong = np.abs(np.append(start + step - powers, 1.0))[1:] > TOLERANCE
+    return int(np.argmax(wrong | np.append(np.abs(moments) > TOLERANCE, True)))
 
 
 def _hermite(place: float) -> Stage:
@@ -59,10 +96,22 @@ class SpaceScheme(abc.ABC):
     #: name in `simulate` and on the command line; empty: none
     name: ClassVar[str] = ""
     formula: ClassVar[Formula]
-    #: a formula of higher order; its stages begin with those of `formula`
+    #: a formula of higher order; its stages begin with those of `formula`, whose weights may be zero
     check: ClassVar[Formula]
     #: true if the scheme only reproduces results of others: large errors neither warn nor change the grid
     is_reproduction: ClassVar[bool] = False
+
+    def __init_subclass__(cls) -> None:
+        name, own, count = cls.__name__, cls.formula, len(cls.formula.stages)
+        if cls.check.stages[:count] != own.stages:
+            raise ValueError(
+                f"{name}: the stages of check do not begin with those of formula; allowed is"
+                " Formula((*formula.stages, …), weights), with weights of zero where they do not count"
+            )
+        least = int(cls.order)  # type: ignore[call-overload]
+        for what, formula, needed in (("formula", own, least), ("check", cls.check, least + 1)):
+            if (found := _order_of(formula)) < needed:
+                raise ValueError(f"{name}: {what} has order {found}; allowed is {needed} or more")
 
     @property
     @abc.abstractmethod

@@ -33,8 +33,9 @@ class TimeScheme(abc.ABC):
     uses_rate = False
     #: ends of the stages as parts of a step; multistep schemes have one stage
     ends: ClassVar[tuple[float, ...]] = (1.0,)
-    #: weights of the states (newest first) in a sum d: a step of y_t = J y adds the error J d / c0; empty: no
-    #: estimate
+    #: weights of the states (newest first) in a sum d: in a step of y_t = J y the rate's error is J d, and
+    #: the step adds the error J d / c0. Where the leading error is C dt^p y^(p+1), d is C dt^p y^(p) by
+    #: differences of the states, for equal steps. Empty: no estimate
     defect: ClassVar[tuple[float, ...]] = ()
 
     @property
@@ -81,9 +82,15 @@ class SDIRK(TimeScheme):
         powers = np.array([np.linalg.matrix_power(A, k).sum(axis=1) for k in range(order + 2)])
         excess = powers[:, -1] - [1.0 / math.factorial(k) for k in range(order + 2)]
         gamma = A[-1, -1]
-        if count < 2 or gamma <= 0.0 or np.any(np.diag(A) != gamma) or np.any(abs(excess[:-1]) > 1e-9):
-            allowed = "two or more rows of 1, 2, … weights that end in one γ, the last row for the step"
-            raise ValueError(f"{cls.__name__}: the tableau has not order {order}; allowed are {allowed}")
+        if count < 2 or gamma <= 0.0 or np.any(np.diag(A) != gamma):
+            raise ValueError(
+                f"{cls.__name__}: the last weights of the tableau's rows are {np.diag(A).tolist()}; allowed"
+                " are two or more rows of 1, 2, … weights that end in one γ > 0, the last row for the step."
+                " A scheme with an explicit stage is a TimeScheme that states its `stages`"
+            )
+        if np.any(abs(excess[:-1]) > 1e-9):
+            lower = int(np.argmax(abs(excess) > 1e-9)) - 1
+            raise ValueError(f"{cls.__name__}: the tableau has order {lower} (order states {order})")
         # combined so that only the power dt^(order - 1) of the rates remains
         wanted = np.append(np.zeros(order - 1), excess[-1] / gamma**2)
         R = gamma * np.linalg.inv(A)
@@ -181,6 +188,37 @@ class Trapezoidal(BDFAlpha):
 LIGHTLY_DAMPED = BDFAlpha(-0.45)
 #: the scheme by default
 TWO_STAGES = SDIRK2()
+
+
+def check_scheme(scheme: TimeScheme) -> None:
+    """Raise `ValueError` unless the coefficients have the stated order, and the defect fits them.
+
+    Of a scheme of several stages, each stage must keep a constant.
+    """
+    name, order, defect = type(scheme).__name__, scheme.order, np.array(scheme.defect)
+    if defect.size and (defect.shape != (scheme.memory + 1,) or abs(defect.sum()) > 1e-9 * abs(defect).max()):
+        raise ValueError(
+            f"{name}: defect is {scheme.defect}; allowed are memory + 1 = {scheme.memory + 1} weights"
+            " with the sum zero, that of the newest state first"
+        )
+    stages = scheme.stages(1.0)
+    for coefficients in stages:
+        *c, d1 = pad_coefficients(coefficients, scheme.memory)
+        if d1 and not scheme.uses_rate:
+            raise ValueError(
+                f"{name}: the last coefficient, of the last rate, is {d1:.4g}; allowed is 0, or"
+                " uses_rate = True"
+            )
+        times = -np.arange(len(c), dtype=float)
+        for power in range(order + 1 if len(stages) == 1 else 1):
+            rate = np.dot(c, times**power) + (d1 * power * (-1.0) ** (power - 1) if power else 0.0)
+            if not abs(rate - (power == 1)) < 1e-9 * np.abs(c).sum():
+                raise ValueError(
+                    f"{name}: for steps of 1 s, its coefficients make {rate:.4g} of the rate of t^{power} at"
+                    f" t = 0, which is {int(power == 1)}; order {order} allows no error up to t^{order}."
+                    " Coefficients are c0, c1, c2, … of the states, newest first, and last d1 of the last"
+                    " rate (0: none)"
+                )
 
 
 def pad_coefficients(coefficients: Coefficients, memory: int) -> Coefficients:
