@@ -153,7 +153,7 @@ def test_poses_without_tensions_are_a_recording(tmp_path):
     config = written(tmp_path, "columns: {time: time, tip: [x, y, z]}\n")
     assert (config.tensions, config.tendons) == ("none", 0)
     sampled = load_recording(path, config).sampled(0.04)
-    assert sampled.tension.shape == (len(sampled.time), 0) and sampled.complete.all()
+    assert sampled.control.shape == (len(sampled.time), 0) and sampled.complete.all()
     np.testing.assert_allclose(sampled.tip_position, POSITION[::2], atol=1e-7)
 
 

@@ -91,8 +91,8 @@ def test_the_knowledge_alone(folder, tmp_path):
     # the figures are those of the plain way, by hand
     seen = kc.load_recording(folder / "sine_2p0.bag").sampled(0.05, 1.0, 4.0)
     robot = kc.load_robot("delrin-tendon-robot")
-    still = kc.equilibrium(robot, seen.initial_tension, space=study.SPACE)
-    moved = kc.simulate(robot, seen.tension[:-1], 0.05, initial=still, space=study.SPACE)
+    still = kc.equilibrium(robot, seen.initial_control, space=study.SPACE)
+    moved = kc.simulate(robot, seen.control[:-1], 0.05, initial=still, space=study.SPACE)
     off = np.asarray(moved.tip_position)[:60] - seen.tip_position[:60]
     assert cells[1]["tip_rmse"] == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-9)
     table = (tmp_path / "table2.md").read_text()

@@ -135,13 +135,13 @@ def predict(
     check_arguments(predict, locals())
     robot, measured = fix_grid(robot), Measurements.of(measured)
     initial: Any = "unstressed" if measured.unstressed else None
-    first = measured.tension[0] if measured.static else measured.initial_tension
+    first = measured.control[0] if measured.static else measured.initial_control
     if first is not None and not measured.unstressed:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     if measured.static:
         return equilibria(
             robot,
-            measured.tension,
+            measured.control,
             space=space,
             initial=initial,
             recovery_budget=recovery,
@@ -149,10 +149,10 @@ def predict(
         )
     return simulated_rows(
         robot,
-        measured.tension[:-1],
+        measured.control[:-1],
         measured.dt,
         initial,
-        measured.initial_tension,
+        measured.initial_control,
         measured.continuous,
         space,
         recovery,

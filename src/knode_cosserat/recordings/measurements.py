@@ -32,7 +32,7 @@ DT = 0.0125
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Measurements:
-    """Tensions or motor angles, and poses of M bodies, at T evenly spaced times.
+    """Controls of a robot, such as tensions, and poses of M bodies, at T evenly spaced times.
 
     Positions are in the robot's frame: z up, origin at the clamped end. Rows in a gap of motion capture that
     is too long to be bridged are NaN; `parts` returns the pieces without such rows.
@@ -40,10 +40,9 @@ class Measurements:
 
     #: s, from the recording's start
     time: Float[np.ndarray, " T"]
-    #: tensions (N), held: row i drives the robot from row i to row i + 1 (`held_tension`). For a robot with
-    #: motor-driven tendons: the motor angles (rad) or the wound-up lengths (m). For any other system without
-    #: tensions: its controls
-    tension: Float[np.ndarray, "T tendons"]
+    #: all controls of the system, in the order of its `control_layout` (SI units), held: row i drives the
+    #: robot from row i to row i + 1, as `Trajectory.held_control`
+    control: Float[np.ndarray, "T c"]
     #: places of the bodies, as fractions of the rod's length, from base to tip
     fractions: Float[np.ndarray, " M"]
     #: positions of the bodies (m); of a planar system, two numbers each
@@ -56,13 +55,13 @@ class Measurements:
     simulated: bool | None
     #: description and origin of the recording
     source: str
-    #: tensions before the first row (N): the mean over the preceding rest, if there is one; None: unknown
-    initial_tension: Float[np.ndarray, " tendons"] | None = None
+    #: controls before the first row: the mean over the preceding rest, if there is one; None: unknown
+    initial_control: Float[np.ndarray, " c"] | None = None
     #: True for a simulation that begins with the unstressed robot; all other motions begin in equilibrium
     unstressed: bool = False
-    #: True if each row is a separate equilibrium under its tensions, not part of a motion
+    #: True if each row is a separate equilibrium under its controls, not part of a motion
     static: bool = False
-    #: True if the tensions are samples of a continuous signal: row i's is then that at the time of row i + 1
+    #: True if the controls are samples of a continuous signal: row i's is then that at the time of row i + 1
     continuous: bool = False
     #: orientations, bending angles, curvatures or wrenches by other sensors, in the same rows
     sensors: tuple[Sensor, ...] = ()
@@ -77,7 +76,7 @@ class Measurements:
         more = "".join(f"; {it.topic}" for it in self.sensors)
         return wrap_lines(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
-            f"{count_of(self.tension.shape[-1], 'tendon')}; "
+            f"{count_of(self.control.shape[-1], 'control')}; "
             f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length{more}; "
             f"source: {self.source}"
         )
@@ -109,9 +108,7 @@ class Measurements:
         if y.ndim == 4:
             raise ValueError("a batch of trajectories; allowed is one, such as `batch[0]`")
         held, initial = np.array(trajectory.held_control), np.asarray(trajectory.control)[0]
-        if "tension" in system.control_layout.names:
-            held, initial = (system.control_layout.get(control, "tension") for control in (held, initial))
-        # the last row has no following tension; without a value it would not count as complete
+        # the last row has no following control; without a value it would not count as complete
         held[-1] = held[-2] if len(held) > 1 else initial
         along = real_array((1.0,) if fractions is None else fractions)
         if along.ndim != 1 or not np.all((along >= 0.0) & (along <= 1.0)):
@@ -128,14 +125,14 @@ class Measurements:
             quaternion = np.full((*position.shape[:2], 4), np.nan)
         return cls(
             time=np.asarray(trajectory.time, dtype=float),
-            tension=held,
+            control=held,
             fractions=along,
             position=position,
             quaternion=quaternion,
             measured=np.isfinite(position).all(axis=-1),
             simulated=True,
             source=f"simulated {type(system).__name__}",
-            initial_tension=initial,
+            initial_control=initial,
             unstressed=begins_unstressed(trajectory),
         )
 
@@ -168,18 +165,18 @@ class Measurements:
             oriented = bool(np.isfinite(self.quaternion[rows, k]).any())
             quaternion = self.quaternion[rows, k] if oriented else None
             poses[name] = Body(self.time[rows], position[rows, k], quaternion)
-        initial = self.initial_tension
+        initial = self.initial_control
         config = RecordingConfig(
             markers=tuple(
                 MarkerSource(name, root + name, float(place), rotation=(1.0, 0.0, 0.0, 0.0))
                 for name, place in zip(names, self.fractions, strict=True)
             ),
-            tension=TensionSource(root + HELD, tuple(range(1, self.tension.shape[1] + 1)), held=True),
+            tension=TensionSource(root + HELD, tuple(range(1, self.control.shape[1] + 1)), held=True),
             simulated=self.simulated,
             description=self.source,
             initial_tension=None if initial is None else tuple(initial.tolist()),
         )
-        tension = Tensions(self.time, self.tension)
+        tension = Tensions(self.time, self.control)
         if is_table:
             write_recording(path, config, poses, tension)
             return
@@ -190,11 +187,6 @@ class Measurements:
                 write_recording(path, config, poses, tension)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
-
-    @property
-    def held_tension(self) -> Float[np.ndarray, "T tendons"]:
-        """`tension` (N), held from row i to row i + 1, as `Trajectory.held_tension`."""
-        return self.tension
 
     @property
     def tip_position(self) -> Float[np.ndarray, "T d"]:
@@ -211,8 +203,8 @@ class Measurements:
 
     @property
     def complete(self) -> Bool[np.ndarray, " T"]:
-        """Mask of the rows with tensions and the positions of all bodies."""
-        known = np.isfinite(self.tension).all(axis=1) & np.isfinite(self.position).all(axis=(1, 2))
+        """Mask of the rows with controls and the positions of all bodies."""
+        known = np.isfinite(self.control).all(axis=1) & np.isfinite(self.position).all(axis=(1, 2))
         return np.asarray(known)
 
     def between(self, start: float, end: float) -> Self:
@@ -227,14 +219,14 @@ class Measurements:
 
     def rows(self, first: int, last: int) -> Self:
         """Return the rows from index `first` to before index `last`."""
-        names = ("time", "tension", "position", "quaternion", "measured")
+        names = ("time", "control", "position", "quaternion", "measured")
         changes: dict[str, Any] = {name: getattr(self, name)[first:last] for name in names}
         changes["sensors"] = tuple(
             dataclasses.replace(it, time=it.time[first:last], values=it.values[first:last])
             for it in self.sensors
         )
         if first:
-            changes |= {"initial_tension": None, "unstressed": False}
+            changes |= {"initial_control": None, "unstressed": False}
         return dataclasses.replace(self, **changes)
 
     def parts(self, shortest: float = 0.0) -> list[Self]:

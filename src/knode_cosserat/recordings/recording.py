@@ -153,14 +153,14 @@ class Recording:
 
         return Measurements(
             time=time,
-            tension=held,
+            control=held,
             fractions=np.array([body.fraction for body in self.bodies]),
             position=rows(0, 3),
             quaternion=rows(1, 4),
             measured=rows(2).astype(bool),
             simulated=self.simulated,
             source=self.source,
-            initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
+            initial_control=self._initial_tension(driver, float(time[0]) - latency, longest),
             static=self.config.static,
             continuous=mean and not self.config.static and not self._is_held(driver),
             sensors=tuple(

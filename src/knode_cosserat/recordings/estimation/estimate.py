@@ -278,7 +278,7 @@ def _parts(
     pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
     if not pieces:
         raise RecordingError(
-            f"no {FEWEST_ROWS} rows of {dt:g} s one after the other with all positions and tensions"
+            f"no {FEWEST_ROWS} rows of {dt:g} s one after the other with all positions and controls"
         )
     used = rows.fractions > 0.0
     parts = []
@@ -293,11 +293,11 @@ def _parts(
 
 
 def _check(rows: Measurements, robot: System) -> None:
-    tendons = rows.tension.shape[1]
-    if tendons != robot.control_layout.size:
+    count = rows.control.shape[1]
+    if count != robot.control_layout.size:
         raise RecordingError(
-            f"the recording has {tendons} tendons and the robot {robot.control_layout.size} "
-            "controls; allowed is the same number"
+            f"the recording has {count} controls and the robot {robot.control_layout.size}; "
+            "allowed is the same number"
         )
     away = rows.fractions > 0.0
     if away.sum() < FEWEST_BODIES:
