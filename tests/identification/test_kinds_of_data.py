@@ -128,7 +128,7 @@ def test_kinds_are_weighted_in_one_objective(motion):
 
 
 SENSED = """format: 1
-columns: {time: t, tensions: [I1, I2, I3, I4]}
+columns: {time: t, tension: [I1, I2, I3, I4]}
 tension: {gain: 0.8e-3, held: true}
 sensors:
   - {kind: orientation, columns: [roll, pitch, yaw], unit: deg, fractions: 1.0}
@@ -194,7 +194,7 @@ def test_a_log_of_sensors_is_read_and_recovers_the_robot(motion, tmp_path):
 def test_wrong_sensors_are_refused_in_one_line(motion, tmp_path, text, words):
     logged(motion, tmp_path / "log.csv")
     (tmp_path / "map.yaml").write_text(
-        f"format: 1\ncolumns: {{time: t, tensions: [I1, I2, I3, I4]}}\nsensors:\n  - {{{text}}}\n"
+        f"format: 1\ncolumns: {{time: t, tension: [I1, I2, I3, I4]}}\nsensors:\n  - {{{text}}}\n"
     )
     with pytest.raises(RecordingError) as refused:
         kc.load_recording(tmp_path / "log.csv", RecordingConfig.load(tmp_path / "map.yaml"))

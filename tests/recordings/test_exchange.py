@@ -7,7 +7,7 @@ import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import RecordingConfig, RecordingError
-from knode_cosserat.recordings.config import TensionSource
+from knode_cosserat.recordings.config import ControlSource
 
 DT, BEFORE = 0.05, np.full(4, 5.0)
 FRACTIONS = (0.25, 0.6, 1.0)
@@ -107,11 +107,11 @@ def test_a_table_says_one_thing_of_its_tensions(tmp_path):
     path.write_text("time [s],tension_1 [N],held_tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n0,1,1,0,0,1\n")
     with pytest.raises(RecordingError, match=r"tension_1 .* and held_tension_1 .*; allowed is one of them"):
         kc.load_recording(path)
-    path.write_text("# initial tension: 1 2\ntime [s],held_tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n")
+    path.write_text("# initial control: 1 2\ntime [s],held_tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n")
     with pytest.raises(RecordingError, match="no rows"):
         kc.load_recording(path)
     path.write_text(path.read_text() + "0,1,0,0,1\n0.1,1,0,0,1\n")
-    with pytest.raises(RecordingError, match=r"initial_tension .*; allowed is 1 numbers \(N\)"):
+    with pytest.raises(RecordingError, match=r"initial_control .*; allowed is 1 numbers \(SI units\)"):
         kc.load_recording(path)
     path.write_text(path.read_text().replace("1 2", "a"))
     with pytest.raises(RecordingError, match="initial tension is 'a'; allowed is numbers"):
@@ -121,11 +121,11 @@ def test_a_table_says_one_thing_of_its_tensions(tmp_path):
 def test_a_configuration_says_that_tensions_are_held(tmp_path):
     config = RecordingConfig.paper_robot()
     assert config.tension is not None
-    held = config.replace(tension=TensionSource("/tension", (4, 1, 2, 3), "gf", held=True))
+    held = config.replace(tension=ControlSource("/tension", (4, 1, 2, 3), "gf", held=True))
     held.save(tmp_path / "held.yaml")
     assert RecordingConfig.load(tmp_path / "held.yaml") == held
     with pytest.raises(RecordingError, match="held is 3; allowed is true or false"):
-        TensionSource("/tension", (1,), held=3)
+        ControlSource("/tension", (1,), held=3)
 
 
 def planar_motion():

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from knode_cosserat.recordings import Recording, RecordingConfig, RecordingError
-from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.config import ControlSource, MarkerSource
+from knode_cosserat.recordings.streams import Body, ControlRows
 
 LATENCY = 0.06
 CONFIG = RecordingConfig(
     markers=(MarkerSource("tip", "tip", 1.0),),
-    tension=TensionSource("tension", (1, 2)),
-    command=CommandSource("command", (1, 2), latency=LATENCY),
+    tension=ControlSource("tension", (1, 2)),
+    command=ControlSource("command", (1, 2), latency=LATENCY),
 )
 #: messages at times of their own, as sensors send them
 TIMES = np.round(0.02 * np.arange(201) + np.random.default_rng(0).uniform(0.0, 0.015, 201), 6)
@@ -28,7 +28,7 @@ def recorded(time, tension, command=None, until=4.0):
         config=CONFIG,
         bodies=(body,),
         base=None,
-        tension=Tensions(time, tension, "tension"),
+        control=ControlRows(time, tension, "tension"),
         command=command,
         rest=None,
         simulated=True,
@@ -45,8 +45,8 @@ def uneven():
 
 def lines(recording, time):
     """Tensions on straight lines between messages; before the first and after the last, those."""
-    known = recording.tension
-    return np.stack([np.interp(time, known.time, known.tension[:, k]) for k in range(2)], axis=1)
+    known = recording.control
+    return np.stack([np.interp(time, known.time, known.values[:, k]) for k in range(2)], axis=1)
 
 
 def test_a_mean_is_that_of_the_lines_between_messages(uneven):
@@ -101,9 +101,9 @@ def test_before_the_first_message_and_after_the_last_its_tension_holds():
 
 def test_commands_are_steps_and_come_late():
     """Each is held until the next, from its latency on."""
-    sent = Tensions(np.array([0.0, 1.0, 1.42]), np.array([[2.0, 2.0], [6.0, 2.0], [3.0, 2.0]]), "command")
+    sent = ControlRows(np.array([0.0, 1.0, 1.42]), np.array([[2.0, 2.0], [6.0, 2.0], [3.0, 2.0]]), "command")
     recording = recorded(np.array([0.0, 4.0]), np.zeros((2, 2)), sent)
-    given = recording.sampled(0.1, tensions="commanded", mean=True)
+    given = recording.sampled(0.1, controls="commanded", mean=True)
     rows = {round(float(t), 9): k for k, t in enumerate(given.time)}
     assert given.control[rows[0.9], 0] == pytest.approx(2.0)
     # 0.06 s of the old one, 0.04 s of the new one
@@ -112,17 +112,17 @@ def test_commands_are_steps_and_come_late():
     assert given.control[rows[1.4], 0] == pytest.approx(0.8 * 6.0 + 0.2 * 3.0)
     # the last one holds
     np.testing.assert_allclose(given.control[rows[1.5] :, 0], 3.0)
-    held = recording.sampled(0.1, tensions="commanded")
+    held = recording.sampled(0.1, controls="commanded")
     assert held.control[rows[1.0], 0] == 2.0 and held.control[rows[1.4], 0] == 6.0
 
 
 def test_a_pause_stays_unknown(uneven):
     """Nothing is averaged over what was not measured."""
-    known = uneven.tension
+    known = uneven.control
     kept = (known.time < 1.0) | (known.time > 2.0)
-    paused = dataclasses.replace(uneven, tension=Tensions(known.time[kept], known.tension[kept], "tension"))
+    paused = dataclasses.replace(uneven, control=ControlRows(known.time[kept], known.values[kept], "tension"))
     given = paused.sampled(0.05, start=0.2, mean=True)
-    times = paused.tension.time
+    times = paused.control.time
     last, following = times[times < 1.0][-1], times[times > 2.0][0]
     unknown = ~np.isfinite(given.control).all(axis=1)
     begin, end = given.time + 0.025, given.time + 0.075
@@ -138,5 +138,5 @@ def test_a_pause_stays_unknown(uneven):
 
 
 def test_without_such_tensions_it_says_so(uneven):
-    with pytest.raises(RecordingError, match=r"^it: there are no commanded tensions$"):
-        uneven.sampled(0.05, tensions="commanded", mean=True)
+    with pytest.raises(RecordingError, match=r"^it: there are no commanded controls$"):
+        uneven.sampled(0.05, controls="commanded", mean=True)

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.write import write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import TendonFriction
@@ -48,7 +48,7 @@ def recorded(path, tension, seed):
         )
     still = np.tile([0.0, 0.0, PAPER.base.height], (len(time), 1))
     poses["base"] = Body(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
-    pulled = Tensions(time[::2][: len(control[::2])], control[::2])
+    pulled = ControlRows(time[::2][: len(control[::2])], control[::2])
     write_recording(path, PAPER, poses, pulled, pulled)
 
 

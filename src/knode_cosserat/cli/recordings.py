@@ -43,7 +43,7 @@ def inspect(
 ) -> None:
     """Report the quality of a recording.
 
-    Sampling rates, gaps, swapped axes, noise, and the delay and error of measured tensions relative to
+    Sampling rates, gaps, swapped axes, noise, and the delay and error of measured controls relative to
     commands. Lists the defects found and their corrections. For a recording with other topics or columns
     than those known, it proposes a configuration, and reads the recording with it.
 
@@ -103,12 +103,15 @@ def _lines(report: Health) -> list[str]:
         it = report.latency
         lines += [
             "",
-            f"tensions follow commands: best shift {it.shift:.3f} s; or a delay of {it.delay:.3f} s and a "
+            f"controls follow commands: best shift {it.shift:.3f} s; or a delay of {it.delay:.3f} s and a "
             f"first-order lag of {it.lag:.3f} s",
         ]
-    if report.tension_errors:
-        rows = [["tendon", "measured minus commanded [N]", "root mean square [N]"]]
-        rows += [[str(it.tendon), f"{it.bias:+.3f}", f"{it.rms:.3f}"] for it in report.tension_errors]
+    if report.control_errors:
+        rows = [["control", "measured minus commanded", "root mean square"]]
+        rows += [
+            [it.control, f"{it.bias:+.3g} {it.unit}", f"{it.rms:.3g} {it.unit}"]
+            for it in report.control_errors
+        ]
         lines += ["", *table(rows)]
     findings = [str(finding) for finding in report.findings]
     return [*lines, "", *(findings or ["no defects found"])]
@@ -130,8 +133,9 @@ _TITLES = [
 
 
 def _row(stream: StreamHealth) -> list[str]:
-    factor, unit = (1.0, "N") if stream.what == "measured tensions" else (1e3, "mm")
-    noise = f"{_number_text(stream.noise, factor, '.3f')} {unit}"
+    is_body = stream.what != "commands" and not stream.what.startswith("measured ")
+    factor, unit = (1e3, "mm") if is_body else (1.0, stream.unit)
+    noise = f"{_number_text(stream.noise, factor, '.3f' if is_body else '.3g')} {unit}"
     return [
         stream.topic,
         stream.what,

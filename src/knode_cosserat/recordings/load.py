@@ -108,7 +108,7 @@ def _recording(content: Bag | Table, config: RecordingConfig | None, name: str) 
         config=config,
         bodies=tuple(sensed.bodies),
         base=sensed.base,
-        tension=sensed.tension,
+        control=sensed.control,
         command=sensed.command,
         rest=rest,
         simulated=config.simulated,

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import re
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -14,9 +15,10 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._numbers import real_array
 from knode_cosserat._reprs import count_of, wrap_lines
-from knode_cosserat.recordings.config import MarkerSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.config import ControlSource, MarkerSource, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.streams import Body, Sensor, Tensions
+from knode_cosserat.recordings.quantities import QUANTITIES, Quantity, counted_quantities
+from knode_cosserat.recordings.streams import Body, ControlRows, Sensor
 from knode_cosserat.recordings.table import HELD
 from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.solvers.initial import begins_unstressed
@@ -25,6 +27,8 @@ from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.recording import Recording
+    from knode_cosserat.rods.layout import Field, Layout
+    from knode_cosserat.rods.system import System
 
 #: time from row to row of recordings that models learn from (s)
 DT = 0.0125
@@ -40,8 +44,9 @@ class Measurements:
 
     #: s, from the recording's start
     time: Float[np.ndarray, " T"]
-    #: all controls of the system, in the order of its `control_layout` (SI units), held: row i drives the
-    #: robot from row i to row i + 1, as `Trajectory.held_control`
+    #: all controls of the system (SI units), held: row i drives the robot from row i to row i + 1, as
+    #: `Trajectory.held_control`. They are in the order of the system's `control_layout`, unless `quantities`
+    #: are stated: `controls_for` brings them to this order
     control: Float[np.ndarray, "T c"]
     #: places of the bodies, as fractions of the rod's length, from base to tip
     fractions: Float[np.ndarray, " M"]
@@ -67,6 +72,8 @@ class Measurements:
     sensors: tuple[Sensor, ...] = ()
     #: standard deviations of `fractions`, zero where they are known; others are identified
     deviations: tuple[float, ...] = ()
+    #: quantities of the columns of `control`, each with the count of its columns; empty: not stated
+    quantities: tuple[tuple[str, int], ...] = ()
 
     def __repr__(self) -> str:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""
@@ -76,10 +83,16 @@ class Measurements:
         more = "".join(f"; {it.topic}" for it in self.sensors)
         return wrap_lines(
             f"Measurements ({origin}): {len(self.time)} {kind}{times}; "
-            f"{count_of(self.control.shape[-1], 'control')}; "
+            f"{self._named_controls}; "
             f"{count_of(len(self.fractions), 'body', 'bodies')} at {places} of the length{more}; "
             f"source: {self.source}"
         )
+
+    @property
+    def _named_controls(self) -> str:
+        if self.quantities:
+            return counted_quantities(self.quantities)
+        return count_of(self.control.shape[-1], "control")
 
     @classmethod
     def of(
@@ -89,7 +102,7 @@ class Measurements:
 
         Args:
             data: a whole trajectory, or consecutive rows, of one system with positions; or a recording: rows
-                of 0.0125 s with mean tensions. Measurements are returned as they are.
+                of 0.0125 s with mean controls. Measurements are returned as they are.
             fractions: for a trajectory: places of the bodies, as fractions of the rod's length, from base to
                 tip; by default the tip. A recording has its own.
 
@@ -134,10 +147,11 @@ class Measurements:
             source=f"simulated {type(system).__name__}",
             initial_control=initial,
             unstressed=begins_unstressed(trajectory),
+            quantities=_quantities_of(system.control_layout),
         )
 
     def save(self, path: str | Path) -> None:
-        """Write a table or a bag (.csv, .parquet, .bag, .mcap, .db3), with tensions held to the next row.
+        """Write a table or a bag (.csv, .parquet, .bag, .mcap, .db3), with controls held to the next row.
 
         A table's titles state everything: `load_recording(path).sampled(measurements.dt)` gives the same
         rows. Beside a bag its configuration is written, with the suffix .yaml, for
@@ -145,8 +159,8 @@ class Measurements:
         written. Bodies are named `tip` and `body_1`, `body_2` and so on.
 
         Raises:
-            RecordingError: the name's ending is not one of a format that is written, or a file cannot be
-                written.
+            RecordingError: the name's ending is not one of a format that is written, the quantities of the
+                controls are not known, or a file cannot be written.
             ImportError: a library for this format is not installed.
         """
         path = Path(path)
@@ -165,28 +179,93 @@ class Measurements:
             oriented = bool(np.isfinite(self.quaternion[rows, k]).any())
             quaternion = self.quaternion[rows, k] if oriented else None
             poses[name] = Body(self.time[rows], position[rows, k], quaternion)
+        columns = self._columns(path)
+        order = [k for places in columns.values() for k in places]
         initial = self.initial_control
         config = RecordingConfig(
             markers=tuple(
                 MarkerSource(name, root + name, float(place), rotation=(1.0, 0.0, 0.0, 0.0))
                 for name, place in zip(names, self.fractions, strict=True)
             ),
-            tension=TensionSource(root + HELD, tuple(range(1, self.control.shape[1] + 1)), held=True),
+            controls="measured" if columns else "none",
             simulated=self.simulated,
             description=self.source,
-            initial_tension=None if initial is None else tuple(initial.tolist()),
+            initial_control=None if initial is None or not columns else tuple(initial[order].tolist()),
+            **{  # type: ignore[arg-type]
+                name: ControlSource(f"{root}{HELD}{name}", tuple(range(1, len(places) + 1)), held=True)
+                for name, places in columns.items()
+            },
         )
-        tension = Tensions(self.time, self.control)
+        control = ControlRows(self.time, self.control[:, order]) if columns else None
         if is_table:
-            write_recording(path, config, poses, tension)
+            write_recording(path, config, poses, control)
             return
         # the configuration takes its name last: neither file is changed if the bag cannot be written
         try:
             with replacing(path.with_suffix(".yaml")) as beside:
                 config.save(beside)
-                write_recording(path, config, poses, tension)
+                write_recording(path, config, poses, control)
         except OSError as error:
             raise RecordingError(f"{path}: cannot be written: {error.strerror}") from None
+
+    def _columns(self, path: Path) -> dict[str, list[int]]:
+        """Return the places of each quantity's columns, in the order of `QUANTITIES`."""
+        count = self.control.shape[1]
+        if not count:
+            return {}
+        # a robot's own controls without stated quantities are tensions, as those of most robots
+        stated = self.quantities or (("tension", count),)
+        names = [name for name, number in stated for _ in range(number)]
+        unknown = next((name for name in names if name not in QUANTITIES), None)
+        if unknown is not None or len(names) != count:
+            raise RecordingError(
+                f"{path}: {counted_quantities(stated)} cannot be written; allowed are the {count} columns of "
+                f"control, of {', '.join(QUANTITIES)}"
+            )
+        return {
+            name: [k for k, each in enumerate(names) if each == name] for name in QUANTITIES if name in names
+        }
+
+    def controls_for(self, system: System) -> Self:
+        """Return the measurements with the controls in the order of a system's `control_layout`.
+
+        Columns of a quantity are matched with the system's controls of the same unit, in order; where several
+        quantities have a unit, with those of its name. Controls whose quantities are not stated are returned
+        as they are.
+
+        Raises:
+            RecordingError: the system has other controls.
+        """
+        layout = system.control_layout
+        if not self.quantities:
+            if self.control.shape[1] != layout.size:
+                raise self._other_controls(system, f"{self.control.shape[1]} controls")
+            return self
+        names = [name for name, number in self.quantities for _ in range(number)]
+        wanted = [_measured_as(field, names) for field in layout.fields for _ in range(field.size)]
+        if sorted(names) != sorted(wanted):
+            raise self._other_controls(system, counted_quantities(self.quantities))
+        places = {name: iter([k for k, each in enumerate(names) if each == name]) for name in names}
+        order = [next(places[name]) for name in wanted]
+        initial = None if self.initial_control is None else self.initial_control[order]
+        return dataclasses.replace(
+            self,
+            control=self.control[:, order],
+            initial_control=initial,
+            quantities=tuple((name, 1) for name in wanted),
+        )
+
+    def _other_controls(self, system: System, there: str) -> RecordingError:
+        names = [
+            (_measured_as(field, ()) or field.name, field.size) for field in system.control_layout.fields
+        ]
+        hint = ""
+        if any(name == "current" for name, _ in self.quantities):
+            hint = "; `gain` of the current (N/A) makes tensions of it"
+        return RecordingError(
+            f"{self.source}: the robot has the controls {counted_quantities(names)}; the recording has "
+            f"{there}{hint}"
+        )
 
     @property
     def tip_position(self) -> Float[np.ndarray, "T d"]:
@@ -239,3 +318,24 @@ class Measurements:
         ends = np.flatnonzero(known[1:] != known[:-1]).reshape(-1, 2)
         pieces = [self.rows(int(first), int(last)) for first, last in ends if last - first >= 2]
         return [piece for piece in pieces if piece.time[-1] - piece.time[0] >= shortest - 1e-9]
+
+
+def _measured_as(field: Field, there: Collection[str]) -> str:
+    """Return the quantity that measures a control, among those that are there; empty without one.
+
+    Names of controls may have a prefix (of an assembly's rod) and a number, such as rod_a_rotation_2.
+    """
+    alike = [quantity for quantity in QUANTITIES.values() if quantity.unit == field.unit]
+    alike = [quantity for quantity in alike if not there or quantity.name in there]
+    stem = re.sub(r"_\d+$", "", field.name)
+
+    def is_named(quantity: Quantity) -> bool:
+        return any(stem == name or stem.endswith(f"_{name}") for name in quantity.controls)
+
+    return next((it.name for it in sorted(alike, key=is_named, reverse=True)), "")
+
+
+def _quantities_of(layout: Layout) -> tuple[tuple[str, int], ...]:
+    """Return the quantities of a system's controls; empty if one of them is of no known quantity."""
+    found = tuple((_measured_as(field, ()), field.size) for field in layout.fields)
+    return found if all(name for name, _ in found) else ()

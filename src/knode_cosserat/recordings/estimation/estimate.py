@@ -137,7 +137,7 @@ def _stretch(part: _Interval, robot: System) -> float:
 
 
 def _estimated(part: _Interval, robot: System, method: str) -> Trajectory:
-    tension, settings = part.rows.tension, None
+    tension, settings = part.rows.control, None
     # the tension held from the row before; for the first row, its own
     control = np.concatenate([tension[:1], tension[:-1]])
     if method == "paper":
