@@ -150,7 +150,7 @@ def test_bad_input_says_what_is_wrong():
     )
     with pytest.raises(DataError, match=f"no control is known at {7 * DT:g} s"):
         kc.identify(NOMINAL, [gone])
-    with pytest.raises(DataError, match="3 controls in a row; the robot has 4"):
+    with pytest.raises(DataError, match=r"the robot has the controls tension \(4\); the recording has"):
         kc.identify(NOMINAL, [dataclasses.replace(seen, control=seen.control[:, :3])])
     with pytest.raises(DataError, match="at least 3"):
         kc.identify(NOMINAL, [seen.rows(0, 2)])

@@ -114,7 +114,7 @@ def test_a_table_says_one_thing_of_its_tensions(tmp_path):
     with pytest.raises(RecordingError, match=r"initial_control .*; allowed is 1 numbers \(SI units\)"):
         kc.load_recording(path)
     path.write_text(path.read_text().replace("1 2", "a"))
-    with pytest.raises(RecordingError, match="initial tension is 'a'; allowed is numbers"):
+    with pytest.raises(RecordingError, match="initial control is 'a'; allowed is numbers"):
         kc.load_recording(path)
 
 

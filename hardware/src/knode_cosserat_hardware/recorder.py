@@ -44,8 +44,8 @@ class MessageEncoder:
         config: topics, order and units of the messages.
 
     Raises:
-        RecordingError: the configuration has other quantities than tensions; from all methods: a wrong number of
-            tensions or bodies.
+        RecordingError: the configuration has other quantities than tensions; from all methods: a wrong number
+            of tensions or bodies.
         ImportError: rosbags is not installed.
     """
 

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, Several, States
 from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
+from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.aspects import Drawing
@@ -214,11 +215,10 @@ def of_measurements(
     robot = model.nominal
     if len(measured.time) < 3:
         raise DataError(f"{name}: {len(measured.time)} rows; at least 3 are needed")
-    if measured.control.shape[1] != robot.control_layout.size:
-        raise DataError(
-            f"{name}: {measured.control.shape[1]} controls in a row; the robot has "
-            f"{robot.control_layout.size}"
-        )
+    try:
+        measured = measured.controls_for(robot)
+    except RecordingError as error:
+        raise DataError(str(error)) from None
     if measured.static:
         measured = _as_steps(measured)
     if not np.all(np.isfinite(measured.control[:-1])):

@@ -274,7 +274,8 @@ def _parts(
     recording: Recording | Measurements, rows: Measurements, robot: System, dt: float
 ) -> list[_Interval]:
     """Return the parts with enough rows for an estimation. Raises `RecordingError` without any."""
-    _check(rows, robot)
+    rows = rows.controls_for(robot)
+    _check(rows)
     pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
     if not pieces:
         raise RecordingError(
@@ -292,13 +293,7 @@ def _parts(
     return parts
 
 
-def _check(rows: Measurements, robot: System) -> None:
-    count = rows.control.shape[1]
-    if count != robot.control_layout.size:
-        raise RecordingError(
-            f"the recording has {count} controls and the robot {robot.control_layout.size}; "
-            "allowed is the same number"
-        )
+def _check(rows: Measurements) -> None:
     away = rows.fractions > 0.0
     if away.sum() < FEWEST_BODIES:
         raise RecordingError(
