@@ -2,10 +2,10 @@
 
 Files are matched by a delay τ. Candidates come from the correlation of the speed of bodies with the rate of
 controls. A static model decides between them: positions (as principal components) are linear in the controls
-at the time less τ. Its τ contains the lag of the robot's motion. A dynamic model refines it, together with the
-drift: accelerations are linear in positions, velocities and the controls at the time less τ. Standard deviations
-are those of a jackknife over parts of the recording, with the scatter over the widths of the filter that
-differentiates, and a tenth of the lag between the two models.
+at the time less τ. Its τ contains the lag of the robot's motion. A dynamic model refines it, together with
+the drift: accelerations are linear in positions, velocities and the controls at the time less τ. Standard
+deviations are those of a jackknife over parts of the recording, with the scatter over the widths of the
+filter that differentiates, and a tenth of the lag between the two models.
 
 The latency of the robot itself cannot be told from an offset of clocks: dead time between a measured control
 and the motion is in the offset. The effect `latency` of `identify` takes what is left.
@@ -122,7 +122,9 @@ class _Motion(NamedTuple):
             raise RecordingError("nothing moves in one of the files")
         kept = min(COMPONENTS, int(np.sum(scale > SMALLEST * scale[0])))
         values = values @ rotation[:kept].T * (math.sqrt(len(time)) / scale[0])
-        return cls(time, values, _near(time, signal.time, 3.0 * max(dt, float(np.median(np.diff(signal.time))))))
+        return cls(
+            time, values, _near(time, signal.time, 3.0 * max(dt, float(np.median(np.diff(signal.time)))))
+        )
 
     @property
     def dt(self) -> float:
@@ -174,7 +176,9 @@ def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, fl
         raise RecordingError(f"less than {SHORTEST:g} s are there in one of the files")
     wanted = max(SHORTEST, OVERLAP * min(np.ptp(first.time), np.ptp(motion.time)))
     near = np.arange(-15, 16) * GRID
-    grid = np.unique(np.round(np.add.outer(_correlated(first, motion, wanted), near) / GRID).astype(int)) * GRID
+    grid = (
+        np.unique(np.round(np.add.outer(_correlated(first, motion, wanted), near) / GRID).astype(int)) * GRID
+    )
     rows = [motion.filtered(width, order) for order in (0, 1, 2)]
     scores = np.array([_likelihoods(first, motion, rows, width, delay, wanted) for delay in grid])
     if not len(grid) or scores[:, 0].max() < RELATED:
@@ -236,7 +240,8 @@ def _likelihoods(
     )
     own = np.hstack([constant, position, velocity])
     before, after = (
-        np.sum(_residual(acceleration, _basis(each)) ** 2, axis=0) for each in (own, np.hstack([own, columns]))
+        np.sum(_residual(acceleration, _basis(each)) ** 2, axis=0)
+        for each in (own, np.hstack([own, columns]))
     )
     # the first components have most of the motion
     weights = np.sum(acceleration**2, axis=0)
@@ -265,7 +270,9 @@ def _explaining(
     size = 2 * math.ceil(reach / motion.dt) + 1
     known = known & motion.seen
     padded = np.pad(known, size // 2, constant_values=False)
-    known = scipy.ndimage.minimum_filter1d(padded.astype(np.uint8), size)[size // 2 : len(padded) - size // 2] > 0
+    known = (
+        scipy.ndimage.minimum_filter1d(padded.astype(np.uint8), size)[size // 2 : len(padded) - size // 2] > 0
+    )
     return _filtered(values, width / motion.dt, order) / motion.dt**order, known
 
 
@@ -301,7 +308,13 @@ def _refined(
         parts = np.array_split(np.flatnonzero(known), PARTS)
         whole = _step(rows[0], every, rates, apart if has_drift else None, np.flatnonzero(known))
         steps = [
-            _step(rows[0], every, rates, apart if has_drift else None, np.concatenate([*parts[:k], *parts[k + 1 :]]))
+            _step(
+                rows[0],
+                every,
+                rates,
+                apart if has_drift else None,
+                np.concatenate([*parts[:k], *parts[k + 1 :]]),
+            )
             for k in range(PARTS)
         ]
         change = float(np.clip(whole[0], -0.02, 0.02))
@@ -317,7 +330,10 @@ def _refined(
 def _step(
     y: np.ndarray, columns: np.ndarray, rates: np.ndarray, apart: np.ndarray | None, used: np.ndarray
 ) -> Float[np.ndarray, " 2"]:
-    """Return the Gauss-Newton step of delay and drift (zero without times `apart`); all other coefficients are eliminated."""
+    """Return the Gauss-Newton step of delay and drift; all other coefficients are eliminated.
+
+    Without times `apart` from the middle the drift stays.
+    """
     y, columns, rates = y[used], columns[used], rates[used]
     scale = np.linalg.norm(columns, axis=0)
     scaled = columns / np.where(scale > 0.0, scale, 1.0)

@@ -100,8 +100,36 @@ class Bag:
         is_simulated = any(SIMULATED.encode() in message for message in first)
         return config.replace(simulated=True) if config.simulated is None and is_simulated else config
 
-    def streams(self, config: RecordingConfig, findings: list[Finding]) -> dict[str, Stream]:
+    @property
+    def names(self) -> list[str]:
+        """Names of the topics."""
+        return sorted(self.topics)
+
+    def topics_there(self, config: RecordingConfig) -> list[str]:
+        """Return the topics of a configuration whose messages are all there."""
+        sources = roles_of(config)
+        return [source.topic for source in sources if set(topics_of(source)) <= set(self.topics)]
+
+    def uses(self, config: RecordingConfig) -> dict[str, str]:
+        """Return the use of each topic; empty text for those that are not read."""
+        uses = dict.fromkeys(self.names, "")
+        for source, role in roles_of(config).items():
+            word = {"control": getattr(source, "quantity", ""), "pose": getattr(source, "name", "base")}
+            for name in topics_of(source):
+                if name in uses:
+                    uses[name] = ", ".join(filter(None, (uses[name], word.get(role, role))))
+        return uses
+
+    def resets(self, config: RecordingConfig) -> list[float]:
+        """Return no times: the times of recording tell where stamps were set back."""
+        return []
+
+    def streams(
+        self, config: RecordingConfig, findings: list[Finding], topics: Collection[str] | None = None
+    ) -> dict[str, Stream]:
         """Return the messages of each source of a configuration, by topic, and add findings.
+
+        `topics` are those that are read; None: all of the configuration.
 
         Raises:
             RecordingError: a topic is missing, its messages are not of a type for their role, or have no such
@@ -109,6 +137,8 @@ class Bag:
         """
         streams: dict[str, Stream] = {}
         for source, role in roles_of(config).items():
+            if topics is not None and source.topic not in topics:
+                continue
             missing = [name for name in topics_of(source) if name not in self.topics]
             if not missing:
                 streams[source.topic] = decoded(self, source, role)

@@ -20,10 +20,12 @@ from knode_cosserat.recordings.config import (
     BaseSource,
     ColumnMap,
     ControlSource,
+    FileSource,
     MarkerSource,
     RecordingConfig,
     TableSource,
 )
+from knode_cosserat.recordings.files import File
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.frame import steps_are_smooth
 from knode_cosserat.recordings.messages import (
@@ -103,7 +105,7 @@ def default_config(content: Bag | Table) -> RecordingConfig:
     if isinstance(content, Bag):
         return RecordingConfig.paper_robot()
     if content.bodies:
-        return config_of_table(content)
+        return config_of_content(content)
     return configured(content.metadata, list(map(str, content.numbers.columns)))
 
 
@@ -116,8 +118,73 @@ def useful_topics(bag: Bag) -> set[str]:
     return {name for name, topic in bag.topics.items() if topic.type in kinds}
 
 
-def config_of_bag(bag: Bag) -> RecordingConfig:
-    """Return a configuration of a bag's topics, with remarks. Raises `RecordingError` without poses."""
+class _Found(NamedTuple):
+    """What was found in a file: bodies, settings of a configuration, and columns by quantity."""
+
+    bodies: list[_ProposedBody]
+    settings: dict[str, Any]
+    columns: dict[str, Any]
+
+
+def config_of_content(content: Bag | Table) -> RecordingConfig:
+    """Return a configuration of topics or columns, with remarks. Raises `RecordingError` without poses."""
+    remarks: list[str] = []
+    found = _found(content, remarks)
+    if not found.bodies:
+        raise RecordingError(_nothing_seen(content))
+    return _config(found.bodies, found.settings | _columns(found), remarks)
+
+
+def config_of_files(files: Sequence[File]) -> RecordingConfig:
+    """Return a configuration of several files, with remarks. Raises `RecordingError` without poses."""
+    remarks: list[str] = []
+    bodies, settings, columns, sources = list[_ProposedBody](), dict[str, Any](), dict[str, Any](), []
+    for file in files:
+        found = _found(file.content, remarks)
+        timing = {key: found.columns.pop(key) for key in ("time", "time_unit") if key in found.columns}
+        if (table := found.settings.pop("table", None)) is not None:
+            timing["rate"] = table.rate
+        sources.append(FileSource(file.name, **timing))
+        names = [body.name for body in bodies]
+        for body in found.bodies:
+            if body.name in names:
+                body = body._replace(name=f"{file.name} {body.name}")
+                if body.titles:
+                    body = body._replace(topic=body.name)
+            bodies.append(body)
+        for quantity in [it for it in found.settings if it in (*QUANTITIES, COMMAND) and it in settings]:
+            del found.settings[quantity]
+            remarks.append(f"{quantity} of {file.name} is not used: another file has it")
+        columns |= {name: titles for name, titles in found.columns.items() if name in found.settings}
+        settings |= found.settings
+    if not bodies:
+        raise RecordingError("; ".join(f"{file.name}: {_nothing_seen(file.content)}" for file in files))
+    found = _Found(bodies, settings, columns)
+    return _config(bodies, settings | _columns(found) | {"files": tuple(sources)}, remarks)
+
+
+def _found(content: Bag | Table, remarks: list[str]) -> _Found:
+    return _found_in_bag(content, remarks) if isinstance(content, Bag) else _found_in_table(content, remarks)
+
+
+def _columns(found: _Found) -> dict[str, Any]:
+    """Return the setting of a map of columns; none for topics and for exports without others."""
+    titles = {body.topic: body.titles for body in found.bodies if body.titles}
+    mapped = found.columns | titles
+    return {"columns": ColumnMap.from_dict(mapped)} if mapped else {}
+
+
+def _nothing_seen(content: Bag | Table) -> str:
+    if isinstance(content, Bag):
+        topics = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in content.topics.values()]
+        return f"no topic has poses; the bag has {', '.join(topics) or 'no topics'}"
+    return (
+        f"the columns are {', '.join(content.names)}; none look like a body's position x, y, z; "
+        "no map can be proposed. Write `columns: {time: …, tension: […], tip: [x, y, z]}` in a YAML file"
+    )
+
+
+def _found_in_bag(bag: Bag, remarks: list[str]) -> _Found:
     names: dict[str, str] = {}
     for topic in bag.topics.values():
         messages = (message for _, message in topic.messages() if message is not None)
@@ -136,10 +203,6 @@ def config_of_bag(bag: Bag) -> RecordingConfig:
         if len(stream.values):
             is_new = word not in [body.name for body in bodies]
             bodies.append(_ProposedBody(word if is_new else name, name, stream.values[:, :3]))
-    if not bodies:
-        topics = [f"{topic.name} ({topic.type.replace('/msg/', '/')})" for topic in bag.topics.values()]
-        raise RecordingError(f"no topic has poses; the bag has {', '.join(topics) or 'no topics'}")
-    remarks: list[str] = []
     sources: dict[str, Any] = {}
     singles: dict[tuple[str, str], list[str]] = {}
     for topic in bag.topics.values():
@@ -163,7 +226,7 @@ def config_of_bag(bag: Bag) -> RecordingConfig:
     for (before, after), numbers in singles.items():
         kind = _OF_TYPE.get(bag.topics[f"{before}{numbers[0]}{after}"].type, "")
         _add_topic(sources, kind, f"{before}{PLACE}{after}", (), tuple(sorted(numbers, key=int)))
-    return _config(bodies, sources, remarks)
+    return _Found(bodies, sources, {})
 
 
 #: quantities of message types
@@ -190,9 +253,9 @@ def _add_topic(
 # tables
 
 
-def config_of_table(table: Table) -> RecordingConfig:
-    """Return a configuration of a table's columns, with remarks. Raises `RecordingError` without poses."""
-    titles, remarks = list(map(str, table.numbers.columns)), list[str]()
+def _found_in_table(table: Table, remarks: list[str]) -> _Found:
+    """Return what is found in a table's columns."""
+    titles = table.names
     if table.bodies:
         bodies = []
         for name in table.bodies:
@@ -200,9 +263,8 @@ def config_of_table(table: Table) -> RecordingConfig:
             bodies.append(_ProposedBody(name, name, columns_of(table.numbers, places)))
         others = [title for title in titles if not re.search(r"_(x|y|z) \[m\]$|_q[wxyz]$", title)]
         mapped, sources = _controls(table, [title for title in others if title != TIME], remarks)
-        columns = ColumnMap.from_dict(mapped) if mapped else None
-        return _config(bodies, sources | {"columns": columns, "up": table.up}, remarks)
-    time = next((title for title in titles if _TIME.match(title)), None)
+        return _Found(bodies, sources | {"up": table.up}, mapped)
+    time = next((title for title in titles if _TIME.match(title.rpartition("/")[2])), None)
     others = [title for title in titles if title != time]
     bodies = _bodies(table, others)
     used = {title for body in bodies for title in body.titles}
@@ -221,8 +283,9 @@ def config_of_table(table: Table) -> RecordingConfig:
         if largest > 20.0:
             settings["position_unit"] = "mm"
             remarks.append(f"positions state no unit: mm is a guess by their size (up to {largest:.4g})")
-    columns = ColumnMap.from_dict({**timing, **mapped, **{body.topic: body.titles for body in bodies}})
-    return _config(bodies, sources | settings | {"columns": columns}, remarks)
+    if time is None:
+        del timing["time"]
+    return _Found(bodies, sources | settings, {**timing, **mapped})
 
 
 def _length_unit(title: str) -> str:
@@ -291,11 +354,6 @@ def _bodies(table: Table, titles: Sequence[str]) -> list[_ProposedBody]:
                 turned = _quaternion(before, titles, len(bodies))
                 bodies[name] = _ProposedBody(name, name, position, (*axes, *turned))
                 break
-    if not bodies:
-        raise RecordingError(
-            f"the columns are {', '.join(columns)}; none look like a body's position x, y, z; "
-            "no map can be proposed. Write `columns: {time: …, tension: […], tip: [x, y, z]}` in a YAML file"
-        )
     return list(bodies.values())
 
 

@@ -49,6 +49,7 @@ class Recording:
         findings: errors and repairs, the gravest first.
         delays: median delay from stamp to recording (s) by topic; NaN without stamps.
         sensors: sensors beside motion capture.
+        uses: use of each column of a table, or topic of a bag; empty text: it is not read.
     """
 
     source: str
@@ -62,6 +63,7 @@ class Recording:
     findings: tuple[Finding, ...]
     delays: Mapping[str, float]
     sensors: tuple[Sensor, ...] = ()
+    uses: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]

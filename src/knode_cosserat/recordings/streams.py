@@ -198,6 +198,16 @@ def rows_on_one_clock(
     Raises:
         RecordingError: there are no poses and no measured controls.
     """
+    rows = rows_from_zero(streams, config, findings)[1]
+    if not rows:
+        raise RecordingError("no poses and no controls in this recording")
+    return rows
+
+
+def rows_from_zero(
+    streams: Mapping[str, Stream], config: RecordingConfig, findings: list[Finding]
+) -> tuple[int, dict[str, Rows]]:
+    """Return the time of the first pose or control (ns), and the rows of each topic from there, if any."""
     for stream in streams.values():
         findings += stream.remarks
         if stream.broken:
@@ -208,16 +218,14 @@ def rows_on_one_clock(
     kept = {topic: _ordered(topic, times[topic], clocks) for topic in streams}
     # commands may start much earlier than anything is measured
     command = config.command.topic if config.command is not None and config.measured else None
-    zero = min(
-        (times[topic][rows[0]] for topic, rows in kept.items() if len(rows) and topic != command),
-        default=None,
-    )
+    begins = {topic: times[topic][rows[0]] for topic, rows in kept.items() if len(rows)}
+    zero = min((at for topic, at in begins.items() if topic != command or len(begins) == 1), default=None)
     if zero is None:
-        raise RecordingError("no poses and no controls in this recording")
+        return 0, {}
     for finding in clocks:
         seconds = tuple((time - zero) * 1e-9 for time in finding.times)
         findings.append(dataclasses.replace(finding, times=seconds))
-    return {
+    return int(zero), {
         topic: Rows(
             topic, np.round((times[topic][rows] - zero) * 1e-9, 9), streams[topic].values[rows], findings
         )

@@ -22,7 +22,7 @@ orientation. A row has the measurements at its time: cells of slower sensors sta
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -40,7 +40,7 @@ from knode_cosserat.recordings.config import (
     RecordingConfig,
     TableSource,
 )
-from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.findings import Finding, RecordingError, counted
 from knode_cosserat.recordings.quantities import QUANTITIES, UNITS, stated_unit
 from knode_cosserat.recordings.streams import FAR, SLOW, Outgoing, Stream
 
@@ -58,6 +58,8 @@ ALLOWED = (
     "from a row to the next are held_tension_1 [N], … instead, and other quantities have their own names, "
     f"such as pressure_1 [Pa] ({', '.join(QUANTITIES)})"
 )
+#: parts of a pose, in the order of their columns
+POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 #: largest number of unread columns that are listed
 MOST_LISTED = 8
 #: largest plausible time (s)
@@ -94,8 +96,52 @@ class Table(NamedTuple):
             config = config.replace(simulated=simulated == "true")
         return config
 
-    def streams(self, config: RecordingConfig, findings: list[Finding]) -> dict[str, Stream]:
+    @property
+    def names(self) -> list[str]:
+        """Titles of the columns."""
+        return list(map(str, self.numbers.columns))
+
+    def topics_there(self, config: RecordingConfig) -> list[str]:
+        """Return the topics of a configuration whose columns are all there."""
+        titles = _titles_by_topic(config, self.names)
+        return [topic for topic, named in titles.items() if set(named) <= set(self.names)]
+
+    def uses(self, config: RecordingConfig) -> dict[str, str]:
+        """Return the use of each column; empty text for those that are not read."""
+        columns, mapped = self.names, config.columns or ColumnMap()
+        stated = {mapped.time, TIME, *(file.time for file in config.files)}
+        uses = {title: "time" if {title, title.rpartition("/")[2]} & stated else "" for title in columns}
+        bodies = [source.topic for source in (*config.markers, config.base) if source is not None]
+        words: dict[str, str] = {}
+        for source in (*config.measured, config.command):
+            if source is not None:
+                what = COMMAND if source is config.command else source.quantity
+                words[source.topic] = f"{what} {{}} [{source.unit}]"
+        for topic, titles in _titles_by_topic(config, columns).items():
+            for k, title in enumerate(titles):
+                if title not in uses and title.isdecimal() and 1 <= int(title) <= len(columns):
+                    title = columns[int(title) - 1]
+                if title in uses:
+                    part = (
+                        POSE_PARTS[k]
+                        if topic in {it.topic for it in (*config.markers, config.base) if it}
+                        else k + 1
+                    )
+                    uses[title] = words.get(topic, f"{topic} {{}}").format(part)
+        return uses
+
+    def resets(self, config: RecordingConfig) -> list[float]:
+        """Return the times (s) at which rows continue after the clock was set back."""
+        time = _times(self.numbers, config.table or TableSource(), config.columns or ColumnMap())
+        return _continued(time)[1]
+
+    def streams(
+        self, config: RecordingConfig, findings: list[Finding], topics: Collection[str] | None = None
+    ) -> dict[str, Stream]:
         """Return the measured rows of each topic, and add findings on unread columns and rows without times.
+
+        `topics` are those that are read; None: all of the configuration. After the clock was set back, the
+        rows are taken to continue one step later.
 
         Raises:
             RecordingError: a column is missing, or the times are not plausible seconds.
@@ -105,11 +151,18 @@ class Table(NamedTuple):
         unused = [source.topic for source in config.idle]
         bodies = [source.topic for source in (*config.markers, config.base) if source is not None]
         templates, mapped = config.table or TableSource(), config.columns or ColumnMap()
-        time = _times(self.numbers, templates, mapped)
+        time, resets = _continued(_times(self.numbers, templates, mapped))
+        if resets:
+            what = (
+                f"{counted(len(resets), 'reset', 'resets')} of the clock; the next rows are taken to follow"
+            )
+            findings.append(Finding("warning", "", what))
         has_rate = templates.rate is not None and mapped.time is None
         read = set[int]() if has_rate else {_place(mapped.time or TIME, columns)}
         streams = {}
         for topic, named in titles.items():
+            if topics is not None and topic not in topics:
+                continue
             # numbers that do not drive the robot may be missing
             if topic in unused and not set(named) & set(columns):
                 continue
@@ -335,6 +388,27 @@ def _times(table: pd.DataFrame, templates: TableSource, mapped: ColumnMap) -> Fl
         unit = next((unit for unit, size in (("ms", 1e3), ("µs", 1e6)) if most <= size), "ns")
         raise RecordingError(f"{what}. Are the times in {unit}?")
     return time
+
+
+#: smallest step back of a clock that was reset (s), and rows after which it has not come back
+_BACK, _STAYS = 1.0, 5
+
+
+def _continued(time: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], list[float]]:
+    """Return times (s) that continue one step later where the clock was set back, and where that is."""
+    known = np.flatnonzero(np.isfinite(time))
+    seconds, begins = time[known].copy(), list[float]()
+    step = float(np.median(np.abs(np.diff(seconds)))) if len(seconds) > 1 else 0.0
+    for row in np.flatnonzero(np.diff(seconds) < -_BACK):
+        after = seconds[row + 1 : row + 1 + _STAYS]
+        # a row out of order comes back; whole parts out of order do not follow the last part
+        if len(after) < _STAYS or np.any(np.diff(after) < 0.0) or after.max() > seconds[row] - _BACK / 2:
+            continue
+        seconds[row + 1 :] += seconds[row] + step - seconds[row + 1]
+        begins.append(float(seconds[row + 1]))
+    continued = np.array(time)
+    continued[known] = seconds
+    return continued, begins
 
 
 #: spellings of units of time in titles
