@@ -13,7 +13,7 @@ from jaxtyping import Float
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import NORMAL, rest_mask, rest_positions, rod_lengths, rotation_steps
 from knode_cosserat.recordings.quantities import labels, unit_of
-from knode_cosserat.recordings.streams import period
+from knode_cosserat.recordings.streams import SLOW, period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.recording import Recording
@@ -193,6 +193,9 @@ def _noise(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"], rest: tuple[float, float] | None
 ) -> float | None:
     """Return the noise's standard deviation from third differences, at rest if possible; None if unknown."""
+    # equilibria are not smooth in time
+    if period(time) > 0.95 * SLOW:
+        return None
     still = values[rest_mask(time, rest)]
     known = still if len(still) >= _ENOUGH else values
     if len(known) < _ENOUGH:

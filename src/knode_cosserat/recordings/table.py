@@ -122,11 +122,7 @@ class Table(NamedTuple):
                 if title not in uses and title.isdecimal() and 1 <= int(title) <= len(columns):
                     title = columns[int(title) - 1]
                 if title in uses:
-                    part = (
-                        POSE_PARTS[k]
-                        if topic in {it.topic for it in (*config.markers, config.base) if it}
-                        else k + 1
-                    )
+                    part = POSE_PARTS[k] if topic in bodies else k + 1
                     uses[title] = words.get(topic, f"{topic} {{}}").format(part)
         return uses
 
