@@ -207,7 +207,7 @@ def test_the_controls_are_those_that_led_to_each_row():
     ("recording", "robot", "options", "said"),
     [
         (recorded(turned=False), BARE, {}, "no body has orientations"),
-        (recorded(tendons=3), BARE, {}, r"the robot has the controls tension \(4\); the recording has 3 controls"),
+        (recorded(tendons=3), BARE, {}, r"the controls tension \(4\); the recording has 3 controls"),
         (recorded(), BARE.replace(length=2.0), {}, "allowed is up to 2 times"),
         (recorded(), BARE, {"method": "kalman"}, 'allowed is "best" or "paper"'),
         (recorded(), BARE, {"start": 9.0}, "no rows"),

@@ -290,7 +290,7 @@ def test_tensions_in_another_unit_are_flagged(tmp_path, streams):
     newtons = dataclasses.replace(PAPER, tension=dataclasses.replace(PAPER.tension, unit="N"))
     write(tmp_path / "newtons.bag", streams, newtons)
     recording = kc.load_recording(tmp_path / "newtons.bag")
-    assert said(recording, "are newtons read as grams-force?").severity == "problem"
+    assert said(recording, "are N read as gf?").severity == "problem"
 
 
 def test_positions_in_another_unit_are_flagged(tmp_path, streams):

@@ -32,6 +32,8 @@ FINEST, COARSEST, MOST_ROWS = 0.005, 0.1, 30_000
 OVERLAP, SHORTEST = 0.4, 2.0
 #: distance of delays that are tried (s)
 GRID = 0.02
+#: number of delays over the whole range, beside candidates
+OTHERS = 101
 #: number of candidates, and the distance within which they are one (s)
 CANDIDATES, APART = 16, 0.3
 #: duration in which residuals are one independent number (s)
@@ -176,18 +178,20 @@ def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, fl
         raise RecordingError(f"less than {SHORTEST:g} s are there in one of the files")
     wanted = max(SHORTEST, OVERLAP * min(np.ptp(first.time), np.ptp(motion.time)))
     near = np.arange(-15, 16) * GRID
-    grid = (
-        np.unique(np.round(np.add.outer(_correlated(first, motion, wanted), near) / GRID).astype(int)) * GRID
-    )
+    candidates = np.add.outer(_correlated(first, motion, wanted), near).ravel()
+    # others tell if a delay is better than any
+    least, most = motion.time[0] - first.time[-1] + wanted, motion.time[-1] - first.time[0] - wanted
+    others = np.linspace(least, most, OTHERS)
+    grid = np.unique(np.round(np.concatenate([candidates, others]) / GRID).astype(int)) * GRID
     rows = [motion.filtered(width, order) for order in (0, 1, 2)]
     scores = np.array([_likelihoods(first, motion, rows, width, delay, wanted) for delay in grid])
     if not len(grid) or scores[:, 0].max() < RELATED:
         raise RecordingError("controls and motion have no relation that tells")
     static, dynamic = scores.T
     best = int(np.argmax(scores.sum(axis=1)))
-    others = (np.abs(grid - grid[best]) > APART) & (scores.sum(axis=1) > scores[best].sum() - DECIDED)
-    if others.any():
-        apart = np.min(np.abs(grid - grid[best])[others])
+    alike = (np.abs(grid - grid[best]) > APART) & (scores.sum(axis=1) > scores[best].sum() - DECIDED)
+    if alike.any():
+        apart = np.min(np.abs(grid - grid[best])[alike])
         raise RecordingError(f"offsets that differ by {apart:.2f} s explain the motion as well as each other")
     # the dynamic model knows the delay without the lag
     around = (grid >= grid[best] - APART) & (grid <= grid[best] + 0.5 * APART)

@@ -416,9 +416,11 @@ def _recognised(text: str, unit: str) -> str:
         return ""
     alike = [it for it in QUANTITIES.values() if it.unit != "1" and (not known or known in it.units)]
     for words in ("words", "actuators"):
-        for quantity in alike:
-            if getattr(quantity, words).search(text):
-                return quantity.name
+        # the longest word is the most special one: Drehwinkel is no Winkel, Vorschub no Hub
+        matches = [(getattr(quantity, words).search(text), quantity.name) for quantity in alike]
+        sizes = [(len(match[0]), name) for match, name in matches if match]
+        if sizes:
+            return max(sizes, key=lambda size: size[0])[1]
     # a length may be anything; a unit of anything else says what is measured
     return alike[0].name if known and known not in POSITION_UNITS else ""
 

@@ -166,7 +166,7 @@ QUANTITIES: dict[str, Quantity] = {
             1e-4,
             1e3,
             (("rad", 7.0), ("deg", math.inf)),
-            _words(r"rotat|rotac|rotaz|alpha|dreh|twist|torsion"),
+            _words(r"rotat|rotac|rotaz|alpha|dreh(winkel)?|twist|torsion"),
             _words(r"tube|rohr|catheter|katheter"),
             ("rotation", "rx", "ry", "rz"),
         ),
