@@ -35,7 +35,7 @@ GRID = 0.02
 #: number of delays over the whole range, beside candidates
 OTHERS = 101
 #: number of candidates, and the distance within which they are one (s)
-CANDIDATES, APART = 16, 0.3
+CANDIDATES, APART = 8, 0.3
 #: duration in which residuals are one independent number (s)
 CORRELATED = 0.2
 #: differences of log likelihoods, twice: from no relation at all, from another candidate, and of two
@@ -236,9 +236,11 @@ def _likelihoods(
     columns, known = _explaining(first, motion, width, delay, 0.0)
     if np.sum(known) * motion.dt < wanted:
         return -math.inf, -math.inf
-    position, velocity, acceleration = (each[known] for each in rows)
-    constant, columns = np.ones((len(position), 1)), columns[known]
-    independent = len(position) * motion.dt / CORRELATED
+    independent = np.sum(known) * motion.dt / CORRELATED
+    # smoothed rows are not needed more densely than they differ
+    used = np.flatnonzero(known)[:: max(1, int(width / motion.dt))]
+    position, velocity, acceleration = (each[used] for each in rows)
+    constant, columns = np.ones((len(used), 1)), columns[used]
     power, least = (
         np.sum(_residual(position, _basis(own)) ** 2) for own in (constant, np.hstack([constant, columns]))
     )
@@ -259,8 +261,11 @@ def _residual(values: np.ndarray, basis: np.ndarray) -> np.ndarray:
 
 def _basis(columns: np.ndarray) -> np.ndarray:
     scale = np.linalg.norm(columns, axis=0)
-    u, s, _ = np.linalg.svd(columns / np.where(scale > 0.0, scale, 1.0), full_matrices=False)
-    return np.asarray(u[:, s > 1e-8 * s[0]])
+    scaled = columns / np.where(scale > 0.0, scale, 1.0)
+    # by the eigenvectors of the small matrix: many bases of few columns are needed
+    s, v = np.linalg.eigh(scaled.T @ scaled)
+    kept = s > 1e-10 * s[-1]
+    return np.asarray(scaled @ (v[:, kept] / np.sqrt(s[kept])))
 
 
 def _explaining(

@@ -119,7 +119,7 @@ def useful_topics(bag: Bag) -> set[str]:
 
 
 class _Found(NamedTuple):
-    """What was found in a file: bodies, settings of a configuration, and columns by quantity."""
+    """Content recognised in a file: bodies, settings of a configuration, and columns by quantity."""
 
     bodies: list[_ProposedBody]
     settings: dict[str, Any]
