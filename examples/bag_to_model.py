@@ -27,7 +27,7 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
     knowledge = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
     found = kc.identify(knowledge, [seen], parameters=NAMES)
     print(found)
-    before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.0125) for each in (knowledge, found.robot))
+    before, after = (kc.simulate(each, unseen.control[:-1], 0.0125) for each in (knowledge, found.robot))
     kc.figures.prediction_against_measurement(after, unseen).savefig(out)
     errors = tuple(
         float(((each.tip_position - unseen.tip_position) ** 2).sum(axis=1).mean() ** 0.5)

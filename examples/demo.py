@@ -99,7 +99,7 @@ def predict_a_held_out_recording(out: Path) -> None:
     kc.save_robot(found.robot, out / "calibrated.yaml")
     # row 0 is the state at rest, so the last row's tension is not used
     predictions = {
-        label: kc.simulate(robot, held_out.held_tension[:-1], DT)
+        label: kc.simulate(robot, held_out.control[:-1], DT)
         for label, robot in {"nominal model": nominal, "calibrated model": found.robot}.items()
     }
     kc.figures.prediction_against_measurement(predictions["calibrated model"], held_out).savefig(

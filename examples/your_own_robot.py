@@ -14,7 +14,7 @@ import numpy as np
 import knode_cosserat as kc
 from knode_cosserat import figures
 from knode_cosserat.metrics import rms_distance
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.virtual import lagged
 from knode_cosserat.recordings.write import write_recording
 from knode_cosserat.rods.tendon_robots import VirtualRobot
@@ -45,7 +45,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
         pulls = kc.controls.random(count, low=3.0, high=8.0, seed=int(signal[7:]), tendons=3, hold=8)
     sent = np.concatenate([np.full((round(RESTING / 0.05), 3), 5.0), pulls])
     time = FINE * np.arange(round(seconds / FINE) + 1)
-    tension = lagged(Tensions(0.05 * np.arange(len(sent)), sent), time, 0.06)
+    tension = lagged(ControlRows(0.05 * np.arange(len(sent)), sent), time, 0.06)
     still = kc.equilibrium(real, tension[0], space="lobatto4")
     moved = kc.simulate(real, tension[1:], FINE, space="lobatto4", initial=still)[::2]
     rng = np.random.default_rng(list(signal.encode()))
@@ -53,7 +53,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
     config = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
     seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
     turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
-    pulled = Tensions(time[::4], (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2))
+    pulled = ControlRows(time[::4], (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2))
     write_recording(path, config, {"tip": Body(time[::2], seen.round(5), turned.round(4))}, pulled)
 
 

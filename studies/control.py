@@ -394,14 +394,14 @@ def smoother(settings: Any) -> Product:
         position, quaternion = np.array(seen), np.array(turned)
         measured = Measurements(
             time=DT * np.arange(len(controls)),
-            tension=controls,
+            control=controls,
             fractions=np.array(BODIES),
             position=position + TipPosition().sigma * rng.normal(size=position.shape),
             quaternion=quaternion + TURN_NOISE * rng.normal(size=quaternion.shape),
             measured=np.ones(position.shape[:2], dtype=bool),
             simulated=True,
             source="study of control",
-            initial_tension=STILL,
+            initial_control=STILL,
         )
         apart = np.asarray(estimate_states(measured, robot).position) - np.array(true)
         errors = np.sqrt(np.mean(np.sum(apart**2, axis=-1), axis=-1)) / float(robot.length)

@@ -384,9 +384,9 @@ def _paper_motion(system: System, resting: System, measured: Measurements, recov
 
     That is the equilibrium of the nominal robot: the paper's robot points up there, others may sag.
     """
-    before = measured.initial_tension
+    before = measured.initial_control
     rest = None if before is None else equilibrium(resting, before, space=PAPER_SPACE)
-    acting = remove_delay(system, measured.tension[:-1], measured.dt, before)
+    acting = remove_delay(system, measured.control[:-1], measured.dt, before)
     return simulate(
         system,
         acting,

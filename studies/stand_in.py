@@ -87,8 +87,8 @@ def identified(nominal: TendonRod, recorded: Sequence[Recorded]) -> Model:
     """Return the model that these recordings give."""
     lags = []
     for commanded, measured in ((each.commanded, each.measured) for each in recorded):
-        assert measured.initial_tension is not None
-        lags.append(identified_lag(commanded, measured.tension, measured.dt, measured.initial_tension))
+        assert measured.initial_control is not None
+        lags.append(identified_lag(commanded, measured.control, measured.dt, measured.initial_control))
     found = identify(nominal, [each.measured for each in recorded], EFFECTS)
     errors = [error for error in found.held_out_error.values() if error is not None]
     robot = found.robot

@@ -327,7 +327,7 @@ def test_recordings_become_the_rows_that_models_learn_from():
     recording = OBJECTS["recording"]
     rows = kc.recordings.Measurements.of(recording)
     same = recording.sampled(0.0125, mean=True)
-    for name in ("time", "tension", "position", "quaternion"):
+    for name in ("time", "control", "position", "quaternion"):
         np.testing.assert_array_equal(getattr(rows, name), getattr(same, name))
     assert kc.recordings.Measurements.of(rows) is rows
     with pytest.raises(ValueError, match="fractions are of trajectories"):

@@ -299,8 +299,8 @@ def test_recordings_and_measurements_show_their_extent(motion):
     measured = kc.recordings.Measurements.of(motion, (0.5, 1.0))
     short(measured, "5 rows from 0 to 0.2 s", "2 bodies at 0.5, 1 of the length")
     recording = kc.recordings.load_example()
-    short(recording, "Recording (simulated): 15.95 s; 4 tendons", "tip at 1 of the length")
-    short(recording.sampled(0.05), "Measurements (simulated)", " s; 4 tendons")
+    short(recording, "Recording (simulated): 15.95 s; tension (4)", "tip at 1 of the length")
+    short(recording.sampled(0.05), "Measurements (simulated)", " s; tension (4)")
     short(kc.controls.Controls(kc.controls.sine(1.5, 4, 0.05), 0.05), "4 steps of 0.05 s; 4 tendons, 5", " N")
 
 

@@ -38,7 +38,7 @@ def test_the_trunks_files_fit_together():
             assert one.end == other.end and np.hypot(one.x + other.x, one.y + other.y) < 1e-6
             assert taken_in[2 * k] == pytest.approx(-taken_in[2 * k + 1])
     seen = extract().sampled(0.05)
-    assert seen.tension.shape[1] == 6 and np.abs(seen.tension).max() < np.radians(90.0)
+    assert seen.control.shape[1] == 6 and np.abs(seen.control).max() < np.radians(90.0)
     # it hangs, and z goes down
     assert np.nanmax(seen.position[:, -1, 2]) > 0.3
 
@@ -61,9 +61,9 @@ def cables(name):
 def test_three_cables_are_read():
     used, unused = cables("identify.csv"), cables("held_out.csv")
     assert (len(used.time), len(unused.time)) == (50, 250) and used.static
-    assert not {*map(tuple, used.tension)} >= {*map(tuple, unused.tension)}
+    assert not {*map(tuple, used.control)} >= {*map(tuple, unused.control)}
     # one cable is always slack, and the tip hangs below the clamped end
-    assert np.all(unused.tension.min(axis=1) == 0.0) and np.all(unused.position[:, 0, 2] > 0.05)
+    assert np.all(unused.control.min(axis=1) == 0.0) and np.all(unused.position[:, 0, 2] > 0.05)
 
 
 @pytest.mark.campaign
@@ -84,7 +84,7 @@ def test_the_order_of_servos_is_found():
     robot, config = kc.load_robot(SERVOS / "nominal.yaml"), RecordingConfig.load(SERVOS / "recording.yaml")
     seen = kc.load_recording(SERVOS / "tendon_pull.csv", config).sampled()
     order, sides = np.array([4, 0, 8, 2, 6, 1, 3, 7, 5]), np.array([1, 1, -1, 1, 1, 1, 1, 1, 1])
-    changed = dataclasses.replace(seen, tension=sides * seen.tension[:, order])
+    changed = dataclasses.replace(seen, control=sides * seen.control[:, order])
     motor_order = runpy.run_path(str(SERVOS / "motor_order.py"))["motor_order"]
     found = motor_order(robot, changed)
     assert np.array_equal(found.tendons, sides * (order + 1))
@@ -92,7 +92,7 @@ def test_the_order_of_servos_is_found():
     with pytest.raises(ValueError, match="motor 1 never moves alone"):
         motor_order(robot, changed.rows(40, 60))
     with pytest.raises(ValueError, match="2 motors; the robot has 9"):
-        motor_order(robot, dataclasses.replace(seen, tension=seen.tension[:, :2]))
+        motor_order(robot, dataclasses.replace(seen, control=seen.control[:, :2]))
 
 
 @pytest.mark.campaign

@@ -17,7 +17,7 @@ def test_its_files_are_those_of_the_page():
         assert (HERE / name).read_text(encoding="utf-8") in page
     robot = kc.load_robot(HERE / "your_own_robot.yaml")
     config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
-    assert robot.control_layout.size == config.tendons == 3
+    assert robot.control_layout.size == config.count == 3
     assert [marker.fraction for marker in config.markers] == [1.0]
     for picture in ("health", "before", "after"):
         assert f"images/own-robot-{picture}.png" in page

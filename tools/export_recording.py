@@ -24,13 +24,13 @@ def write_table(path, measured, source, simulated_with):
         "tension_k: measured tension of tendon k, the last sample at or before the row's time.",
         "tip: position interpolated at the row's time; z is up, the origin the rod's clamped end.",
     ]
-    tendons = range(1, measured.tension.shape[1] + 1)
+    tendons = range(1, measured.control.shape[1] + 1)
     names = ["time [s]", *(f"tension_{k} [N]" for k in tendons), *(f"tip_{axis} [m]" for axis in "xyz")]
     with path.open("w", encoding="utf-8", newline="") as file:
         file.writelines(f"# {line}\n" for line in comments)
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(names)
-        for t, newtons, metres in zip(measured.time, measured.tension, measured.tip_position, strict=True):
+        for t, newtons, metres in zip(measured.time, measured.control, measured.tip_position, strict=True):
             writer.writerow([f"{t:g}", *(f"{x:.5f}" for x in newtons), *(f"{x:.6f}" for x in metres)])
 
 

@@ -56,7 +56,7 @@ print(found)
 # narrow. The test is the prediction of the held-out recording:
 
 # %%
-before, after = (kc.simulate(each, unseen.held_tension[:-1], 0.025) for each in (knowledge, found.robot))
+before, after = (kc.simulate(each, unseen.control[:-1], 0.025) for each in (knowledge, found.robot))
 for label, each in (("before", before), ("after", after)):
     off = np.sqrt(np.mean(np.sum((each.tip_position - unseen.tip_position) ** 2, axis=1)))
     print(f"{label:7} tip RMSE {100 * off:.2f} cm on the unseen recording")

@@ -34,7 +34,7 @@ def motor_order(robot: Any, measured: kc.recordings.Measurements) -> Order:
     Raises:
         ValueError: another number of motors, or a motor that never moves further than all others.
     """
-    control, tip = measured.tension, measured.position[:, -1]
+    control, tip = measured.control, measured.position[:, -1]
     count = robot.control_layout.size
     if control.shape[1] != count:
         raise ValueError(f"the recording has {control.shape[1]} motors; the robot has {count}")

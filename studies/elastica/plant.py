@@ -150,14 +150,14 @@ def record_elastica(
     position = position + sigma.sigma * random.normal(size=np.shape(position))
     measured = Measurements(
         time=ROW * np.arange(len(commanded)),
-        tension=np.array(tension),
+        control=np.array(tension),
         fractions=np.array(bodies),
         position=np.array(position),
         quaternion=_shaken(np.array(quaternion), sigma.sigma_rotation, random),
         measured=np.ones((len(commanded), len(bodies)), dtype=bool),
         simulated=True,
         source="simulated with PyElastica",
-        initial_tension=initial,
+        initial_control=initial,
         continuous=True,
     )
     return Recorded(measured, commanded)

@@ -39,7 +39,7 @@ def recording(trajectory):
     tip = np.asarray(trajectory.tip_position) + rng.normal(0.0, 0.05, trajectory.tip_position.shape)
     return kc.recordings.Measurements(
         time=7.0 + np.asarray(trajectory.time),
-        tension=np.asarray(trajectory.held_tension),
+        control=np.asarray(trajectory.held_tension),
         fractions=np.ones(1),
         position=tip[:, None],
         quaternion=np.full((len(tip), 1, 4), np.nan),

@@ -43,9 +43,9 @@ def recorded(path, streams, config=PAPER):
         for t, kind, k in sorted(events):
             clock.time = t
             if kind == 0:
-                recorder.add_command(command.tension[k])
+                recorder.add_command(command.values[k])
             elif kind == 1:
-                recorder.add_reading(Reading(t, tension.tension[k], np.zeros(4), DriverState.ARMED))
+                recorder.add_reading(Reading(t, tension.values[k], np.zeros(4), DriverState.ARMED))
             else:
                 position = np.array([poses[name].position[k] for name in recorder.encoder.bodies])
                 quaternion = np.array([poses[name].quaternion[k] for name in recorder.encoder.bodies])
@@ -59,9 +59,9 @@ def equal(one, other):
         np.testing.assert_allclose(a.time, b.time, atol=2e-9)
         np.testing.assert_array_equal(a.position, b.position)
         np.testing.assert_array_equal(a.quaternion, b.quaternion)
-    for a, b in ((one.tension, other.tension), (one.command, other.command)):
+    for a, b in ((one.control, other.control), (one.command, other.command)):
         np.testing.assert_allclose(a.time, b.time, atol=2e-9)
-        np.testing.assert_array_equal(a.tension, b.tension)
+        np.testing.assert_array_equal(a.values, b.values)
     return True
 
 
@@ -102,11 +102,11 @@ def test_a_simulated_robot_is_stated(tmp_path, exact):
 def test_lost_bodies_and_tensions_have_no_message(tmp_path):
     poses, tension, command = made(seconds=1.0, noise=0.0)
     poses["rib 2"].position[40:43] = np.nan
-    tension.tension[7, 2] = np.nan
+    tension.values[7, 2] = np.nan
     recorded(tmp_path / "live.bag", (poses, tension, command))
     recording = load_recording(tmp_path / "live.bag")
     assert [len(body.time) for body in recording.bodies] == [100, 97, 100, 100]
-    assert len(recording.tension.time) == 49
+    assert len(recording.control.time) == 49
 
 
 KILLED = """
@@ -142,7 +142,7 @@ def test_a_kill_loses_one_second_at_most(tmp_path):
     assert not path.exists()
     recording = load_recording(path.with_name("run.bag.active"))
     # the interval is 0.5 s; a slow disk or a busy machine adds to it
-    assert last - begin - recording.tension.time[-1] < 1.0
+    assert last - begin - recording.control.time[-1] < 1.0
     assert any("recorder was stopped" in each.message for each in recording.findings)
     # the name of the killed one is not taken
     with pytest.raises(HardwareError, match=r"run.bag.active: this file exists"):
@@ -185,8 +185,8 @@ def test_a_full_disk_is_one_error_and_keeps_what_was_written(tmp_path, monkeypat
         record()
     recorder.close()  # the error was raised once
     recording = load_recording(recorder.active_path)
-    assert len(recording.tension.time) >= 1
-    assert len(recording.tension.time) + 5 * len(recording.bodies[0].time) == recorder.written
+    assert len(recording.control.time) >= 1
+    assert len(recording.control.time) + 5 * len(recording.bodies[0].time) == recorder.written
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/shm") or os.geteuid() != 0, reason="mounting needs root")
@@ -277,4 +277,4 @@ def test_a_robot_is_recorded_for_a_time(tmp_path):
     clock = Clock()
     with Recorder(tmp_path / "run.bag", clock=HostClock(clock)) as recorder:
         assert record_robot(recorder, Source(), 1.0, Capture()) == 50
-    assert len(load_recording(tmp_path / "run.bag").tension.time) == 50
+    assert len(load_recording(tmp_path / "run.bag").control.time) == 50

@@ -168,7 +168,7 @@ def test_record_writes_a_bag_that_is_read(folder):
     assert found["commands"] == 20 and found["bodies"] == ["tip"] and found["messages"] > 100
     recording = kc.load_recording("a.bag", kc.recordings.RecordingConfig.load("a.yaml"))
     measured = recording.sampled(0.05)
-    assert measured.simulated and measured.tension.shape[1] == 4
+    assert measured.simulated and measured.control.shape[1] == 4
     assert np.nanmax(np.abs(measured.tip_position[:, 0])) > 1e-3
     assert "this file exists" in error(
         run(*words, "--controls", "1,1,1,1", "--seconds", "1", "--out", "a.bag")

@@ -121,9 +121,9 @@ def equal(one, other):
         np.testing.assert_array_equal(a.time, b.time)
         np.testing.assert_array_equal(a.position, b.position)
         np.testing.assert_array_equal(a.quaternion, b.quaternion)
-    for a, b in ((one.tension, other.tension), (one.command, other.command)):
+    for a, b in ((one.control, other.control), (one.command, other.command)):
         np.testing.assert_array_equal(a.time, b.time)
-        np.testing.assert_array_equal(a.tension, b.tension)
+        np.testing.assert_array_equal(a.values, b.values)
     return one.simulated == other.simulated
 
 
@@ -135,7 +135,7 @@ def test_rosbag_records_what_the_driver_records(tmp_path, ros):
     subprocess.run(program, env=ros, check=True, timeout=120.0)
     recorded.stop()
     own, live = load_recording(tmp_path / "own.bag"), load_recording(tmp_path / "recorded.bag")
-    assert len(own.tension.time) == 100 and own.simulated
+    assert len(own.control.time) == 100 and own.simulated
     assert equal(live, own)
 
     # and played back, recorded again

@@ -40,12 +40,12 @@ def measured(robot, true_tension, source, *, seed=0, noise=NOISE, reading=None, 
     return kc.recordings.Measurements(
         time=np.asarray(moved.time),
         # the last row's leads beyond the end
-        tension=np.concatenate([seen, seen[-1:]]),
+        control=np.concatenate([seen, seen[-1:]]),
         fractions=FRACTIONS,
         position=position + noise * rng.normal(size=position.shape),
         quaternion=quaternion / np.linalg.norm(quaternion, axis=-1, keepdims=True),
         measured=np.ones(position.shape[:2], dtype=bool),
         simulated=True,
         source=source,
-        initial_tension=seen[0],
+        initial_control=seen[0],
     )

@@ -71,7 +71,7 @@ def test_a_passive_network_does_not_diverge_and_its_spread_is_told():
     )
     unseen = measured(TRUE, tensions("random", 2.0, seed=9), "unseen", seed=9)
     before = evaluate(NOMINAL, unseen).tip_rmse
-    model = library_model(NOMINAL, unseen.tension)
+    model = library_model(NOMINAL, unseen.control)
     from knode_cosserat.identification.experiments import of_measurements
 
     data = [of_measurements(each, model, each.source) for each in given]
@@ -119,7 +119,7 @@ def test_poses_of_a_trajectory_are_measurements():
     robot = NOMINAL.replace(nodes=5)
     states = kc.simulate(robot, tension, DT)
     rows = poses_of_nodes(states, "a trajectory")
-    assert np.allclose(rows.tension[:-1], tension, rtol=0.0, atol=0.0)
+    assert np.allclose(rows.control[:-1], tension, rtol=0.0, atol=0.0)
     assert rows.fractions[-1] == 1.0 and rows.dt == pytest.approx(DT)
     assert np.array_equal(rows.tip_position, np.asarray(states.position)[:, -1])
 

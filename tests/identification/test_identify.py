@@ -87,7 +87,7 @@ def test_named_effects_and_their_intervals(tmp_path):
     kc.save_robot(found.robot, tmp_path / "found.yaml")
     saved = kc.load_robot(tmp_path / "found.yaml")
     assert all(evaluate(saved, each).extrapolated == 0.0 for each in given)
-    harder = dataclasses.replace(given[0], tension=1.5 * given[0].tension)
+    harder = dataclasses.replace(given[0], control=1.5 * given[0].control)
     outside = evaluate(saved, harder)
     assert outside.extrapolated > 0.3 and "of the rows extrapolated" in str(outside)
 
@@ -100,7 +100,7 @@ def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
     assert found.tip_rmse < 1e-7 and found.pose_mse < 1e-12 and found.failed is None
     assert "tip RMSE 0.00 mm" in str(found)
     assert evaluate(true, seen, every=2, last=5).tip.shape == (5, 3)
-    hopeless = dataclasses.replace(seen, tension=1e9 * seen.tension, initial_tension=None)
+    hopeless = dataclasses.replace(seen, control=1e9 * seen.control, initial_control=None)
     failed = evaluate(true, hopeless)
     assert failed.failed and failed.to_dict()["tip_rmse"] is None and "no prediction" in str(failed)
 
@@ -109,7 +109,7 @@ def test_a_robots_own_motion_is_predicted_however_bodies_are_mounted():
 def test_trials_name_what_fails():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
-    data = of_measurements(seen, library_model(NOMINAL, seen.tension), "own")
+    data = of_measurements(seen, library_model(NOMINAL, seen.control), "own")
     assert failed_trial(true, [data], "lobatto2") is None
     # a rod that its own tendons buckle between its ribs
     weak = true.replace(rib_spacing=RibSpacing(softening=1.0))
@@ -120,7 +120,7 @@ def test_trials_name_what_fails():
 def test_a_grid_is_too_coarse_or_fine_enough():
     true = kc.robots.RoutedTendonRobot.like(NOMINAL)
     seen = measured(true, tensions(1.0, 1.0), "own", noise=0.0)
-    data = [of_measurements(seen, library_model(NOMINAL, seen.tension), "own")]
+    data = [of_measurements(seen, library_model(NOMINAL, seen.control), "own")]
     assert not has_coarse_rows(true, data, "lobatto2")
     soft = true.replace(nodes=5, youngs_modulus=2e8, sections=(Sleeve(stiffening=8.0, length=0.1),))
     assert has_coarse_rows(soft, data, "lobatto2")
@@ -146,11 +146,11 @@ def test_bad_input_says_what_is_wrong():
     with pytest.raises(DataError, match="time steps differ"):
         kc.identify(NOMINAL, [seen, other])
     gone = dataclasses.replace(
-        seen, tension=np.where(np.arange(len(seen.time))[:, None] == 7, np.nan, seen.tension)
+        seen, control=np.where(np.arange(len(seen.time))[:, None] == 7, np.nan, seen.control)
     )
-    with pytest.raises(DataError, match=f"no tension is known at {7 * DT:g} s"):
+    with pytest.raises(DataError, match=f"no control is known at {7 * DT:g} s"):
         kc.identify(NOMINAL, [gone])
-    with pytest.raises(DataError, match="3 tensions in a row; the robot has 4"):
-        kc.identify(NOMINAL, [dataclasses.replace(seen, tension=seen.tension[:, :3])])
+    with pytest.raises(DataError, match=r"the robot has the controls tension \(4\); the recording has"):
+        kc.identify(NOMINAL, [dataclasses.replace(seen, control=seen.control[:, :3])])
     with pytest.raises(DataError, match="at least 3"):
         kc.identify(NOMINAL, [seen.rows(0, 2)])

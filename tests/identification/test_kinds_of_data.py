@@ -128,7 +128,7 @@ def test_kinds_are_weighted_in_one_objective(motion):
 
 
 SENSED = """format: 1
-columns: {time: t, tensions: [I1, I2, I3, I4]}
+columns: {time: t, tension: [I1, I2, I3, I4]}
 tension: {gain: 0.8e-3, held: true}
 sensors:
   - {kind: orientation, columns: [roll, pitch, yaw], unit: deg, fractions: 1.0}
@@ -153,7 +153,7 @@ def logged(motion, path):
     bend = np.stack([np.linalg.norm(angles, axis=1), np.arctan2(angles[:, 1], angles[:, 0])], axis=1)
     frame = Rotation.from_quat([0.5, 0.5, 0.5, 0.5], scalar_first=True).inv()
     forces = 1e3 * frame.apply(wrench.reshape(-1, 3)).reshape(wrench.shape)
-    currents = seen.tension[np.searchsorted(seen.time, time + 1e-9, side="right") - 1] / 0.8e-3
+    currents = seen.control[np.searchsorted(seen.time, time + 1e-9, side="right") - 1] / 0.8e-3
     table = np.hstack([time[:, None], currents, euler, bend, 1e-3 * curvatures, forces])
     table = np.repeat(table, 1 + (np.arange(len(time)) % 7 == 3), axis=0)
     table[40:42, 5:8] = np.nan
@@ -169,7 +169,7 @@ def test_a_log_of_sensors_is_read_and_recovers_the_robot(motion, tmp_path):
     assert RecordingConfig.from_dict(yaml.safe_load(config.to_yaml())) == config
     recording = kc.load_recording(tmp_path / "log.csv", config)
     rows = recording.sampled(DT)
-    np.testing.assert_allclose(rows.tension, seen.tension[: len(rows.time)], atol=1e-9)
+    np.testing.assert_allclose(rows.control, seen.control[: len(rows.time)], atol=1e-9)
     for read, exact in zip(rows.sensors[1:], seen.sensors[1:], strict=True):
         np.testing.assert_allclose(
             read.values, exact.values[: len(rows.time)], atol=1e-3 * np.ptp(exact.values)
@@ -194,7 +194,7 @@ def test_a_log_of_sensors_is_read_and_recovers_the_robot(motion, tmp_path):
 def test_wrong_sensors_are_refused_in_one_line(motion, tmp_path, text, words):
     logged(motion, tmp_path / "log.csv")
     (tmp_path / "map.yaml").write_text(
-        f"format: 1\ncolumns: {{time: t, tensions: [I1, I2, I3, I4]}}\nsensors:\n  - {{{text}}}\n"
+        f"format: 1\ncolumns: {{time: t, tension: [I1, I2, I3, I4]}}\nsensors:\n  - {{{text}}}\n"
     )
     with pytest.raises(RecordingError) as refused:
         kc.load_recording(tmp_path / "log.csv", RecordingConfig.load(tmp_path / "map.yaml"))

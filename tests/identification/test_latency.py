@@ -61,7 +61,7 @@ def test_derivatives_by_latency_are_those_of_differences():
     """Where tensions rise linearly in time, what acts is linear in the latency, across rows too."""
     rising = np.concatenate([np.full((20, 4), 4.0), 4.0 + np.outer(np.arange(31), [0.2, 0.0, -0.1, 0.05])])
     seen = measured(kc.robots.RoutedTendonRobot.like(NOMINAL), rising, "own", noise=0.0)
-    model = library_model(NOMINAL, seen.tension)
+    model = library_model(NOMINAL, seen.control)
     misfit = Misfit(model, [of_measurements(seen, model, "own")])
     k = model.slice("latency").start
     one = np.eye(model.size)[k] * DT / model.numbers[k].width

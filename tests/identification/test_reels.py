@@ -76,7 +76,7 @@ def equilibria(robot, control, noise=5e-5):
     count = len(control)
     return kc.recordings.Measurements(
         time=np.arange(float(count)),
-        tension=control,
+        control=control,
         fractions=np.ones(1),
         position=position,
         quaternion=np.full((count, 1, 4), np.nan),
@@ -89,7 +89,7 @@ def equilibria(robot, control, noise=5e-5):
 
 def test_equilibria_follow_a_row_that_was_not_seen():
     seen = equilibria(CABLES, np.full((3, 3), 20.0))
-    [data] = experiments_of([seen], library_model(CABLES, seen.tension, seen.fractions))
+    [data] = experiments_of([seen], library_model(CABLES, seen.control, seen.fractions))
     assert data.static and len(data.control) == 3 and np.isnan(data.data[0]).all()
     np.testing.assert_array_equal(data.data[1:, :3], seen.position[:, 0])
 

@@ -18,7 +18,7 @@ ROWS = measured(NOMINAL, tensions(1.0, 2.0), "one")
 
 @pytest.fixture(scope="module")
 def search():
-    model = library_model(NOMINAL, ROWS.tension, ROWS.fractions)
+    model = library_model(NOMINAL, ROWS.control, ROWS.fractions)
     return ParameterSearch(Misfit(model, [each.rough() for each in experiments_of([ROWS], model)]))
 
 
@@ -38,7 +38,7 @@ def test_the_next_experiment_tells_what_it_promises(search):
     point = search.run(np.zeros(model.size), model.mask(names), effort=(0, 0.0), equations="all")
     posterior = Posterior.of(model, point, names)
     found = next_experiment(search, posterior, point.x, ["load cell gains"])
-    assert found.control.min() >= ROWS.tension.min() and found.control.max() <= ROWS.tension.max()
+    assert found.control.min() >= ROWS.control.min() and found.control.max() <= ROWS.control.max()
     assert set(found.deviations) == {f"load_cells.gain[{k}]" for k in range(4)}
     assert all(after < before for before, after in found.deviations.values())
     assert "deviation" in str(found)

@@ -52,7 +52,7 @@ def rested():
     pull = np.concatenate([np.full(3, 3.0), 3.0 + 2.0 * np.sin(0.7 * np.arange(1, 18))])[:, None]
     still = kc.equilibrium(REAL, [3.0], space="euler")
     moved = measured(kc.simulate(REAL, pull, 0.1, space="euler", initial=still))
-    return dataclasses.replace(moved, initial_tension=None)
+    return dataclasses.replace(moved, initial_control=None)
 
 
 @pytest.mark.slow
@@ -78,7 +78,7 @@ def test_what_starts_at_rest_gives_the_robot_that_made_it(data, tolerance):
     [
         pytest.param(lambda: measured(settled()).rows(4, 20), id="from the middle of a motion"),
         pytest.param(
-            lambda: dataclasses.replace(measured(settled()), initial_tension=np.array([9.0])), id="wrong pull"
+            lambda: dataclasses.replace(measured(settled()), initial_control=np.array([9.0])), id="wrong pull"
         ),
     ],
 )

@@ -77,7 +77,7 @@ def test_recordings_of_both_kinds_are_simulated_as_each_alone_with_its_derivativ
     nominal = ROBOT.replace(nodes=6)
     seen = measured(kc.robots.RoutedTendonRobot.like(nominal), tensions(0.5, 1.5), "own")
     held = dataclasses.replace(seen, time=0.5 * seen.time)
-    model = library_model(nominal, seen.tension)
+    model = library_model(nominal, seen.control)
     data = [
         of_measurements(each, model, "own") for each in (dataclasses.replace(held, continuous=True), held)
     ]

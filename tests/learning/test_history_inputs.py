@@ -68,14 +68,14 @@ def test_models_of_the_paper_start_in_one_rest():
     rows = 4
     measured = Measurements(
         time=DT * np.arange(rows),
-        tension=np.tile(TENSION, (rows, 1)),
+        control=np.tile(TENSION, (rows, 1)),
         fractions=np.ones(1),
         position=np.zeros((rows, 1, 3)),
         quaternion=np.zeros((rows, 1, 4)),
         measured=np.ones((rows, 1), bool),
         simulated=True,
         source="none",
-        initial_tension=TENSION,
+        initial_control=TENSION,
     )
     rest = kc.equilibrium(ROBOT, TENSION, space="euler")
     moved = _paper_motion(learned(1.5 / DT), ROBOT, measured, 0.0)

@@ -6,8 +6,8 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.config import ControlSource, MarkerSource
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.write import write_recording
 
 LENGTH = 0.635
@@ -15,8 +15,8 @@ PAPER = RecordingConfig.paper_robot()
 #: of three tendons and one body that has no orientation
 SMALL = RecordingConfig(
     markers=(MarkerSource("tip", "tip", 1.0),),
-    tension=TensionSource("tension", (1, 2, 3)),
-    command=CommandSource("command", (1, 2, 3), latency=0.04),
+    tension=ControlSource("tension", (1, 2, 3)),
+    command=ControlSource("command", (1, 2, 3), latency=0.04),
     description="three tendons, one body",
 )
 #: the constant rotations of the bodies' axes, and where motion capture has the clamped end
@@ -48,13 +48,13 @@ def made(seconds=3.0, noise=1e-4, seed=0, config=PAPER):
         turned = np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1))
         poses["base"] = Body(time, still + rng.normal(0.0, noise, still.shape), turned)
     sent = np.round(np.arange(0.0, seconds, 0.05), 6)
-    phase = 2 * np.pi * (sent[:, None] - np.arange(config.tendons) / config.tendons)
+    phase = 2 * np.pi * (sent[:, None] - np.arange(config.count) / config.count)
     grams = np.round(500.0 + np.where(sent[:, None] < 1.0, 0.0, 200.0 * np.cos(phase)))
-    command = Tensions(sent, grams * 9.81e-3)
+    command = ControlRows(sent, grams * 9.81e-3)
     seen = np.round(np.arange(0.0, seconds, 0.02), 6)
     return (
         poses,
-        Tensions(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.tendons))),
+        ControlRows(seen, lagged(command, seen) + rng.normal(0.0, 0.01, (len(seen), config.count))),
         command,
     )
 
@@ -62,7 +62,7 @@ def made(seconds=3.0, noise=1e-4, seed=0, config=PAPER):
 def lagged(command, at):
     """Commands through a first-order lag, at times that are whole milliseconds."""
     fine = np.arange(0.0, at[-1] + 0.001, 0.001)
-    held = command.tension[np.searchsorted(command.time, fine + 1e-9, side="right") - 1]
+    held = command.values[np.searchsorted(command.time, fine + 1e-9, side="right") - 1]
     followed = [held[0]]
     for each in held[:-1]:
         followed.append(each + (followed[-1] - each) * np.exp(-0.001 / LAG))

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording, proposed_config
-from knode_cosserat.recordings.config import UP, ColumnMap, MarkerSource, TensionSource
+from knode_cosserat.recordings.config import UP, ColumnMap, ControlSource, MarkerSource
 from tests.commands import run, succeeded
 from tests.recordings.formats import exported
 
@@ -45,38 +45,38 @@ def agrees(recording, pulls=PULLS):
     # ns since 1970 are 256 ns apart as floats
     np.testing.assert_allclose(body.time, TIME, rtol=0.0, atol=3e-7)
     np.testing.assert_allclose(body.position, POSITION, atol=1e-7)
-    np.testing.assert_allclose(recording.tension.tension, pulls, atol=1e-7)
+    np.testing.assert_allclose(recording.control.values, pulls, atol=1e-7)
 
 
 T6 = "[T1, T2, T3, T4, T5, T6]"
 #: file, and the map that a user writes for it
 FILES = {
-    "a plain file": (table(columns()), f"columns: {{time: time, tensions: {T6}, tip: [x, y, z]}}\n"),
+    "a plain file": (table(columns()), f"columns: {{time: time, tension: {T6}, tip: [x, y, z]}}\n"),
     "semicolons and decimal commas": (
         table(columns("Zeit (ms)", clock=1e3), ";", ","),
-        f"columns: {{time: Zeit (ms), tensions: {T6}, tip: [x, y, z]}}\n",
+        f"columns: {{time: Zeit (ms), tension: {T6}, tip: [x, y, z]}}\n",
     ),
     "tabs, Windows' line ends and mm": (
         table(columns("t", place=("X [mm]", "Y [mm]", "Z [mm]"), scale=1e3), "\t", end="\r\n"),
-        f'columns: {{time: t, tensions: {T6}, tip: ["X [mm]", "Y [mm]", "Z [mm]"]}}\nposition_unit: mm\n',
+        f'columns: {{time: t, tension: {T6}, tip: ["X [mm]", "Y [mm]", "Z [mm]"]}}\nposition_unit: mm\n',
     ),
     "tabs and decimal commas, a comment before": (
         table(columns("Time / s"), "\t", ",", before="# simulated: true\n"),
-        f'columns: {{time: "Time / s", tensions: {T6}, tip: [x, y, z]}}\n',
+        f'columns: {{time: "Time / s", tension: {T6}, tip: [x, y, z]}}\n',
     ),
     "no titles": (
         table(columns(), header=False),
-        "columns: {time: 1, tensions: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
+        "columns: {time: 1, tension: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
     ),
     "no titles, semicolons and decimal commas": (
         table(columns(), ";", ",", header=False),
-        "columns: {time: 1, tensions: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
+        "columns: {time: 1, tension: [2, 3, 4, 5, 6, 7], tip: [8, 9, 10]}\n",
     ),
     "nanoseconds since 1970": (
         table(
             {"stamp": [f"{1_760_000_000_000_000_000 + round(at * 1e9)}" for at in TIME], **columns(time="")}
         ),
-        f"columns: {{time: stamp, time_unit: ns, tensions: {T6}, tip: [x, y, z]}}\n",
+        f"columns: {{time: stamp, time_unit: ns, tension: {T6}, tip: [x, y, z]}}\n",
     ),
     "columns with text, and a line of units": (
         table(
@@ -86,15 +86,15 @@ FILES = {
                 for (name, values), unit in zip(columns().items(), ["s", *["N"] * 6, *["m"] * 3], strict=True)
             }
         ),
-        f"columns: {{time: time, tensions: {T6}, tip: [x, y, z]}}\n",
+        f"columns: {{time: time, tension: {T6}, tip: [x, y, z]}}\n",
     ),
     "a title that is there twice, and an empty last column": (
         table(columns() | {"note": TIME, "": [""] * len(TIME)}).replace(b"note", b"x"),
-        f"columns: {{time: time, tensions: {T6}, tip: [8, y, z]}}\n",
+        f"columns: {{time: time, tension: {T6}, tip: [8, y, z]}}\n",
     ),
     "rows without times": (
         table(columns(time="")),
-        f"columns: {{tensions: {T6}, tip: [x, y, z]}}\ntable: {{rate: 50}}\n",
+        f"columns: {{tension: {T6}, tip: [x, y, z]}}\ntable: {{rate: 50}}\n",
     ),
 }
 
@@ -115,13 +115,13 @@ def test_the_order_of_tendons_units_and_orientations_are_those_of_the_map(tmp_pa
     path.write_bytes(table(columns(turned=("a", "b", "c", "d"))))
     config = written(
         tmp_path,
-        "columns: {time: time, tensions: [T3, T1], commands: [T5, T6], tip: [x, y, z, a, b, c, d]}\n"
+        "columns: {time: time, tension: [T3, T1], command: [T5, T6], tip: [x, y, z, a, b, c, d]}\n"
         "tension: {unit: gf}\ncommand: {latency: 0.1}\n"
         "markers: [{name: tip, fraction: 1, rotation: [1, 0, 0, 0]}]\n",
     )
     recording = load_recording(path, config)
     agrees(recording, 9.81e-3 * PULLS[:, [2, 0]])
-    np.testing.assert_allclose(recording.command.tension, PULLS[:, [4, 5]], atol=1e-7)
+    np.testing.assert_allclose(recording.command.values, PULLS[:, [4, 5]], atol=1e-7)
     assert config.command.latency == 0.1
     turned = np.abs(np.sum(recording.bodies[0].quaternion * QUATERNION, axis=1))
     np.testing.assert_allclose(turned, 1.0, atol=1e-8)
@@ -137,23 +137,23 @@ def test_several_bodies_a_base_and_motors(tmp_path):
     path.write_bytes(table(content))
     config = written(
         tmp_path,
-        "columns: {time: time, motors: [T1, T2], tip: [x, y, z], rib: [mx, my, mz], base: [bx, by, bz]}\n"
-        "base: {height: 0.05}\nmotors: {unit: deg}\n"
+        "columns: {time: time, angle: [T1, T2], tip: [x, y, z], rib: [mx, my, mz], base: [bx, by, bz]}\n"
+        "base: {height: 0.05}\nangle: {unit: deg}\n"
         "markers:\n  - {name: rib, fraction: 1/2}\n  - {name: tip, fraction: 1}\n",
     )
     recording = load_recording(path, config)
     np.testing.assert_allclose(recording.bodies[0].position, middle, atol=1e-7)
     np.testing.assert_allclose(recording.bodies[1].position, POSITION, atol=1e-7)
-    np.testing.assert_allclose(recording.tension.tension, np.radians(PULLS[:, :2]), atol=1e-7)
+    np.testing.assert_allclose(recording.control.values, np.radians(PULLS[:, :2]), atol=1e-7)
 
 
 def test_poses_without_tensions_are_a_recording(tmp_path):
     path = tmp_path / "it.csv"
     path.write_bytes(table(columns()))
     config = written(tmp_path, "columns: {time: time, tip: [x, y, z]}\n")
-    assert (config.tensions, config.tendons) == ("none", 0)
+    assert (config.controls, config.count) == ("none", 0)
     sampled = load_recording(path, config).sampled(0.04)
-    assert sampled.tension.shape == (len(sampled.time), 0) and sampled.complete.all()
+    assert sampled.control.shape == (len(sampled.time), 0) and sampled.complete.all()
     np.testing.assert_allclose(sampled.tip_position, POSITION[::2], atol=1e-7)
 
 
@@ -162,7 +162,7 @@ def test_poses_without_tensions_are_a_recording(tmp_path):
     [
         (
             "columns: [time]\n",
-            "columns is .*; allowed is a mapping with time, tensions and the names of bodies",
+            "columns is .*; allowed is a mapping with time, quantities such as tension, and the names",
         ),
         (
             "columns: {time: t, tip: [x, y]}\n",
@@ -179,7 +179,7 @@ def test_poses_without_tensions_are_a_recording(tmp_path):
             "columns: {rip: [x, y, z]}\nmarkers: [{name: rib, fraction: 1}]\n",
             "columns are of rip, and no marker has this topic; allowed is rib",
         ),
-        ("columns: {tip: [x, y, z]}\ntensions: measured\n", "tension is missing; .*`tensions: none`"),
+        ("columns: {tip: [x, y, z]}\ncontrols: measured\n", "tension is missing; .*`controls: none`"),
     ],
 )
 def test_a_map_that_is_not_right_gives_one_line(tmp_path, yaml, words):
@@ -197,8 +197,8 @@ def test_a_map_that_is_not_right_gives_one_line(tmp_path, yaml, words):
         ),
         ("columns: {time: time, tip: [x, y, 11]}\n", "the column 11 is missing; the columns are"),
         (
-            "columns: {time: time, tensions: [T1, T2], tip: [x, y, z]}\ntension: {order: [1, 2, 3]}\n",
-            "2 columns are mapped and order has 3 tendons",
+            "columns: {time: time, tension: [T1, T2], tip: [x, y, z]}\ntension: {order: [1, 2, 3]}\n",
+            "2 columns are mapped and order has 3 numbers",
         ),
     ],
 )
@@ -217,10 +217,10 @@ def test_only_mapped_columns_have_to_be_numbers(tmp_path):
     path.write_bytes(table(content))
     tip = MarkerSource("tip", "tip", 1.0)
     for pulls, is_fair in ((("T1", "T3"), True), (("T1", "T2"), False)):
-        mapped = ColumnMap((("tip", ("x", "y", "z")),), "time", tensions=pulls)
-        config = RecordingConfig(markers=(tip,), tension=TensionSource("tension", (1, 2)), columns=mapped)
+        mapped = ColumnMap((("tip", ("x", "y", "z")),), (("tension", pulls),), "time")
+        config = RecordingConfig(markers=(tip,), tension=ControlSource("tension", (1, 2)), columns=mapped)
         if is_fair:
-            assert load_recording(path, config).tendons == 2
+            assert load_recording(path, config).config.count == 2
             continue
         with pytest.raises(RecordingError, match="row 5: T2 is 'broken'; allowed is a finite number"):
             load_recording(path, config)
@@ -229,7 +229,7 @@ def test_only_mapped_columns_have_to_be_numbers(tmp_path):
 def test_commas_that_separate_thousands_are_not_decimal(tmp_path):
     path = tmp_path / "it.csv"
     path.write_bytes(b"time;T1;x;y;z\n0;1,000;0.5;0.0;0.4\n1;1,000;0.5;0.0;0.4\n")
-    config = written(tmp_path, "columns: {time: time, tensions: [T1], tip: [x, y, z]}\n")
+    config = written(tmp_path, "columns: {time: time, tension: [T1], tip: [x, y, z]}\n")
     with pytest.raises(RecordingError, match="row 1: T1 is '1,000'; allowed is a finite number"):
         load_recording(path, config)
 
@@ -275,7 +275,7 @@ def test_inspect_proposes_a_map_that_reads_the_table(tmp_path, name):
     text = succeeded("inspect", path)
     proposed = text.partition("proposed configuration, for a file of --config:\n")[2]
     config = written(tmp_path, proposed)
-    assert (config.columns.time, list(config.columns.tensions)) == (time, pulls)
+    assert (config.columns.time, list(dict(config.columns.controls)["tension"])) == (time, pulls)
     ((_, titles),) = config.columns.bodies
     assert list(titles) == tip
     agrees(load_recording(path, config))
@@ -288,8 +288,8 @@ def test_inspect_proposes_a_map_that_reads_the_table(tmp_path, name):
 LOGS = {
     "actuator_force_{}": (-PULLS, "tension", -1.0),
     "ctrl[{}]": (PULLS, "command", None),
-    "present_current_{}": (PULLS, "tension", 1.0),
-    "[ID:00{}] Present Position": (np.round(512.0 * PULLS), "motors", 360.0 / 4096.0),
+    "present_current_{}": (PULLS, "current", 1.0),
+    "[ID:00{}] Present Position": (np.round(512.0 * PULLS), "angle", 360.0 / 4096.0),
 }
 
 
@@ -304,15 +304,16 @@ def test_inspect_proposes_a_map_of_logs_of_simulators_and_motors(tmp_path, title
     path.write_bytes(table(content))
     text = succeeded("inspect", path)
     config = written(tmp_path, text.partition("proposed configuration, for a file of --config:\n")[2])
-    assert (config.measured or config.command) == getattr(config, source)
+    assert [*config.measured, config.command][0] == getattr(config, source)
     assert getattr(config, source).gain == gain and ("gain" in text) == (gain is not None)
     recording = load_recording(path, config)
     (body,) = recording.bodies
     np.testing.assert_allclose(body.position, POSITION, atol=1e-7)
     assert body.quaternion is not None
-    driver = recording.command if source == "command" else recording.tension
-    expected = np.radians(values * gain) if source == "motors" else values * (gain or 1.0)
-    np.testing.assert_allclose(driver.tension, expected, atol=1e-6)
+    driver = recording.command if source == "command" else recording.control
+    expected = values * (gain or 1.0) * {"angle": np.pi / 180.0, "current": 1e-3}.get(source, 1.0)
+    assert driver.quantities == (("angle" if source == "angle" else "tension", 6),)
+    np.testing.assert_allclose(driver.values, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("axis", ["x", "-x", "y", "-y", "-z"])
@@ -324,7 +325,7 @@ def test_inspect_says_that_the_frame_is_rotated(tmp_path, axis):
     path = tmp_path / "it.csv"
     path.write_bytes(table(content))
     text = succeeded("inspect", path)
-    assert "`rotation` turns this axis to z" in text
+    assert "`frame_rotation` turns this axis to z" in text
     config = written(tmp_path, text.partition("proposed configuration, for a file of --config:\n")[2])
     (body,) = load_recording(path, config).bodies
     np.testing.assert_allclose(body.position, POSITION, atol=1e-7)
@@ -337,7 +338,7 @@ def test_inspect_proposes_places_of_bodies_in_exports(tmp_path):
     assert "length of the rod, from each body: 0.4000, 0.4000 m" in text
     config = written(tmp_path, text.partition("--config:\n")[2])
     assert [(each.topic, each.fraction) for each in config.markers] == [("rib", 0.5), ("tip", 1.0)]
-    assert (config.base.topic, config.up, config.tensions) == ("base", "y", "none")
+    assert (config.base.topic, config.up, config.controls) == ("base", "y", "none")
     np.testing.assert_array_equal(
         load_recording(path, config).bodies[1].position, load_recording(path).bodies[1].position
     )
@@ -395,7 +396,7 @@ def test_columns_that_nothing_reads_are_listed(tmp_path, more, message):
 def test_columns_by_number_and_tensions_of_no_use_count_as_read_or_not(tmp_path):
     path = tmp_path / "it.csv"
     path.write_bytes(table(columns() | {"y ": POSITION[:, 1]}))
-    by_number = "columns: {time: '1', tensions: ['2', '3', '4', '5', '6', '7'], tip: ['8', '9', '10']}\n"
+    by_number = "columns: {time: '1', tension: ['2', '3', '4', '5', '6', '7'], tip: ['8', '9', '10']}\n"
     recording = load_recording(path, written(tmp_path, by_number))
     agrees(recording)
     assert [each.message.partition(":")[0] for each in recording.findings] == ["1 column is not read"]
@@ -405,12 +406,15 @@ def test_columns_by_number_and_tensions_of_no_use_count_as_read_or_not(tmp_path)
 def test_pressures_are_not_judged_as_tensions(tmp_path, unit, factor):
     path = tmp_path / "it.csv"
     path.write_bytes(table(columns()))
-    settings = (
-        FILES["a plain file"][1] + f"tension: {{topic: tension, order: [1, 2, 3, 4, 5, 6], unit: {unit}}}\n"
-    )
+    settings = FILES["a plain file"][1].replace("tension", "pressure") + f"pressure: {{unit: {unit}}}\n"
     recording = load_recording(path, written(tmp_path, settings))
     agrees(recording, factor * PULLS)
-    assert recording.findings == ()
+    assert recording.control.quantities == (("pressure", 6),)
+    # some pascals are no pressure that moves a robot
+    messages = [each.message for each in recording.findings]
+    assert messages == (
+        ["pressures of 17.1 Pa are not plausible: are hPa read as Pa?"] if unit == "Pa" else []
+    )
 
 
 def test_tensions_of_that_size_are_judged(tmp_path):

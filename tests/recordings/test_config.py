@@ -8,20 +8,20 @@ import yaml
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, RecordingError
-from knode_cosserat.recordings.config import BaseSource, CommandSource, MarkerSource, TensionSource
+from knode_cosserat.recordings.config import BaseSource, ControlSource, MarkerSource
 
 FULL = RecordingConfig(
     markers=(
         MarkerSource("middle", "/mocap/middle", 0.5, rotation=(0.0, 1.0, 0.0, 0.0)),
         MarkerSource("tip: the last", "/mocap/tip", 1.0),
     ),
-    tension=TensionSource("/cells", (3, 1, 2), "N"),
-    command=CommandSource("/motors", (1, 2, 3), "gf", text="go {} now", latency=0.1),
+    tension=ControlSource("/cells", (3, 1, 2), "N"),
+    command=ControlSource("/motors", (1, 2, 3), "gf", text="go {} now", latency=0.1),
     base=None,
-    tensions="commanded",
+    controls="commanded",
     position_unit="mm",
     origin=(0.1, 0.2, -0.3),
-    rotation=(0.6, 0.8, 0.0, 0.0),
+    frame_rotation=(0.6, 0.8, 0.0, 0.0),
     clock="received",
     longest_gap=0.25,
     rest=(0.0, 0.75),
@@ -52,10 +52,10 @@ def test_the_papers_robot_is_as_the_specification_has_it():
     assert (paper.base.topic, paper.base.height) == ("/vicon/continuum_base/pose", 0.0635)
     assert (paper.tension.topic, paper.tension.unit, paper.tension.order) == ("/tension", "gf", (4, 1, 2, 3))
     assert (paper.command.order, paper.command.latency) == ((4, 1, 2, 3), 0.06)
-    assert paper.tensions == "measured"
+    assert paper.controls == "measured"
     # it may be the stand-in, which has the same topics
     assert paper.simulated is None
-    assert paper.tendons == 4
+    assert paper.count == 4
 
 
 def test_a_short_file_is_enough(tmp_path):
@@ -70,7 +70,7 @@ def test_a_short_file_is_enough(tmp_path):
     assert config.markers[0].fraction == 4 / 9
     assert config.command is None
     assert config.simulated is None
-    assert config.tendons == 3
+    assert config.count == 3
 
 
 @pytest.mark.parametrize(
@@ -79,7 +79,7 @@ def test_a_short_file_is_enough(tmp_path):
         ("format: 1", "format: 2", "format is 2; allowed is 1"),
         ("format: 1", "formats: 1", "the key 'formats' is unknown; allowed is markers, tension,"),
         ("unit: N", "unit: lb", "tension: unit is 'lb'; allowed is N or gf"),
-        ("order: [1, 2]", "order: [0, 1]", "tension: order is [0, 1]; allowed is the tendons 1, 2, 3"),
+        ("order: [1, 2]", "order: [0, 1]", "tension: order is [0, 1]; allowed is the numbers 1, 2, 3"),
         ("order: [1, 2]", "order: 2", "tension: order is 2; allowed"),
         ("order: [1, 2]", "orders: [1, 2]", "'orders' is unknown; allowed is topic, order, unit, held, na"),
         ("order: [1, 2], ", "", "tension: the key order is missing; required is topic, order"),
@@ -91,12 +91,12 @@ def test_a_short_file_is_enough(tmp_path):
         ("  - {name: tip, topic: /tip, fraction: 1}", "  []", "markers is (); allowed is a list of one"),
         ("  - {name: tip, topic: /tip, fraction: 1}", "  - tip", "number 1 is 'tip'; allowed is a Marker"),
         ("topic: /tip", "topic: /pull", "the topic /pull is there twice"),
-        ("tension:", "command:", "tension is missing; required where tensions is measured"),
+        ("tension:", "command:", "tension is missing; required where controls is measured"),
         ("format: 1", "simulated: perhaps", "simulated is 'perhaps'; allowed is true or false"),
         ("format: 1", "rest: [2, 1]", "rest is [2, 1]; allowed is [start, end] in s, start before end"),
         ("format: 1", "rest: [null, 1]", "rest is [None, 1]; allowed"),
         ("format: 1", "trim: 3", "trim is 3; allowed is [start, end] in s, start before end, either"),
-        ("format: 1", "rotation: [1, 1, 0, 0]", "rotation is [1, 1, 0, 0]; allowed is a quaternion"),
+        ("format: 1", "frame_rotation: [1, 1, 0, 0]", "frame_rotation is [1, 1, 0, 0]; allowed is a"),
         ("format: 1", "origin: [1, 1]", "origin is [1, 1]; allowed is three numbers"),
         ("format: 1", "longest_gap: -1", "longest_gap is -1; allowed is a number from 0 to 60 s"),
         ("format: 1", "clock: sun", "clock is 'sun'; allowed is header or received"),
@@ -107,7 +107,7 @@ def test_a_short_file_is_enough(tmp_path):
             "command: {topic: /c, order: [1, 2], text: 'Go'}",
             "command: text is 'Go'; allowed is text with one {} where the numbers stand",
         ),
-        ("format: 1", "command: {topic: /c, order: [1]}", "order has 2 tendons in tension and 1 in command"),
+        ("format: 1", "command: {topic: /c, order: [1]}", "order has 2 numbers in tension and 1 in command"),
         ("format: 1", "a: [", "not YAML"),
         ("format: 1", "format: 1\nformat: 1", "the key 'format' is there twice"),
     ],

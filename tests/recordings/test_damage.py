@@ -50,8 +50,8 @@ def assert_begins_alike(recording, streams):
             rtol=0,
             atol=1e-12,
         )
-    known = streams[1].tension[: len(recording.tension.time)]
-    np.testing.assert_allclose(recording.tension.tension, known, rtol=0, atol=1e-12)
+    known = streams[1].values[: len(recording.control.time)]
+    np.testing.assert_allclose(recording.control.values, known, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("compression", [None, "BZ2", "LZ4"])

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.recordings import Recording, RecordingConfig
 from knode_cosserat.recordings.estimation import kinematics
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.virtual import virtual_robot
 
 LENGTH, FRACTIONS = 0.635, np.array([3, 5, 7, 9]) / 9
@@ -50,7 +50,7 @@ def recorded(of=arc, seconds=3.0, noise=(0.0, 0.0), seed=0, lost=(), tendons=4, 
         quaternion = (round_z * shaken * round_z.inv()).as_quat(scalar_first=True)
         bodies.append(Body(time, position, quaternion if turned else None, f"rib {k}", f"/rib{k}", fraction))
     stamps = np.arange(0.0, seconds + 0.01, 0.02)
-    pulls = Tensions(stamps, np.full((len(stamps), tendons), 5.0), "/tension")
+    pulls = ControlRows(stamps, np.full((len(stamps), tendons), 5.0), "/tension")
     config = RecordingConfig.paper_robot()
     return Recording("made", config, tuple(bodies), None, pulls, None, None, True, (), {})
 
@@ -140,9 +140,9 @@ def test_a_loaded_equilibrium_has_its_own_forces():
 
     recording = recorded(still)
     pulls = dataclasses.replace(
-        recording.tension, tension=np.tile([5.0, 5.0, 5.3, 5.2], (len(recording.tension.time), 1))
+        recording.control, values=np.tile([5.0, 5.0, 5.3, 5.2], (len(recording.control.time), 1))
     )
-    states = kc.estimate_states(dataclasses.replace(recording, tension=pulls), ROBOT)
+    states = kc.estimate_states(dataclasses.replace(recording, control=pulls), ROBOT)
     for name in ("n", "m", "u"):
         true = np.asarray(truth.part(name))[0, ::3]
         # u hardly: four bodies tell little of how it goes along the rod
@@ -195,10 +195,10 @@ def test_a_recording_in_parts_says_so():
 
 def test_the_controls_are_those_that_led_to_each_row():
     recording = recorded(tendons=4)
-    ramp = np.linspace(1.0, 2.0, len(recording.tension.time))[:, None] * np.ones(4)
-    recording = dataclasses.replace(recording, tension=dataclasses.replace(recording.tension, tension=ramp))
+    ramp = np.linspace(1.0, 2.0, len(recording.control.time))[:, None] * np.ones(4)
+    recording = dataclasses.replace(recording, control=dataclasses.replace(recording.control, values=ramp))
     states = kc.estimate_states(recording, BARE, "paper")
-    held = recording.sampled(0.05).tension
+    held = recording.sampled(0.05).control
     np.testing.assert_array_equal(states.control[1:], held[:-1])
     np.testing.assert_array_equal(states.control[0], held[0])
 
@@ -207,7 +207,7 @@ def test_the_controls_are_those_that_led_to_each_row():
     ("recording", "robot", "options", "said"),
     [
         (recorded(turned=False), BARE, {}, "no body has orientations"),
-        (recorded(tendons=3), BARE, {}, "3 tendons and the robot 4 controls"),
+        (recorded(tendons=3), BARE, {}, r"the controls tension \(4\); the recording has 3 controls"),
         (recorded(), BARE.replace(length=2.0), {}, "allowed is up to 2 times"),
         (recorded(), BARE, {"method": "kalman"}, 'allowed is "best" or "paper"'),
         (recorded(), BARE, {"start": 9.0}, "no rows"),

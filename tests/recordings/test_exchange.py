@@ -7,7 +7,7 @@ import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.identification.evaluate import evaluate
 from knode_cosserat.recordings import RecordingConfig, RecordingError
-from knode_cosserat.recordings.config import TensionSource
+from knode_cosserat.recordings.config import ControlSource
 
 DT, BEFORE = 0.05, np.full(4, 5.0)
 FRACTIONS = (0.25, 0.6, 1.0)
@@ -62,8 +62,8 @@ def test_a_simulation_goes_through_a_file_without_error(robot, tensions, motion,
     loaded = kc.load_recording(tmp_path / f"motion.{ending}", config)
     assert loaded.simulated is True and seen.source in loaded.source
     rows = loaded.sampled(DT)
-    np.testing.assert_array_equal(rows.held_tension[:-1], tensions)
-    np.testing.assert_array_equal(rows.initial_tension, BEFORE)
+    np.testing.assert_array_equal(rows.control[:-1], tensions)
+    np.testing.assert_array_equal(rows.initial_control, BEFORE)
     np.testing.assert_allclose(rows.time, motion.time, rtol=0, atol=1e-12)
     np.testing.assert_allclose(rows.position, seen.position, rtol=0, atol=1e-9)
     np.testing.assert_allclose(rows.quaternion, seen.quaternion, rtol=0, atol=1e-9)
@@ -73,8 +73,8 @@ def test_a_simulation_goes_through_a_file_without_error(robot, tensions, motion,
     assert found.failed is None
     assert found.tip_rmse < 1e-8 and found.pose_mse < 1e-15
     # and a row off, it is another motion
-    late = np.concatenate([rows.tension[:1], rows.tension[:-1]])
-    assert evaluate(robot, kc.recordings.Measurements(**{**vars(rows), "tension": late})).tip_rmse > 1e-3
+    late = np.concatenate([rows.control[:1], rows.control[:-1]])
+    assert evaluate(robot, kc.recordings.Measurements(**{**vars(rows), "control": late})).tip_rmse > 1e-3
 
 
 def test_a_table_written_by_hand_says_by_its_titles_that_tensions_are_held(motion, tensions, tmp_path):
@@ -83,14 +83,14 @@ def test_a_table_written_by_hand_says_by_its_titles_that_tensions_are_held(motio
     path = tmp_path / "by-hand.csv"
     np.savetxt(path, np.transpose(columns), "%.17g", ",", header=",".join(titles), comments="")
     recording = kc.load_recording(path)
-    np.testing.assert_array_equal(recording.sampled(DT).held_tension[:-1], tensions)
+    np.testing.assert_array_equal(recording.sampled(DT).control[:-1], tensions)
     # means over half rows are the tensions themselves, and not those on lines to the next
     halves = recording.sampled(DT / 2, mean=True)
-    np.testing.assert_allclose(halves.held_tension[:-1], np.repeat(tensions, 2, axis=0), rtol=1e-12)
+    np.testing.assert_allclose(halves.control[:-1], np.repeat(tensions, 2, axis=0), rtol=1e-12)
     path.write_text(path.read_text().replace("held_", ""))
     lines = kc.load_recording(path).sampled(DT / 2, mean=True)
     assert lines.continuous and not halves.continuous
-    assert np.abs(lines.held_tension[:40] - np.repeat(tensions, 2, axis=0)[:40]).max() > 0.5
+    assert np.abs(lines.control[:40] - np.repeat(tensions, 2, axis=0)[:40]).max() > 0.5
 
 
 def test_controls_in_files_are_held_under_either_name(tensions, tmp_path):
@@ -107,25 +107,25 @@ def test_a_table_says_one_thing_of_its_tensions(tmp_path):
     path.write_text("time [s],tension_1 [N],held_tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n0,1,1,0,0,1\n")
     with pytest.raises(RecordingError, match=r"tension_1 .* and held_tension_1 .*; allowed is one of them"):
         kc.load_recording(path)
-    path.write_text("# initial tension: 1 2\ntime [s],held_tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n")
+    path.write_text("# initial control: 1 2\ntime [s],held_tension_1 [N],tip_x [m],tip_y [m],tip_z [m]\n")
     with pytest.raises(RecordingError, match="no rows"):
         kc.load_recording(path)
     path.write_text(path.read_text() + "0,1,0,0,1\n0.1,1,0,0,1\n")
-    with pytest.raises(RecordingError, match=r"initial_tension .*; allowed is 1 numbers \(N\)"):
+    with pytest.raises(RecordingError, match=r"initial_control .*; allowed is 1 numbers \(SI units\)"):
         kc.load_recording(path)
     path.write_text(path.read_text().replace("1 2", "a"))
-    with pytest.raises(RecordingError, match="initial tension is 'a'; allowed is numbers"):
+    with pytest.raises(RecordingError, match="initial control is 'a'; allowed is numbers"):
         kc.load_recording(path)
 
 
 def test_a_configuration_says_that_tensions_are_held(tmp_path):
     config = RecordingConfig.paper_robot()
     assert config.tension is not None
-    held = config.replace(tension=TensionSource("/tension", (4, 1, 2, 3), "gf", held=True))
+    held = config.replace(tension=ControlSource("/tension", (4, 1, 2, 3), "gf", held=True))
     held.save(tmp_path / "held.yaml")
     assert RecordingConfig.load(tmp_path / "held.yaml") == held
     with pytest.raises(RecordingError, match="held is 3; allowed is true or false"):
-        TensionSource("/tension", (1,), held=3)
+        ControlSource("/tension", (1,), held=3)
 
 
 def planar_motion():
@@ -147,8 +147,8 @@ def test_measurements_of_a_planar_system(fractions):
     np.testing.assert_allclose(seen.position, moved.part("p")[:, at], atol=1e-12)
     assert seen.position.shape == (5, len(fractions), 2) and np.all(np.isnan(seen.quaternion))
     assert seen.measured.all() and seen.complete.all()
-    np.testing.assert_array_equal(seen.tension[:-1], moved.control[1:])
-    np.testing.assert_array_equal(seen.initial_tension, moved.control[0])
+    np.testing.assert_array_equal(seen.control[:-1], moved.control[1:])
+    np.testing.assert_array_equal(seen.initial_control, moved.control[0])
     assert len(seen.rows(1, 4).parts()) == 1 and seen.tip_position.shape == (5, 2)
 
 

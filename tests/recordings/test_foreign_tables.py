@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
-from knode_cosserat.recordings.config import MarkerSource, MotorSource, TableSource, TensionSource
+from knode_cosserat.recordings.config import ControlSource, MarkerSource, TableSource
 
 ROWS = 60
 CONFIG = RecordingConfig(
     markers=(MarkerSource("tip", "3", 1.0),),
-    motors=MotorSource("phi", (2, 1), "deg"),
-    table=TableSource(rate=100.0, position=("x{}", "y{}", "z{}"), motor="phi{}"),
+    angle=ControlSource("phi", (2, 1), "deg"),
+    table=TableSource(rate=100.0, position=("x{}", "y{}", "z{}"), control="phi{}"),
     repeats="drop",
 )
 
@@ -45,13 +45,13 @@ def test_titles_times_and_motors_of_another_laboratory(tmp_path):
     np.testing.assert_allclose(found.bodies[0].position, position[kept], atol=1e-12)
     sampled = found.sampled(0.02)
     # motor 1 is in the second column, in rad
-    np.testing.assert_allclose(sampled.tension[:, 1], sampled.time, atol=1e-9)
-    np.testing.assert_allclose(sampled.tension[:, 0], -2.0 * sampled.time, atol=1e-9)
+    np.testing.assert_allclose(sampled.control[:, 1], sampled.time, atol=1e-9)
+    np.testing.assert_allclose(sampled.control[:, 0], -2.0 * sampled.time, atol=1e-9)
     assert not any("tension" in each.message for each in found.findings if each.severity == "problem")
     late = load_recording(
-        tmp_path / "it.csv.gz", CONFIG.replace(motors=MotorSource("phi", (2, 1), "deg", latency=0.03))
+        tmp_path / "it.csv.gz", CONFIG.replace(angle=ControlSource("phi", (2, 1), "deg", latency=0.03))
     ).sampled(0.02, 0.1)
-    np.testing.assert_allclose(late.tension[:, 1], late.time - 0.03, atol=0.01 + 1e-9)
+    np.testing.assert_allclose(late.control[:, 1], late.time - 0.03, atol=0.01 + 1e-9)
 
 
 def test_rows_of_equilibria_are_as_they_are(tmp_path):
@@ -61,14 +61,14 @@ def test_rows_of_equilibria_are_as_they_are(tmp_path):
     found = load_recording(tmp_path / "it.csv", CONFIG.replace(static=True)).sampled(0.3, mean=True)
     assert found.static and len(found.time) == 9
     np.testing.assert_allclose(found.position[:, 0], position, atol=1e-12)
-    np.testing.assert_allclose(found.tension[:, [1, 0]], np.radians(angles), atol=1e-12)
+    np.testing.assert_allclose(found.control[:, [1, 0]], np.radians(angles), atol=1e-12)
 
 
 def test_bad_settings_and_files_are_said(tmp_path):
     with pytest.raises(RecordingError, match="position is"):
         TableSource(position=("x", "y", "z"))
-    with pytest.raises(RecordingError, match="tension and motors are both there"):
-        CONFIG.replace(tension=TensionSource("t", (1, 2)))
+    with pytest.raises(RecordingError, match="the topic phi is there twice"):
+        CONFIG.replace(tension=ControlSource("phi", (1, 2)))
     with pytest.raises(RecordingError, match="static is 'yes'; allowed is true or false"):
         CONFIG.replace(static="yes")
     (tmp_path / "it.csv.gz").write_bytes(gzip.compress(b"x3,y3\n1,2\n")[:-4])

@@ -16,7 +16,7 @@ def resting(path, curve, fractions, noise=0.0, **settings):
     """Bodies with unknown axes that rest on a curve of the fraction of the length (m), as they are read."""
     rng = np.random.default_rng(0)
     markers = [{"name": f"body{k}", "fraction": fraction} for k, fraction in enumerate(fractions)]
-    config = RecordingConfig(markers=markers, tensions="none", **settings)
+    config = RecordingConfig(markers=markers, controls="none", **settings)
     poses = {}
     for marker in config.markers:
         position = curve(marker.fraction) + noise * rng.normal(size=(len(TIME), 3))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.cli import app
 from knode_cosserat.recordings.frame import leans_of, rod_lengths
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from tests.recordings.made import LAG, PAPER, changed, made, write
 
 NOISE = 2e-4
@@ -81,9 +81,9 @@ def test_the_lag_of_the_motors_is_found(report):
 def test_a_pure_delay_is_found_and_said_if_it_is_not_the_stated_one(tmp_path):
     poses, _, command = made(seconds=8.0)
     time = np.round(np.arange(0.0, 8.0, 0.01), 6)
-    held = command.tension[np.maximum(np.searchsorted(command.time, time - 0.15 + 1e-9, side="right") - 1, 0)]
+    held = command.values[np.maximum(np.searchsorted(command.time, time - 0.15 + 1e-9, side="right") - 1, 0)]
     report = kc.load_recording(
-        write(tmp_path / "it.bag", (poses, Tensions(time, held + 0.1), command))
+        write(tmp_path / "it.bag", (poses, ControlRows(time, held + 0.1), command))
     ).health()
     assert report.latency.shift == pytest.approx(0.15, abs=0.011)
     assert report.latency.delay == pytest.approx(0.15, abs=0.006)
@@ -91,7 +91,7 @@ def test_a_pure_delay_is_found_and_said_if_it_is_not_the_stated_one(tmp_path):
     words = "tensions follow commands after 0.15 s; the configuration's latency is 0.06 s"
     assert any(words in finding.message for finding in report.findings)
     # and with the delay out of the way only the offset is left
-    for error in report.tension_errors:
+    for error in report.control_errors:
         assert error.bias == pytest.approx(0.1, abs=0.01)
 
 
@@ -99,8 +99,8 @@ def test_commands_that_do_not_change_say_nothing_about_latency(tmp_path):
     poses, tension, command = made(seconds=1.0)
     report = kc.load_recording(write(tmp_path / "it.bag", (poses, tension, command))).health()
     assert report.latency is None
-    assert len(report.tension_errors) == 4
-    assert max(abs(error.bias) for error in report.tension_errors) < 0.01
+    assert len(report.control_errors) == 4
+    assert max(abs(error.bias) for error in report.control_errors) < 0.01
 
 
 def test_the_rod_and_its_rest_are_told(report):
@@ -117,7 +117,7 @@ def test_a_recording_without_commands_or_rest_still_has_a_report(tmp_path):
     report = recording.health()
     assert report.rest is None
     assert report.latency is None
-    assert report.tension_errors == ()
+    assert report.control_errors == ()
     assert all(stream.noise is not None for stream in report.streams)
     kc.figures.health(recording).savefig(tmp_path / "it.png")
 
@@ -138,7 +138,7 @@ def test_inspect_says_it_in_words(bag):
         "simulated: not stated",
         "at rest from 0.00 to 1.0",
         "/vicon/continuum_1/pose",
-        "measured minus commanded [N]",
+        "measured minus commanded",
         "warning: /vicon/continuum_3/pose: its axes were swapped at 3.000 s, by 90 degrees about (0, 0, 1)",
         "too long to be bridged (",
     ):

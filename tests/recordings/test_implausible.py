@@ -36,7 +36,7 @@ def messages(recording):
 
 def test_nothing_is_found_in_a_good_table(tmp_path):
     recording = load_recording(written(tmp_path / "it.csv", rows()))
-    assert recording.findings == () and len(recording.tension.time) == ROWS
+    assert recording.findings == () and len(recording.control.time) == ROWS
 
 
 def test_rows_without_a_time_are_a_finding(tmp_path):
@@ -46,7 +46,7 @@ def test_rows_without_a_time_are_a_finding(tmp_path):
     lines[9] = lines[9][lines[9].index(",") :]
     recording = load_recording(written(tmp_path / "it.csv", lines))
     assert messages(recording) == ["warning: 3 rows have no time (4, 8, 10); left out"]
-    assert len(recording.tension.time) == ROWS - 3
+    assert len(recording.control.time) == ROWS - 3
 
 
 def test_text_after_a_hash_is_a_finding(tmp_path):
@@ -56,7 +56,7 @@ def test_text_after_a_hash_is_a_finding(tmp_path):
     path = written(tmp_path / "it.csv", lines)
     path.write_text("# source: it\n\n# latency: 0.02\n" + path.read_text())
     recording = load_recording(path)
-    assert recording.source == "it" and len(recording.tension.time) == ROWS - 1
+    assert recording.source == "it" and len(recording.control.time) == ROWS - 1
     assert messages(recording) == [
         "warning: 1 line begins with # after the header (9); left out",
         "warning: 1 line has a # (11); the text after it is left out",
@@ -77,12 +77,12 @@ def test_a_tension_that_no_tendon_has_is_left_out(tmp_path, value):
     assert finding.message == (
         f"1 row has a tension that is not plausible, {value:g} N among tensions of 5 N; left out"
     )
-    assert np.all(np.abs(recording.tension.tension - 5.0) < 0.2)
+    assert np.all(np.abs(recording.control.values - 5.0) < 0.2)
     # a held tension lasts until the next row: it is kept, and said to be doubtful
     recording = load_recording(written(tmp_path / "it.csv", lines, "held_tension"))
     (finding,) = recording.findings
     assert finding.severity == "problem" and finding.message.endswith("among tensions of 5 N; kept")
-    assert np.any(recording.tension.tension == value)
+    assert np.any(recording.control.values == value)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,9 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, checks
-from knode_cosserat.recordings.config import MarkerSource, TensionSource
+from knode_cosserat.recordings.config import ControlSource, MarkerSource
 from knode_cosserat.recordings.formats import bag
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.write import START, write_recording
 from tests.recordings.made import CLAMP, PAPER, TURNED, changed, made, moved, write
 
@@ -170,12 +170,12 @@ def test_poses_that_are_no_numbers_are_left_out(tmp_path, streams):
 
 def test_tensions_that_are_no_numbers_or_spikes_are_left_out(tmp_path, streams):
     poses, tension, command = streams
-    wrong = tension.tension.copy()
+    wrong = tension.values.copy()
     wrong[20, 1], wrong[100, 2] = np.nan, 40.0
-    recording = read(tmp_path, (poses, Tensions(tension.time, wrong), command))
+    recording = read(tmp_path, (poses, ControlRows(tension.time, wrong), command))
     assert said(recording, "1 tension is not finite").times == pytest.approx((0.4,))
     assert said(recording, "1 tension jumps up or down and back").times == pytest.approx((2.0,))
-    assert len(recording.tension.time) == len(tension.time) - 2
+    assert len(recording.control.time) == len(tension.time) - 2
 
 
 def test_a_base_that_moves_is_said(tmp_path, streams):
@@ -276,7 +276,7 @@ def test_a_stamp_of_another_year_does_not_make_a_recording_of_a_year(tmp_path, s
 def test_tensions_in_another_unit_are_flagged(tmp_path, streams):
     read(tmp_path, streams)
     for source, words in (
-        (TensionSource("/tension", (4, 1, 2, 3), "N"), "are grams-force read as newtons?"),
+        (ControlSource("/tension", (4, 1, 2, 3), "N"), "are gf read as N?"),
         (PAPER.tension, None),
     ):
         config = dataclasses.replace(PAPER, tension=source)
@@ -290,7 +290,7 @@ def test_tensions_in_another_unit_are_flagged(tmp_path, streams):
     newtons = dataclasses.replace(PAPER, tension=dataclasses.replace(PAPER.tension, unit="N"))
     write(tmp_path / "newtons.bag", streams, newtons)
     recording = kc.load_recording(tmp_path / "newtons.bag")
-    assert said(recording, "are newtons read as grams-force?").severity == "problem"
+    assert said(recording, "are N read as gf?").severity == "problem"
 
 
 def test_positions_in_another_unit_are_flagged(tmp_path, streams):
@@ -316,7 +316,7 @@ def test_a_straight_rod_that_does_not_point_along_its_axis_is_flagged(tmp_path, 
     poses = {name: each for name, each in streams[0].items() if name != "base"}
     upright = dataclasses.replace(PAPER, base=None)
     lying = dataclasses.replace(
-        upright, rotation=tuple(turn.as_quat(scalar_first=True)), origin=tuple(turn.apply(CLAMP))
+        upright, frame_rotation=tuple(turn.as_quat(scalar_first=True)), origin=tuple(turn.apply(CLAMP))
     )
     write(tmp_path / "it.bag", (poses, *streams[1:]), upright)
     finding = said(kc.load_recording(tmp_path / "it.bag", lying), "at rest the last body")
@@ -373,12 +373,14 @@ def test_the_rest_can_be_given(tmp_path, streams):
 
 def test_two_tendons_and_a_rod_that_hardly_moves(tmp_path):
     config = RecordingConfig(
-        markers=(MarkerSource("tip", "/tip", 1.0),), tension=TensionSource("/pull", (1, 2), "N")
+        markers=(MarkerSource("tip", "/tip", 1.0),), tension=ControlSource("/pull", (1, 2), "N")
     )
     time = np.round(np.arange(0.0, 2.0, 0.01), 6)
     turned = np.tile(TURNED[1].as_quat(scalar_first=True), (len(time), 1))
     tip = Body(time, np.tile([0.0, 0.0, 0.4], (len(time), 1)), turned)
-    write_recording(tmp_path / "it.db3", config, {"tip": tip}, Tensions(time, np.full((len(time), 2), 4.0)))
+    write_recording(
+        tmp_path / "it.db3", config, {"tip": tip}, ControlRows(time, np.full((len(time), 2), 4.0))
+    )
     recording = kc.load_recording(tmp_path / "it.db3", config)
     assert recording.rest == pytest.approx((0.0, 1.99))
     np.testing.assert_allclose(

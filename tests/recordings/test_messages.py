@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording, proposed_config
-from knode_cosserat.recordings.config import CommandSource, MarkerSource, MotorSource, TensionSource
+from knode_cosserat.recordings.config import ControlSource, MarkerSource
 from knode_cosserat.recordings.messages import typestore
 from tests.commands import succeeded
 from tests.recordings.formats.exported import bent, times
@@ -122,13 +122,13 @@ def joint_states(order=(0, 1, 2, 3), names=NAMES, ros=2, change=None):
 
 
 def config(tension=None, **changes):
-    source = tension or TensionSource("/joint_states", (1, 2, 3, 4))
+    source = tension or ControlSource("/joint_states", (1, 2, 3, 4))
     return RecordingConfig(markers=TIP, tension=source, **changes)
 
 
 def measured(recording):
-    np.testing.assert_allclose(recording.tension.time, TIME, atol=1e-9)
-    return recording.tension.tension
+    np.testing.assert_allclose(recording.control.time, TIME, atol=1e-9)
+    return recording.control.values
 
 
 # tendons by name
@@ -160,16 +160,16 @@ def test_joints_are_matched_by_name(tmp_path, ros, order, change):
 )
 def test_numbers_in_names_and_the_order_of_the_wire(tmp_path, names, order, stated, expected):
     path = write(tmp_path / "it", [*poses(), *joint_states(order, names)])
-    recording = load_recording(path, config(TensionSource("/joint_states", stated)))
+    recording = load_recording(path, config(ControlSource("/joint_states", stated)))
     np.testing.assert_allclose(measured(recording), PULLS[:, expected], atol=1e-12)
 
 
 def test_names_in_the_configuration_decide(tmp_path):
     names = ["flexor", "extensor", "left", "right"]
     path = write(tmp_path / "it", [*poses(), *joint_states((2, 0, 3, 1), names, change=50)])
-    recording = load_recording(path, config(TensionSource("/joint_states", names=tuple(names))))
+    recording = load_recording(path, config(ControlSource("/joint_states", names=tuple(names))))
     np.testing.assert_allclose(measured(recording), PULLS, atol=1e-12)
-    two = TensionSource("/joint_states", (2, 1), names=("right", "flexor"))
+    two = ControlSource("/joint_states", (2, 1), names=("right", "flexor"))
     np.testing.assert_allclose(measured(load_recording(path, config(two))), PULLS[:, [0, 3]], atol=1e-12)
     # without names the first message's order counts for all, and is reported
     recording = load_recording(path, config())
@@ -178,7 +178,7 @@ def test_names_in_the_configuration_decide(tmp_path):
         "left, flexor, right, extensor are taken in this order" in it.message for it in recording.findings
     )
     with pytest.raises(RecordingError, match="no joint is called extensr; its joints are extensor, flexor"):
-        load_recording(path, config(TensionSource("/joint_states", names=("flexor", "extensr"))))
+        load_recording(path, config(ControlSource("/joint_states", names=("flexor", "extensr"))))
 
 
 def test_names_that_contradict_the_order_are_refused(tmp_path):
@@ -186,7 +186,7 @@ def test_names_that_contradict_the_order_are_refused(tmp_path):
     with pytest.raises(
         RecordingError, match=r"tendon_3, tendon_1, tendon_4, tendon_2, .* \[2, 1, 3, 4\]; allowed"
     ):
-        load_recording(path, config(TensionSource("/joint_states", (2, 1, 3, 4))))
+        load_recording(path, config(ControlSource("/joint_states", (2, 1, 3, 4))))
 
 
 def test_joint_states_of_others_are_left_out_and_messages_without_names_are_in_order(tmp_path):
@@ -198,7 +198,7 @@ def test_joint_states_of_others_are_left_out_and_messages_without_names_are_in_o
     np.testing.assert_allclose(measured(load_recording(path, config())), PULLS, atol=1e-12)
     nameless = series(*joints, lambda at, row: it.joints(at, [], PULLS[row]))
     path = write(tmp_path / "other", [*poses(), *nameless])
-    reversed_order = config(TensionSource("/joint_states", (4, 3, 2, 1)))
+    reversed_order = config(ControlSource("/joint_states", (4, 3, 2, 1)))
     np.testing.assert_allclose(measured(load_recording(path, reversed_order)), PULLS[:, ::-1], atol=1e-12)
 
 
@@ -211,7 +211,7 @@ def test_motors_are_positions_of_joints(tmp_path):
         lambda at, _: it.joints(at, names, [9.0, 9.0], [20.0 + at, 10.0 - at]),
     )
     path = write(tmp_path / "it", [*poses(), *entries])
-    motors = RecordingConfig(markers=TIP, motors=MotorSource("/motors", (1, 2)))
+    motors = RecordingConfig(markers=TIP, angle=ControlSource("/motors", (1, 2)))
     expected = np.stack([10.0 - TIME, 20.0 + TIME], axis=1)
     np.testing.assert_allclose(measured(load_recording(path, motors)), expected, atol=1e-12)
 
@@ -238,17 +238,17 @@ def test_each_tendon_has_its_topic(tmp_path, kind):
         topic = f"/cells/{name}/force", f"{package}/msg/{kind}"
         entries += series(*topic, lambda _, row, pulls=pulls: pulls[row], TIME + 0.001 * k)
     path = write(tmp_path / "it", [*poses(), *entries])
-    source = TensionSource("/cells/{}/force", names=("c", "a", "b"))
+    source = ControlSource("/cells/{}/force", names=("c", "a", "b"))
     recording = load_recording(path, config(source))
     # tendon 3 is sampled first; the others are interpolated to its times
-    seen = recording.tension
+    seen = recording.control
     expected = np.stack([30.0 + seen.time - 0.002, 10.0 + seen.time, 20.0 + seen.time - 0.001], axis=1)
     inside = slice(2, -2)
-    np.testing.assert_allclose(seen.tension[inside], expected[inside], atol=1e-5)
+    np.testing.assert_allclose(seen.values[inside], expected[inside], atol=1e-5)
     with pytest.raises(
         RecordingError, match=r"topic /cells/1/force \(tension\) is missing; the bag has /cells/a"
     ):
-        load_recording(path, config(TensionSource("/cells/{}/force", (1, 2, 3))))
+        load_recording(path, config(ControlSource("/cells/{}/force", (1, 2, 3))))
 
 
 def test_commands_of_each_tendon_hold_until_the_next(tmp_path):
@@ -260,10 +260,10 @@ def test_commands_of_each_tendon_hold_until_the_next(tmp_path):
         for at, value in rows
     ]
     path = write(tmp_path / "it.bag", [*poses(1), *entries], ros=1)
-    command = CommandSource("/cmd_{}", (1, 2))
-    recording = load_recording(path, RecordingConfig(markers=TIP, command=command, tensions="commanded"))
+    command = ControlSource("/cmd_{}", (1, 2))
+    recording = load_recording(path, RecordingConfig(markers=TIP, command=command, controls="commanded"))
     np.testing.assert_allclose(recording.command.time, [0.2, 0.5, 1.0], atol=1e-9)
-    np.testing.assert_allclose(recording.command.tension, [[5.0, 6.0], [7.0, 6.0], [7.0, 8.0]])
+    np.testing.assert_allclose(recording.command.values, [[5.0, 6.0], [7.0, 6.0], [7.0, 8.0]])
 
 
 # poses
@@ -329,7 +329,7 @@ def test_a_body_of_a_pose_array(tmp_path):
         ("/poses[tip]", r"topic /poses has no part \[tip\]; allowed"),
         ("/joint_states[1]", "its messages are sensor_msgs/JointState; allowed for a pose is"),
     ):
-        other = of(topic, tension=TensionSource("/other", (1,))) if "joint" in topic else of(topic)
+        other = of(topic, tension=ControlSource("/other", (1,))) if "joint" in topic else of(topic)
         with pytest.raises(RecordingError, match=words):
             load_recording(path, other)
     path = write(tmp_path / "poses", [*poses(), *joint_states()])
@@ -484,7 +484,7 @@ def test_compressed_messages_stay_within_the_limits(tmp_path, monkeypatch):
 
 
 def test_parts_of_messages_are_not_written(tmp_path):
-    from knode_cosserat.recordings.streams import Body, Tensions
+    from knode_cosserat.recordings.streams import Body, ControlRows
     from knode_cosserat.recordings.write import write_recording
 
     config = of("/poses[1]")
@@ -492,7 +492,7 @@ def test_parts_of_messages_are_not_written(tmp_path):
     with pytest.raises(
         RecordingError, match=r"topic /poses\[1\] cannot be written; allowed is one topic for each"
     ):
-        write_recording(tmp_path / "it.bag", config, poses, Tensions(TIME, PULLS))
+        write_recording(tmp_path / "it.bag", config, poses, ControlRows(TIME, PULLS))
     assert not list(tmp_path.iterdir())
 
 
@@ -536,8 +536,8 @@ def test_parts_and_topics_of_tendons_are_proposed(tmp_path):
     assert [each.topic for each in found.markers] == ["/poses[0]", "/poses[1]", "/poses[2]"]
     assert (found.tension.topic, found.tension.names) == ("/cell{}/force", ("1", "2"))
     assert any("no body is called base" in each for each in found.remarks)
-    seen = load_recording(path, found).tension
-    np.testing.assert_allclose(seen.tension, seen.time[:, None] + [5.0, 10.0], atol=1e-9)
+    seen = load_recording(path, found).control
+    np.testing.assert_allclose(seen.values, seen.time[:, None] + [5.0, 10.0], atol=1e-9)
     path = write(tmp_path / "tf", [*transforms(), *cells])
     found = proposed_config(path)
     assert sorted(each.topic for each in found.markers) == ["/tf[camera]", "/tf[tip]"]
@@ -577,7 +577,7 @@ def test_sensors_beside_motion_capture_are_read_from_bags(tmp_path, ros):
     path = write(tmp_path / ("it.bag" if ros == 1 else "it"), entries, ros)
     kinds = {"orientation": "/imu", "base_wrench": "/wrench"}
     config = RecordingConfig(
-        tension=TensionSource("/pull", (1, 2, 3, 4)),
+        tension=ControlSource("/pull", (1, 2, 3, 4)),
         sensors=[{"kind": kind, "topic": topic} for kind, topic in kinds.items()],
     )
     turned, force = load_recording(path, config).sensors
@@ -585,4 +585,4 @@ def test_sensors_beside_motion_capture_are_read_from_bags(tmp_path, ros):
     np.testing.assert_allclose(force.values, np.hstack([PULLS[:, :3], PULLS[:, 1:]]), rtol=1e-12)
     wrong = [{"kind": "orientation", "topic": "/pull"}]
     with pytest.raises(RecordingError, match="topic /pull"):
-        load_recording(path, RecordingConfig(sensors=wrong, tensions="none"))
+        load_recording(path, RecordingConfig(sensors=wrong, controls="none"))

@@ -10,9 +10,9 @@ from scipy.spatial.transform import Rotation
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, RecordingError, messages
-from knode_cosserat.recordings.config import CommandSource, MarkerSource, TensionSource
+from knode_cosserat.recordings.config import ControlSource, MarkerSource
 from knode_cosserat.recordings.formats import written_suffixes
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.write import write_recording
 from tests.recordings.made import LAG, PAPER, SMALL, changed, compressed, moved, repacked, write
 
@@ -29,10 +29,10 @@ def turned_by(quaternion, rotation):
 def test_the_papers_robot_comes_back(tmp_path, exact, ending):
     recording = kc.load_recording(write(tmp_path / f"it{ending}", exact), PAPER)
     _, tension, command = exact
-    np.testing.assert_allclose(recording.tension.time, tension.time, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(recording.tension.tension, tension.tension, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.control.time, tension.time, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(recording.control.values, tension.values, rtol=0, atol=1e-12)
     np.testing.assert_allclose(recording.command.time, command.time, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(recording.command.tension, command.tension, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.command.values, command.values, rtol=0, atol=1e-12)
     assert [body.name for body in recording.bodies] == ["rib 1", "rib 2", "rib 3", "rib 4"]
     for body, ninths in zip(recording.bodies, (3, 5, 7, 9), strict=True):
         position, rotation = moved(body.time, ninths / 9)
@@ -47,15 +47,15 @@ def test_the_papers_robot_comes_back(tmp_path, exact, ending):
 def test_another_robot_of_three_tendons_and_one_body_that_has_no_orientation_comes_back(tmp_path, ending):
     time = np.round(np.arange(0.0, 2.0, 0.02), 6)
     position, _ = moved(time, 1.0)
-    pulls = Tensions(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
+    pulls = ControlRows(time[::2], 3.0 + np.random.default_rng(0).uniform(0.0, 1.0, (50, 3)))
     write_recording(tmp_path / f"it{ending}", SMALL, {"tip": Body(time, position)}, pulls, pulls)
     recording = kc.load_recording(tmp_path / f"it{ending}", SMALL)
     (tip,) = recording.bodies
     np.testing.assert_allclose(tip.position, position, rtol=0, atol=1e-12)
     assert tip.quaternion is None
-    np.testing.assert_allclose(recording.tension.tension, pulls.tension, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.control.values, pulls.values, rtol=0, atol=1e-12)
     measured = recording.sampled(0.04)
-    assert measured.tension.shape[1] == 3
+    assert measured.control.shape[1] == 3
     assert measured.position.shape[1:] == (1, 3)
     assert np.isnan(measured.quaternion).all()
     assert len(measured.parts()) == 1
@@ -67,8 +67,8 @@ def test_a_table_explains_itself(tmp_path, exact):
     config = dataclasses.replace(
         PAPER,
         markers=tuple(dataclasses.replace(it, topic=it.name.replace(" ", "")) for it in PAPER.markers),
-        tension=TensionSource("tension", (1, 2, 3, 4)),
-        command=CommandSource("command", (1, 2, 3, 4), latency=0.06),
+        tension=ControlSource("tension", (1, 2, 3, 4)),
+        command=ControlSource("command", (1, 2, 3, 4), latency=0.06),
         base=None,
         simulated=True,
         description="a test",
@@ -82,19 +82,19 @@ def test_a_table_explains_itself(tmp_path, exact):
         assert [body.fraction for body in recording.bodies] == [it.fraction for it in config.markers]
         assert recording.config.command.latency == 0.06
         assert len(recording.bodies[0].time) == len(recording.bodies[1].time) / 2
-        np.testing.assert_array_equal(recording.tension.tension, streams[1].tension)
+        np.testing.assert_array_equal(recording.control.values, streams[1].values)
         # what a table without configuration says is taken as it stands
         np.testing.assert_allclose(recording.bodies[3].position, poses["rib 4"].position, rtol=0, atol=1e-12)
 
 
 def test_arrays_have_no_stamps_and_are_taken_when_they_were_recorded(tmp_path):
-    config = dataclasses.replace(SMALL, tension=TensionSource("/pull", (2, 1)), command=None)
+    config = dataclasses.replace(SMALL, tension=ControlSource("/pull", (2, 1)), command=None)
     time = np.round(np.arange(0.0, 1.0, 0.01), 6)
     tip = {"tip": Body(time, moved(time, 1.0)[0])}
-    pulls = Tensions(time, np.stack([5.0 + time, 6.0 - time], axis=1))
+    pulls = ControlRows(time, np.stack([5.0 + time, 6.0 - time], axis=1))
     write_recording(tmp_path / "it.mcap", config, tip, pulls)
     recording = kc.load_recording(tmp_path / "it.mcap", config)
-    np.testing.assert_allclose(recording.tension.tension, pulls.tension, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.control.values, pulls.values, rtol=0, atol=1e-12)
     assert any("have no stamps" in finding.message for finding in recording.findings)
 
 
@@ -156,7 +156,7 @@ def test_a_bag_in_several_files_is_one(tmp_path, exact):
     write(folder / "it_1.mcap", part(1.5, 2.0))
     write(folder / "it_10.mcap", part(2.0, 9.0))
     recording = kc.load_recording(folder)
-    np.testing.assert_allclose(recording.tension.tension, tension.tension, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.control.values, tension.values, rtol=0, atol=1e-12)
     assert len(recording.bodies[0].time) == 300
 
 
@@ -186,11 +186,11 @@ def test_messages_of_types_that_other_robots_use(tmp_path):
             for name, message in told.items():
                 writer.write(there[name], 10**10 + round(t * 1e9), store.serialize_cdr(message, kinds[name]))
     config = RecordingConfig(
-        markers=(MarkerSource("tip", "/tip", 1.0),), tension=TensionSource("/pull", (2, 1))
+        markers=(MarkerSource("tip", "/tip", 1.0),), tension=ControlSource("/pull", (2, 1))
     )
     recording = kc.load_recording(tmp_path / "bag", config)
     np.testing.assert_allclose(recording.bodies[0].position[3], [0.0, 0.0, 0.5])
-    np.testing.assert_allclose(recording.tension.tension[:, 0], 5.0 + time)
+    np.testing.assert_allclose(recording.control.values[:, 0], 5.0 + time)
 
 
 # frames and units
@@ -201,9 +201,9 @@ def test_another_frame_and_other_units(tmp_path, exact):
     up = Rotation.from_euler("x", 90.0, degrees=True)
     config = dataclasses.replace(
         PAPER,
-        rotation=tuple(up.as_quat(scalar_first=True)),
+        frame_rotation=tuple(up.as_quat(scalar_first=True)),
         position_unit="mm",
-        tension=TensionSource("/tension", (2, 4, 1, 3), "N"),
+        tension=ControlSource("/tension", (2, 4, 1, 3), "N"),
     )
     poses, tension, command = exact
     seen = {
@@ -215,7 +215,7 @@ def test_another_frame_and_other_units(tmp_path, exact):
         for name, it in poses.items()
     }
     recording = kc.load_recording(write(tmp_path / "it.bag", (seen, tension, command), config), config)
-    np.testing.assert_allclose(recording.tension.tension, tension.tension, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(recording.control.values, tension.values, rtol=0, atol=1e-12)
     for body in recording.bodies:
         position, rotation = moved(body.time, body.fraction)
         np.testing.assert_allclose(body.position, position, rtol=0, atol=1e-9)
@@ -230,10 +230,10 @@ def test_the_wire_has_the_tendons_in_its_own_order(tmp_path, exact):
         for each, _, raw in reader.messages(connections=chosen):
             told.setdefault(each.topic, reader.deserialize(raw, each.msgtype))
     _, tension, command = exact
-    first = tension.tension[0] / 9.81e-3
+    first = tension.values[0] / 9.81e-3
     q = told["/tension"].quaternion
     np.testing.assert_allclose([q.x, q.y, q.z, q.w], first[[3, 0, 1, 2]])
-    grams = np.round(command.tension[0] / 9.81e-3).astype(int)[[3, 0, 1, 2]]
+    grams = np.round(command.values[0] / 9.81e-3).astype(int)[[3, 0, 1, 2]]
     assert told["/rosout"].msg == "Serial Command: " + " ".join(map(str, grams))
 
 
@@ -275,8 +275,8 @@ def test_rows_hold_tensions_and_interpolate_poses(tmp_path, exact):
     measured = recording.sampled(0.037, start=0.5, end=2.5)
     np.testing.assert_allclose(measured.time, 0.5 + 0.037 * np.arange(55), atol=1e-9)
     _, tension, command = exact
-    held = [tension.tension[np.flatnonzero(tension.time <= t + 1e-9)[-1]] for t in measured.time]
-    np.testing.assert_allclose(measured.tension, held, atol=1e-12)
+    held = [tension.values[np.flatnonzero(tension.time <= t + 1e-9)[-1]] for t in measured.time]
+    np.testing.assert_allclose(measured.control, held, atol=1e-12)
     position, rotation = moved(measured.time, 1.0)
     # but for the kink at 1 s, cubic splines are good to 20 micrometres
     np.testing.assert_allclose(measured.tip_position, position, rtol=0, atol=2e-4)
@@ -285,10 +285,10 @@ def test_rows_hold_tensions_and_interpolate_poses(tmp_path, exact):
     assert measured.dt == pytest.approx(0.037)
     np.testing.assert_allclose(measured.fractions, [3 / 9, 5 / 9, 7 / 9, 1.0])
 
-    commanded = recording.sampled(0.037, 0.5, 2.5, tensions="commanded")
-    late = [command.tension[np.flatnonzero(command.time <= t - LAG + 1e-9)[-1]] for t in measured.time]
-    np.testing.assert_allclose(commanded.tension, late, atol=1e-12)
-    assert not np.allclose(commanded.tension, measured.tension, atol=0.1)
+    commanded = recording.sampled(0.037, 0.5, 2.5, controls="commanded")
+    late = [command.values[np.flatnonzero(command.time <= t - LAG + 1e-9)[-1]] for t in measured.time]
+    np.testing.assert_allclose(commanded.control, late, atol=1e-12)
+    assert not np.allclose(commanded.control, measured.control, atol=0.1)
 
 
 def test_quaternions_do_not_flip_from_row_to_row(tmp_path, exact):
@@ -327,7 +327,7 @@ def test_short_gaps_are_bridged_and_long_ones_split(tmp_path, exact):
 def test_a_gap_in_the_measured_tensions_splits_too(tmp_path, exact):
     poses, tension, command = exact
     known = (tension.time < 1.5) | (tension.time > 2.0)
-    streams = poses, Tensions(tension.time[known], tension.tension[known]), command
+    streams = poses, ControlRows(tension.time[known], tension.values[known]), command
     measured = kc.load_recording(write(tmp_path / "it.bag", streams)).sampled(0.05)
     assert [round(part.time[0], 2) for part in measured.parts()] == [0.0, 2.05]
 
@@ -366,7 +366,7 @@ def test_trimming_and_asking_for_rows(tmp_path, exact):
     for dt in (0.0, -1.0, float("nan"), float("inf")):
         with pytest.raises(RecordingError, match=r"dt is .*; allowed is a time step above 0 s"):
             recording.sampled(dt)
-    with pytest.raises(RecordingError, match="tensions is 'guessed'; allowed is measured, commanded or none"):
-        recording.sampled(tensions="guessed")
+    with pytest.raises(RecordingError, match="controls is 'guessed'; allowed is measured, commanded or none"):
+        recording.sampled(controls="guessed")
     with pytest.raises(RecordingError, match="one row has no time step"):
         _ = recording.sampled(0.05, 1.0, 1.01).dt

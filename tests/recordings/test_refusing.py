@@ -7,9 +7,9 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig, RecordingError, messages
-from knode_cosserat.recordings.config import BaseSource, TensionSource
+from knode_cosserat.recordings.config import BaseSource, ControlSource
 from knode_cosserat.recordings.formats import written_suffixes
-from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.streams import ControlRows
 from knode_cosserat.recordings.write import write_recording
 from tests.recordings.made import PAPER, changed, write
 
@@ -33,7 +33,7 @@ def test_a_bag_of_another_robot_is_refused_by_the_topic_that_it_lacks(tmp_path, 
 def test_a_topic_of_another_type_is_refused(tmp_path, exact):
     path = write(tmp_path / "it.bag", exact)
     other = dataclasses.replace(
-        PAPER, tension=TensionSource("/vicon/continuum_0/pose", (1, 2, 3, 4)), markers=PAPER.markers[1:]
+        PAPER, tension=ControlSource("/vicon/continuum_0/pose", (1, 2, 3, 4)), markers=PAPER.markers[1:]
     )
     message = refused(path, other)
     assert (
@@ -52,8 +52,8 @@ def test_a_type_that_is_not_the_standard_one_is_refused(tmp_path, exact):
 
 def test_another_number_of_tendons_is_refused(tmp_path, exact):
     path = write(tmp_path / "it.bag", exact)
-    two = RecordingConfig(markers=PAPER.markers, tension=TensionSource("/tension", (1, 2), "gf"))
-    assert "topic /tension: a message has 4 tensions; the configuration's order has 2 tendons" in refused(
+    two = RecordingConfig(markers=PAPER.markers, tension=ControlSource("/tension", (1, 2), "gf"))
+    assert "topic /tension: a message has 4 tensions; the configuration's order has 2 numbers" in refused(
         path, two
     )
 
@@ -71,9 +71,9 @@ def test_commands_that_are_needed_are_asked_for(tmp_path, exact):
     assert [str(it) for it in recording.findings] == [
         "note: /rosout: there is no such topic, and so no commands"
     ]
-    with pytest.raises(RecordingError, match="there are no commanded tensions"):
-        recording.sampled(tensions="commanded")
-    driven = dataclasses.replace(PAPER, tensions="commanded")
+    with pytest.raises(RecordingError, match="there are no commanded controls"):
+        recording.sampled(controls="commanded")
+    driven = dataclasses.replace(PAPER, controls="commanded")
     assert "topic /rosout (command) is missing" in refused(path, driven)
 
 
@@ -118,8 +118,8 @@ def test_what_cannot_be_written_is_said(tmp_path, exact):
         write_recording(tmp_path / "it.txt", PAPER, poses, tension, command)
     with pytest.raises(RecordingError, match="poses are given of"):
         write_recording(tmp_path / "it.bag", PAPER, {"tip": poses["rib 4"]}, tension, command)
-    with pytest.raises(RecordingError, match=r"tension of shape \(150, 3\); the configuration has 4 tendons"):
-        write_recording(tmp_path / "it.bag", PAPER, poses, Tensions(tension.time, tension.tension[:, :3]))
+    with pytest.raises(RecordingError, match=r"control of shape \(150, 3\); the configuration has 4 numbers"):
+        write_recording(tmp_path / "it.bag", PAPER, poses, ControlRows(tension.time, tension.values[:, :3]))
     for ending in written_suffixes():
         with pytest.raises(RecordingError, match="cannot be written"):
             write_recording(tmp_path / "nowhere" / f"it{ending}", PAPER, poses, tension, command)

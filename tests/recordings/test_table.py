@@ -4,7 +4,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.metrics import dtw_distance
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_example, load_recording
-from knode_cosserat.recordings.config import MarkerSource, TensionSource
+from knode_cosserat.recordings.config import ControlSource, MarkerSource
 
 HEADER = "time [s],tension_1 [N],tension_2 [N],tip_x [m],tip_y [m],tip_z [m]"
 ROW = "0,1,2,0.1,0.2,0.3"
@@ -38,22 +38,22 @@ def test_nothing_is_wrong_with_the_example():
 def test_the_example_has_20_rows_a_second(example):
     assert example.dt == 0.05
     np.testing.assert_allclose(example.time, np.arange(320) * 0.05, rtol=0, atol=1e-12)
-    assert example.tension.shape == (320, 4)
+    assert example.control.shape == (320, 4)
     assert example.tip_position.shape == (320, 3)
     # and they are those of the file
     (body,) = load_example().bodies
     np.testing.assert_allclose(example.tip_position, body.position, rtol=0, atol=1e-12)
-    np.testing.assert_array_equal(example.tension, load_example().tension.tension)
+    np.testing.assert_array_equal(example.control, load_example().control.values)
     assert example.measured.all()
 
 
 def test_the_example_follows_its_commands(example):
     # 500 + 300 (cos, sin, -cos, -sin) grams-force at a period of 1 s from t = 1 s on, 500 before
     resting = example.between(0.0, 1.0)
-    np.testing.assert_allclose(resting.tension, 4.905, atol=0.25)
+    np.testing.assert_allclose(resting.control, 4.905, atol=0.25)
     running = example.between(5.0, 15.0)
     turns = np.exp(-2j * np.pi * running.time)
-    amplitude = 2 * (turns @ running.tension) / len(turns)
+    amplitude = 2 * (turns @ running.control) / len(turns)
     # the motors lag behind a little, by the same for all
     assert abs(amplitude) / 9.81e-3 == pytest.approx(300, rel=0.1)
     np.testing.assert_allclose(amplitude / amplitude[0], [1, -1j, -1, 1j], atol=0.03)
@@ -74,7 +74,7 @@ def test_the_papers_knowledge_misses_the_example_by_what_the_specification_says(
     assert len(measured.time) == 200
     robot = kc.load_robot("delrin-tendon-robot")
     predicted = kc.simulate(
-        robot, measured.tension[:-1], measured.dt, time="bdf2", space="euler", start="paper"
+        robot, measured.control[:-1], measured.dt, time="bdf2", space="euler", start="paper"
     )
     assert dtw_distance(predicted.tip_position, measured.tip_position) == pytest.approx(60.9, abs=0.5)
 
@@ -88,8 +88,8 @@ def test_a_table_is_read_by_its_titles(table):
     recording = load_recording(path)
     assert recording.source == "a test: of ours"
     assert recording.simulated is True
-    np.testing.assert_array_equal(recording.tension.time, [0, 0.5])
-    np.testing.assert_array_equal(recording.tension.tension, [[1, 2], [4, 5]])
+    np.testing.assert_array_equal(recording.control.time, [0, 0.5])
+    np.testing.assert_array_equal(recording.control.values, [[1, 2], [4, 5]])
     np.testing.assert_allclose(recording.bodies[0].position, [[0.1, 0.2, 0.3], [0.4, 0.5, 0.6]])
     assert recording.bodies[0].fraction == 1.0
     assert recording.sampled(0.5).dt == 0.5
@@ -105,7 +105,7 @@ def test_without_comments_nothing_is_claimed_of_the_robot(table):
 def test_cells_that_are_empty_were_not_measured(table):
     path = table(f"{HEADER}\n0,1,2,,,\n0.1,,,0,0,0.5\n0.2,1,3,nan,nan,nan\n0.3,,,0,0.1,0.5\n0.4,1,2,0,0.2,\n")
     recording = load_recording(path)
-    np.testing.assert_array_equal(recording.tension.time, [0.0, 0.2, 0.4])
+    np.testing.assert_array_equal(recording.control.time, [0.0, 0.2, 0.4])
     np.testing.assert_array_equal(recording.bodies[0].time, [0.1, 0.3])
     assert "1 pose is not finite" in recording.findings[0].message
 
@@ -113,7 +113,7 @@ def test_cells_that_are_empty_were_not_measured(table):
 def test_rows_out_of_order_are_sorted(table):
     path = table(f"{HEADER}\n0,1,2,0,0,0.5\n2,3,2,0,0,0.5\n1,2,2,0,0,0.5\n1,2,2,0,0,0.5\n")
     recording = load_recording(path)
-    np.testing.assert_array_equal(recording.tension.tension[:, 0], [1, 2, 3])
+    np.testing.assert_array_equal(recording.control.values[:, 0], [1, 2, 3])
     words = " ".join(finding.message for finding in recording.findings)
     assert "the messages were sorted" in words
     assert "1 stamp is there twice" in words
@@ -141,17 +141,17 @@ def test_a_table_with_other_titles_needs_a_configuration(table):
     )
     config = RecordingConfig(
         markers=(MarkerSource("tip", "end", 1.0),),
-        tension=TensionSource("grip", (1,), "gf"),
+        tension=ControlSource("grip", (1,), "gf"),
         position_unit="mm",
         simulated=False,
     )
     recording = load_recording(path, config)
     assert recording.simulated is False
-    np.testing.assert_allclose(recording.tension.tension, 4.905)
+    np.testing.assert_allclose(recording.control.values, 4.905)
     np.testing.assert_allclose(recording.bodies[0].position, [[0, 0, 0.4]] * 2)
     with pytest.raises(RecordingError, match=r"the columns are time \[s\], grip_1"):
         load_recording(path)
-    other = config.replace(tension=TensionSource("pull", (1,)))
+    other = config.replace(tension=ControlSource("pull", (1,)))
     with pytest.raises(RecordingError, match=r"the column pull_1 \[N\] is missing; the columns are time"):
         load_recording(path, other)
 

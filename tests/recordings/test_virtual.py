@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.recordings.streams import Tensions
+from knode_cosserat.recordings.streams import ControlRows
 from knode_cosserat.recordings.virtual import (
     GRAM,
     Sensors,
@@ -17,7 +17,7 @@ from knode_cosserat.recordings.virtual import (
 
 def grams(signal, seconds=6.0):
     sent = commands(signal, seconds)
-    return sent.time, sent.tension / GRAM
+    return sent.time, sent.values / GRAM
 
 
 @pytest.mark.campaign
@@ -98,7 +98,7 @@ def test_other_signals_come_after_a_rest(tmp_path):
 
 
 def test_the_lag_is_a_first_order_lag():
-    sent = Tensions(np.array([0.0, 1.0]), np.array([[1.0] * 4, [2.0] * 4]))
+    sent = ControlRows(np.array([0.0, 1.0]), np.array([[1.0] * 4, [2.0] * 4]))
     time = np.arange(0.0, 2.0, 0.01)
     expected = np.where(time < 1.0, 1.0, 2.0 - np.exp(-(time - 1.0) / 0.06))
     np.testing.assert_allclose(lagged(sent, time, 0.06)[:, 0], expected, atol=1e-12)
@@ -114,7 +114,7 @@ def test_sensors_without_noise_tell_the_truth_but_for_axes_and_place(virtual):
     moved = poses["rib 4"].position - poses["rib 4"].position[0]
     tip = np.asarray(truth.tip_position)
     np.testing.assert_allclose(moved, tip - tip[0], atol=1e-12)
-    np.testing.assert_allclose(tension.tension[:50], 500.0 * GRAM, rtol=1e-12)
+    np.testing.assert_allclose(tension.values[:50], 500.0 * GRAM, rtol=1e-12)
     same, _ = simulated_sensors(truth, sent, 0, exact)
     np.testing.assert_array_equal(same["base"].position, poses["base"].position)
     other, _ = simulated_sensors(truth, sent, 1, exact)

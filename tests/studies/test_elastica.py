@@ -184,8 +184,8 @@ def test_a_recording_has_the_tension_of_the_end_of_a_row(rubbing):
     assert measured.simulated and measured.continuous
     assert measured.position.shape == (48, 4, 3) and measured.dt == 0.0125
     expected = apply_lag(found.commanded, measured.dt, 0.06, np.full(4, 2.0))
-    assert np.std(measured.tension - expected) < 0.06
-    assert_allclose(measured.initial_tension, 2.0, atol=0.05)
+    assert np.std(measured.control - expected) < 0.06
+    assert_allclose(measured.initial_control, 2.0, atol=0.05)
     assert np.std(measured.position[:15, -1], axis=0).max() < 3e-4
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 import knode_cosserat as kc
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.recordings import RecordingConfig
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.write import write_recording
 from knode_cosserat.rods.section import Sleeve
 from knode_cosserat.rods.tendons import TendonFriction
@@ -48,7 +48,7 @@ def recorded(path, tension, seed):
         )
     still = np.tile([0.0, 0.0, PAPER.base.height], (len(time), 1))
     poses["base"] = Body(time, still, np.tile([1.0, 0.0, 0.0, 0.0], (len(time), 1)))
-    pulled = Tensions(time[::2][: len(control[::2])], control[::2])
+    pulled = ControlRows(time[::2][: len(control[::2])], control[::2])
     write_recording(path, PAPER, poses, pulled, pulled)
 
 
@@ -91,8 +91,8 @@ def test_the_knowledge_alone(folder, tmp_path):
     # the figures are those of the plain way, by hand
     seen = kc.load_recording(folder / "sine_2p0.bag").sampled(0.05, 1.0, 4.0)
     robot = kc.load_robot("delrin-tendon-robot")
-    still = kc.equilibrium(robot, seen.initial_tension, space=study.SPACE)
-    moved = kc.simulate(robot, seen.tension[:-1], 0.05, initial=still, space=study.SPACE)
+    still = kc.equilibrium(robot, seen.initial_control, space=study.SPACE)
+    moved = kc.simulate(robot, seen.control[:-1], 0.05, initial=still, space=study.SPACE)
     off = np.asarray(moved.tip_position)[:60] - seen.tip_position[:60]
     assert cells[1]["tip_rmse"] == pytest.approx(np.sqrt(np.mean(np.sum(off**2, axis=1))), rel=1e-9)
     table = (tmp_path / "table2.md").read_text()

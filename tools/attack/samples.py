@@ -91,7 +91,7 @@ def _of_recordings() -> dict[str, Sample]:
         if path.suffix in (".bag", ".mcap", ".db3"):
             config = kc.recordings.RecordingConfig.load(path.with_suffix(".yaml"))
         found = kc.load_recording(path, config).sampled(DT)
-        return [found.time, found.position, found.quaternion, found.tension]
+        return [found.time, found.position, found.quaternion, found.control]
 
     names = ("table.csv", "table.parquet", "bag.bag", "bag.mcap", "bag.db3")
     return dict.fromkeys(names, Sample(write, read))

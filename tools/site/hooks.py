@@ -17,7 +17,7 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 import knode_cosserat as kc
-from tools.site import api, changelog, equations, examples, notebooks, robot_file, source
+from tools.site import api, changelog, equations, examples, notebooks, quantities, robot_file, source
 
 #: pages that others write: without them the site is whole
 OPTIONAL = ("viewer.md", "notebooks.md")
@@ -31,6 +31,7 @@ MADE = {
     "changelog": changelog.page,
     "examples": examples.page,
     "notebook": notebooks.page,
+    "quantities": quantities.page,
     "robot-file": robot_file.page,
 }
 

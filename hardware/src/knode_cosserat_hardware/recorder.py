@@ -14,11 +14,11 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.recordings.config import POSITION_UNITS, RecordingConfig
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.messages import encoder_of, message_type, typestore
 from knode_cosserat.recordings.streams import OutgoingStream
-from knode_cosserat.recordings.write import sent_tensions
+from knode_cosserat.recordings.write import sent_numbers
 from knode_cosserat_hardware.driver import Driver, HardwareError, HostClock, Reading
 from knode_cosserat_hardware.middleware.mocap import MotionCapture, PoseFrame
 
@@ -44,14 +44,15 @@ class MessageEncoder:
         config: topics, order and units of the messages.
 
     Raises:
-        RecordingError: the configuration has motors in place of tensions; from all methods: a wrong number of
-            tensions or bodies.
+        RecordingError: the configuration has other quantities than tensions; from all methods: a wrong number
+            of tensions or bodies.
         ImportError: rosbags is not installed.
     """
 
     def __init__(self, config: RecordingConfig):
-        if config.motors is not None:
-            raise RecordingError("motors cannot be recorded; required is a configuration with tensions")
+        others = [source.quantity for source in config.measured if source.quantity != "tension"]
+        if others:
+            raise RecordingError(f"{others[0]} cannot be recorded; required is a configuration with tensions")
         self.config = config
         #: names of the bodies, in the order of poses: the base, where there is one, then the markers
         self.bodies: tuple[str, ...] = tuple(marker.name for marker in config.markers)
@@ -61,7 +62,7 @@ class MessageEncoder:
         self._poses = [OutgoingStream(topic, "pose", [], np.zeros((0, 7))) for topic in topics]
         self._numbers = {
             role: OutgoingStream(source.topic, role, [], np.zeros((0, len(source.order))), source)  # type: ignore[arg-type]
-            for role, source in (("tension", config.tension), ("command", config.command))
+            for role, source in (("control", config.tension), ("command", config.command))
             if source is not None
         }
         streams = [*self._poses, *self._numbers.values()]
@@ -79,7 +80,7 @@ class MessageEncoder:
             position: positions (m), in the order of `bodies`.
             quaternion: orientations, scalar first.
         """
-        scale = POSITION_UNITS[self.config.position_unit]
+        scale = self.config.position_factor
         values = np.concatenate([np.asarray(position) / scale, np.asarray(quaternion)], axis=1)
         if values.shape != (len(self.bodies), 7):
             raise RecordingError(
@@ -93,7 +94,7 @@ class MessageEncoder:
 
         There is none if one is not finite, as without a measurement, or without a topic for tensions.
         """
-        return self._tensions("tension", stamp, tension) if np.all(np.isfinite(tension)) else []
+        return self._tensions("control", stamp, tension) if np.all(np.isfinite(tension)) else []
 
     def command(self, stamp: int, tension: Float[np.ndarray, " tendons"]) -> list[Encoded]:
         """Return the message of commanded tensions (N); none if the configuration has no topic for it.
@@ -121,7 +122,7 @@ class MessageEncoder:
             )
         if not np.all(np.isfinite(values)):
             raise RecordingError(f"topic {stream.topic}: tensions must be finite (got {values.tolist()})")
-        return [self._message(stream, stamp, sent_tensions(stream.source, values[None])[0])]
+        return [self._message(stream, stamp, sent_numbers(stream.source, values[None])[0])]
 
     def _message(self, stream: OutgoingStream, stamp: int, values: Any) -> Encoded:
         return Encoded(stream.topic, self._encode[stream.topic](stamp, 0, values))
@@ -249,7 +250,7 @@ class Recorder:
 
     Raises:
         HardwareError: the name is not allowed, or the file exists or cannot be created.
-        RecordingError: the configuration has motors in place of tensions.
+        RecordingError: the configuration has other quantities than tensions.
         ImportError: rosbags is not installed.
     """
 

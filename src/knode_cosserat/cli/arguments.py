@@ -354,7 +354,8 @@ def coarse_grid_in_output() -> Iterator[None]:
 def load_recordings(paths: Sequence[Path], config: Path | None, *, proposals: bool = True) -> list[Recording]:
     """Return the recordings in files, read by a configuration file if there is one.
 
-    With `proposals` an error about other columns or topics names the command that proposes a configuration.
+    `motors.csv+mocap.csv` is one recording in several files. With `proposals` an error about other columns or
+    topics names the command that proposes a configuration.
     """
     from knode_cosserat.recordings.config import RecordingConfig
     from knode_cosserat.recordings.findings import RecordingError
@@ -363,21 +364,30 @@ def load_recordings(paths: Sequence[Path], config: Path | None, *, proposals: bo
     meaning = None if config is None else RecordingConfig.load(config)
     recordings = []
     for path in paths:
-        if is_trajectory(str(path)):
-            raise ValueError(
-                f"{path}: this is a trajectory; allowed is a recording ({', '.join(RECORDINGS)}). "
-                f"To draw a trajectory, type: {command_line('plot', path, '--out', path.stem + '.png')}. "
-                f"To learn a model from it, type: {command_line('fit', 'ROBOT', path, '--out', 'model')}"
-            )
+        files = files_of(path)
+        for file in files:
+            if is_trajectory(str(file)):
+                raise ValueError(
+                    f"{file}: this is a trajectory; allowed is a recording ({', '.join(RECORDINGS)}). "
+                    f"To draw a trajectory, type: {command_line('plot', file, '--out', file.stem + '.png')}. "
+                    f"To learn a model from it, type: {command_line('fit', 'ROBOT', file, '--out', 'model')}"
+                )
         try:
-            recordings.append(load_recording(path, meaning))
+            recordings.append(load_recording(files if len(files) > 1 else files[0], meaning))
         except RecordingError as error:
             columns = config is None and ("the columns are" in str(error) or "is missing" in str(error))
             hint = "; or describe its own names in a YAML file with --config" + (
-                f" ({command_line('inspect', path)} proposes one)" if proposals else ""
+                f" ({command_line('inspect', *files)} proposes one)" if proposals else ""
             )
             raise ValueError(f"{error}{hint if columns else ''}") from None
     return recordings
+
+
+def files_of(path: Path) -> list[Path]:
+    """Return the files of a recording that is written as FILE+FILE; a file of this very name is one."""
+    if "+" not in str(path) or path.exists():
+        return [path]
+    return [Path(part) for part in str(path).split("+") if part]
 
 
 def shows_progress(progress: bool | None) -> bool:

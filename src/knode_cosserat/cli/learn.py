@@ -217,7 +217,13 @@ class _SearchOptions(NamedTuple):
 @app.command()
 def identify(
     nominal: Nominal,
-    recordings: Annotated[list[Path], argument("RECORDING", f"Recordings ({', '.join(read_suffixes())}).")],
+    recordings: Annotated[
+        list[Path],
+        argument(
+            "RECORDING",
+            f"Recordings ({', '.join(read_suffixes())}); motors.csv+mocap.csv is one in two files.",
+        ),
+    ],
     search: _SearchOptions,
     sampling: Sampling,
     report: Report,

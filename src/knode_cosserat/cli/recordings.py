@@ -14,6 +14,7 @@ from knode_cosserat.cli.arguments import (
     Picture,
     argument,
     figures,
+    files_of,
     load_recordings,
     option,
     require_trajectory_name,
@@ -31,10 +32,11 @@ if TYPE_CHECKING:
 @app.command()
 def inspect(
     recording: Annotated[
-        Path,
+        list[Path],
         argument(
             "RECORDING",
-            f"File or folder of one of these formats: {', '.join(kind.name for kind in formats())}.",
+            f"File or folder of one of these formats: {', '.join(kind.name for kind in formats())}. Several "
+            "files are one recording, each with its own clock.",
         ),
     ],
     config: Path | None = None,
@@ -43,9 +45,10 @@ def inspect(
 ) -> None:
     """Report the quality of a recording.
 
-    Sampling rates, gaps, swapped axes, noise, and the delay and error of measured tensions relative to
-    commands. Lists the defects found and their corrections. For a recording with other topics or columns
-    than those known, it proposes a configuration, and reads the recording with it.
+    Sampling rates, gaps, swapped axes, noise, and the delay and error of measured controls relative to
+    commands. Lists the defects found and their corrections, and the use of every column. For a recording
+    with other topics or columns than those known, it proposes a configuration, and reads the recording with
+    it. Offset and drift of the clocks of several files are found from the motion.
 
     Options:
         config (--config YAML): Meaning of the recording's topics or columns. Default: the paper's robot for
@@ -55,6 +58,7 @@ def inspect(
         inspect sine_1p0.bag
         inspect sine_1p0.bag --config my-robot.yaml --plot health.png
         inspect table.csv --json
+        inspect motors.csv mocap.csv
     """
     require_writable(figure=plot)
     drawing = figures() if plot else None
@@ -63,19 +67,26 @@ def inspect(
     if drawing:
         drawing.health(loaded).savefig(plot)
     written = {"plot": plot} if plot or as_json else {}
-    content = {"recording": str(recording), **report.to_dict()}
-    lines = _lines(report)
+    named = " + ".join(map(str, recording))
+    content = {"recording": named, **report.to_dict(), "columns": dict(loaded.uses)}
+    lines = [*_lines(report), "", *_uses(loaded)]
     if proposed:
         content["proposed_config"] = proposed
         lines += ["", "proposed configuration, for a file of --config:", "", *proposed.splitlines()]
     write_output(as_json, content, lines, **written)
 
 
-def _loaded(path: Path, config: Path | None) -> tuple[Recording, str]:
+def _loaded(paths: list[Path], config: Path | None) -> tuple[Recording, str]:
     """Return the recording, and the YAML text of a configuration if one is proposed; else empty text."""
     from knode_cosserat.recordings import load_recording, proposed_config
     from knode_cosserat.recordings.findings import RecordingError
 
+    paths = [file for path in paths for file in files_of(path)]
+    if len(paths) > 1:
+        proposed = None if config else proposed_config(paths)
+        loaded = load_recording(paths, config or proposed)
+        return loaded, loaded.config.to_yaml(brief=True) if proposed else ""
+    (path,) = paths
     try:
         (loaded,) = load_recordings([path], config, proposals=False)
         # exports of motion capture are read by a proposal, which states the axis that points up
@@ -91,6 +102,14 @@ def _loaded(path: Path, config: Path | None) -> tuple[Recording, str]:
     return loaded, loaded.config.to_yaml(brief=True) if is_proposal else ""
 
 
+def _uses(loaded: Recording) -> list[str]:
+    """Return lines on the use of each column or topic, those without any last."""
+    placed = {name: use for name, use in loaded.uses.items() if use}
+    others = [name for name in loaded.uses if name not in placed]
+    lines = table([["column or topic", "use"], *([name, use] for name, use in placed.items())])
+    return [*lines, *([f"not placed: {', '.join(others)}"] if others else [])]
+
+
 def _lines(report: Health) -> list[str]:
     simulated = {True: "yes", False: "no", None: "not stated"}[report.simulated]
     rest = "never at rest" if report.rest is None else "at rest from {:.2f} to {:.2f} s".format(*report.rest)
@@ -103,12 +122,15 @@ def _lines(report: Health) -> list[str]:
         it = report.latency
         lines += [
             "",
-            f"tensions follow commands: best shift {it.shift:.3f} s; or a delay of {it.delay:.3f} s and a "
+            f"controls follow commands: best shift {it.shift:.3f} s; or a delay of {it.delay:.3f} s and a "
             f"first-order lag of {it.lag:.3f} s",
         ]
-    if report.tension_errors:
-        rows = [["tendon", "measured minus commanded [N]", "root mean square [N]"]]
-        rows += [[str(it.tendon), f"{it.bias:+.3f}", f"{it.rms:.3f}"] for it in report.tension_errors]
+    if report.control_errors:
+        rows = [["control", "measured minus commanded", "root mean square"]]
+        rows += [
+            [it.control, f"{it.bias:+.3g} {it.unit}", f"{it.rms:.3g} {it.unit}"]
+            for it in report.control_errors
+        ]
         lines += ["", *table(rows)]
     findings = [str(finding) for finding in report.findings]
     return [*lines, "", *(findings or ["no defects found"])]
@@ -130,8 +152,9 @@ _TITLES = [
 
 
 def _row(stream: StreamHealth) -> list[str]:
-    factor, unit = (1.0, "N") if stream.what == "measured tensions" else (1e3, "mm")
-    noise = f"{_number_text(stream.noise, factor, '.3f')} {unit}"
+    is_body = stream.what != "commands" and not stream.what.startswith("measured ")
+    factor, unit = (1e3, "mm") if is_body else (1.0, stream.unit)
+    noise = f"{_number_text(stream.noise, factor, '.3f' if is_body else '.3g')} {unit}"
     return [
         stream.topic,
         stream.what,

@@ -245,14 +245,14 @@ class LoopLog:
         position = self.measured.reshape(rows, bodies, 3)
         return Measurements(
             time=self.time,
-            tension=self.control,
+            control=self.control,
             fractions=np.asarray(fractions, dtype=float),
             position=position,
             quaternion=np.full((rows, bodies, 4), np.nan),
             measured=np.isfinite(position).all(axis=-1),
             simulated=simulated,
             source="closed loop",
-            initial_tension=self.initial_control,
+            initial_control=self.initial_control,
         )
 
     def to_csv(self, path: str | Path) -> None:

@@ -10,6 +10,7 @@ from knode_cosserat._arguments import check_arguments
 from knode_cosserat.figures.drawing import AXES, Tips, draw_tips, legend_above, line, tips_of
 from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
 from knode_cosserat.metrics import dtw_distance, rms_distance
+from knode_cosserat.recordings.quantities import QUANTITIES, labels
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -27,7 +28,7 @@ _MARKS = (
 
 
 def health(recording: Recording) -> Figure:
-    """Return a figure of a recording and its quality: tensions, positions, missing frames and noise."""
+    """Return a figure of a recording and its quality: controls, positions, missing frames and noise."""
     check_arguments(health, locals())
     report = recording.health()
     robot = {True: "a simulated robot", False: "a physical robot", None: "not stated whether simulated"}
@@ -35,14 +36,14 @@ def health(recording: Recording) -> Figure:
         figure.suptitle(f"{recording.source}\n{report.duration:.2f} s, {robot[recording.simulated]}")
         left, right = figure.subfigures(1, 2, width_ratios=(2.3, 1.0))
         axes = left.subplots(5, 1, sharex=True, height_ratios=(1.3, 1.0, 1.0, 1.0, 0.9))
-        _draw_tensions(axes[0], recording)
+        _draw_controls(axes[0], recording)
         _draw_positions(axes[1:4], recording)
         _draw_frames(axes[4], recording)
         axes[4].set_xlabel("time [s]")
         left.align_ylabels(axes)
         axes[0].set_xlim(min(0.0, *(body.time[0] for body in recording.bodies)), _end(recording))
         above, below = right.subplots(2, 1)
-        _draw_noise(above, report)
+        _draw_noise(above, recording, report)
         _draw_errors(below, recording, report)
     return figure
 
@@ -91,35 +92,41 @@ def _end(recording: Recording) -> float:
     return float(max(body.time[-1] for body in recording.bodies))
 
 
-def _draw_tensions(axes: Any, recording: Recording) -> None:
-    """Draw measured tensions as lines and commanded ones as dotted steps."""
+def _draw_controls(axes: Any, recording: Recording) -> None:
+    """Draw measured controls as lines and commanded ones as dotted steps."""
     end = _end(recording)
+    stream = recording.control or recording.command
+    quantities = stream.quantities if stream else ()
+    names = [name.replace("_", " ") for name in labels(quantities)]
     if recording.command is not None:
         time = np.append(recording.command.time, max(end, recording.command.time[-1]))
-        for k, tension in enumerate(recording.command.tension.T):
+        for k, sent in enumerate(recording.command.values.T):
             axes.step(
                 time,
-                np.append(tension, tension[-1]),
+                np.append(sent, sent[-1]),
                 where="post",
                 linestyle=":",
                 linewidth=1.1,
                 color=PALETTE[k % len(PALETTE)],
                 label="commanded (dotted)" if k == 0 else None,
             )
-    if recording.tension is not None:
-        for k, tension in enumerate(recording.tension.tension.T):
+    if recording.control is not None:
+        for k, (name, values) in enumerate(zip(names, recording.control.values.T, strict=True)):
             axes.plot(
-                recording.tension.time,
-                tension,
+                recording.control.time,
+                values,
                 linewidth=1.0,
                 color=PALETTE[k % len(PALETTE)],
-                label=f"tendon {k + 1}",
+                label=name,
             )
-    axes.set_ylabel("tension [N]")
+    units = dict.fromkeys(f"{name} [{QUANTITIES[name].unit}]" for name, _ in quantities)
+    axes.set_ylabel(", ".join(units) or "no controls")
+    if not names:
+        return
     axes.legend(
         loc="lower center",
         bbox_to_anchor=(0.5, 1.0),
-        ncols=recording.tendons + 1,
+        ncols=len(names) + 1,
         columnspacing=1.2,
         handlelength=1.8,
     )
@@ -151,8 +158,8 @@ def _draw_frames(axes: Any, recording: Recording) -> None:
     from knode_cosserat.recordings.streams import period
 
     streams = [(body.name, body.topic, body.time) for body in (*recording.bodies, recording.base) if body]
-    if recording.tension is not None:
-        streams.append(("tensions", recording.tension.topic, recording.tension.time))
+    if recording.control is not None:
+        streams.append(("controls", recording.control.topic, recording.control.time))
     named: set[str] = set()
 
     def once(name: str) -> str | None:
@@ -182,9 +189,10 @@ def _draw_frames(axes: Any, recording: Recording) -> None:
         legend_above(axes)
 
 
-def _draw_noise(axes: Any, report: Health) -> None:
+def _draw_noise(axes: Any, recording: Recording, report: Health) -> None:
     """Draw the noise of positions and, on a second axis, of orientations."""
-    bodies = [stream for stream in report.streams if stream.what not in ("measured tensions", "commands")]
+    names = [body.name for body in (*recording.bodies, recording.base) if body]
+    bodies = [stream for stream in report.streams if stream.what in names]
     at = np.arange(len(bodies))
     axes.bar(at - 0.2, [1e3 * (each.noise or 0.0) for each in bodies], 0.38, color=PALETTE[0])
     axes.set_ylabel("noise of position [mm]", color=PALETTE[0])
@@ -199,19 +207,20 @@ def _draw_noise(axes: Any, report: Health) -> None:
 
 
 def _draw_errors(axes: Any, recording: Recording, report: Health) -> None:
-    """Draw RMS and bias of measured minus commanded tension by tendon, or a note without commands."""
-    if not report.tension_errors:
+    """Draw RMS and bias of measured minus commanded controls, or a note without commands."""
+    if not report.control_errors:
         axes.axis("off")
-        axes.text(0.5, 0.5, "no commands to compare\nmeasured tensions with", ha="center", va="center")
+        axes.text(0.5, 0.5, "no commands to compare\nmeasured controls with", ha="center", va="center")
         return
-    at = np.arange(len(report.tension_errors))
+    at = np.arange(len(report.control_errors))
     colours = [PALETTE[k % len(PALETTE)] for k in at]
-    axes.bar(at, [each.rms for each in report.tension_errors], 0.6, color=colours)
-    axes.plot(at, [each.bias for each in report.tension_errors], "kD", markersize=5)
+    axes.bar(at, [each.rms for each in report.control_errors], 0.6, color=colours)
+    axes.plot(at, [each.bias for each in report.control_errors], "kD", markersize=5)
     axes.axhline(0.0, color="#333333", linewidth=0.8)
-    axes.set_xticks(at, [str(each.tendon) for each in report.tension_errors])
-    axes.set(xlabel="tendon", ylabel="measured less commanded [N]")
+    axes.set_xticks(at, [each.control.replace("_", " ") for each in report.control_errors])
+    units = dict.fromkeys(each.unit for each in report.control_errors)
+    axes.set(ylabel=f"measured less commanded [{', '.join(units)}]")
     late = ""
     if report.latency is not None:
         late = f"\ncommands {1e3 * report.latency.shift:.0f} ms later; lag {1e3 * report.latency.lag:.0f} ms"
-    axes.set_title(f"tension error: RMS, and bias (diamonds){late}")
+    axes.set_title(f"error of controls: RMS, and bias (diamonds){late}")

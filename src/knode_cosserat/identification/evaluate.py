@@ -125,23 +125,24 @@ def predict(
 
     Args:
         robot: any robot or model.
-        measured: a recording (`Measurements.of`), or its rows; the tensions are known in all of them.
+        measured: a recording (`Measurements.of`), or its rows; the controls are known in all of them.
         space: the scheme along the rod.
         recovery: seconds that recovery from failed steps may take; None: the usual budget.
 
     Raises:
+        RecordingError: the recording has other controls than the robot.
         SimulationError: an equilibrium or a step has no solution.
     """
     check_arguments(predict, locals())
-    robot, measured = fix_grid(robot), Measurements.of(measured)
+    robot, measured = fix_grid(robot), Measurements.of(measured).controls_for(robot)
     initial: Any = "unstressed" if measured.unstressed else None
-    first = measured.tension[0] if measured.static else measured.initial_tension
+    first = measured.control[0] if measured.static else measured.initial_control
     if first is not None and not measured.unstressed:
         initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     if measured.static:
         return equilibria(
             robot,
-            measured.tension,
+            measured.control,
             space=space,
             initial=initial,
             recovery_budget=recovery,
@@ -149,10 +150,10 @@ def predict(
         )
     return simulated_rows(
         robot,
-        measured.tension[:-1],
+        measured.control[:-1],
         measured.dt,
         initial,
-        measured.initial_tension,
+        measured.initial_control,
         measured.continuous,
         space,
         recovery,

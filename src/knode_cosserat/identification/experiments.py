@@ -13,6 +13,7 @@ from jaxtyping import Float
 from knode_cosserat.estimation.outputs import BodyMotions, BodyPositions, Output, Several, States
 from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.steps import is_resolved, steps_per_row, time_scheme
+from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.aspects import Drawing
@@ -214,23 +215,22 @@ def of_measurements(
     robot = model.nominal
     if len(measured.time) < 3:
         raise DataError(f"{name}: {len(measured.time)} rows; at least 3 are needed")
-    if measured.tension.shape[1] != robot.control_layout.size:
-        raise DataError(
-            f"{name}: {measured.tension.shape[1]} tensions in a row; the robot has "
-            f"{robot.control_layout.size}"
-        )
+    try:
+        measured = measured.controls_for(robot)
+    except RecordingError as error:
+        raise DataError(str(error)) from None
     if measured.static:
         measured = _as_steps(measured)
-    if not np.all(np.isfinite(measured.tension[:-1])):
-        row = int(np.flatnonzero(~np.isfinite(measured.tension).all(axis=1))[0])
+    if not np.all(np.isfinite(measured.control[:-1])):
+        row = int(np.flatnonzero(~np.isfinite(measured.control).all(axis=1))[0])
         raise DataError(
-            f"{name}: no tension is known at {measured.time[row]:g} s; use the part before (`parts`)"
+            f"{name}: no control is known at {measured.time[row]:g} s; use the part before (`parts`)"
         )
     seen = [measured.position, measured.quaternion, *(it.values for it in measured.sensors)]
     if not any(np.any(np.isfinite(rows[1:])) for rows in seen):
         raise DataError(f"{name}: nothing was measured after the first row")
-    control = measured.tension[:-1]
-    held = np.asarray(control[0] if measured.initial_tension is None else measured.initial_tension)
+    control = measured.control[:-1]
+    held = np.asarray(control[0] if measured.initial_control is None else measured.initial_control)
     swing = np.max(np.abs(control - held), axis=1, initial=0.0)  # a robot may have no controls
     moving = np.flatnonzero(swing > 0.05 * max(np.max(swing), 1e-12))
     scheme = time_scheme(measured.dt, measured.continuous)
@@ -293,11 +293,11 @@ def _as_steps(measured: Measurements) -> Measurements:
 
     return dataclasses.replace(
         measured,
-        tension=np.concatenate([measured.tension, measured.tension[-1:]]),
+        control=np.concatenate([measured.control, measured.control[-1:]]),
         position=late(measured.position),
         quaternion=late(measured.quaternion),
         sensors=tuple(dataclasses.replace(it, values=late(it.values)) for it in measured.sensors),
-        initial_tension=measured.tension[0],
+        initial_control=measured.control[0],
     )
 
 
@@ -364,13 +364,13 @@ def poses_of_nodes(trajectory: Trajectory, name: str) -> Measurements:
     nodes, seen = position.shape[1], np.ones((len(position), position.shape[1] - 1), dtype=bool)
     return Measurements(
         time=np.asarray(trajectory.time),
-        tension=held,
+        control=held,
         fractions=np.arange(1, nodes) / (nodes - 1),
         position=position[:, 1:],
         quaternion=quaternion[:, 1:],
         measured=seen,
         simulated=True,
         source=name,
-        initial_tension=control[0],
+        initial_control=control[0],
         unstressed=begins_unstressed(trajectory),
     )

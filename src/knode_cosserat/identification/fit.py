@@ -165,7 +165,7 @@ def with_residual(
     measured = measured_rows(recordings)
     if len(measured) < 2:
         raise DataError("there is one recording; a residual needs two at least, for one is left out in turn")
-    tension = np.concatenate([it.tension for it in measured])
+    tension = np.concatenate([it.control for it in measured])
     model = library_model(nominal, tension, measured[0].fractions)  # type: ignore[arg-type]
     x = coordinates_of(model, identified)
     effects = (*identified.effects, *identified.undecided)
@@ -218,7 +218,7 @@ def _named(system: System, config: FitConfig, facts: dict[str, Any]) -> KNODE:
 def _with_network(knowledge: System, poses: _Poses, config: FitConfig, tell: Tell) -> Any:
     """Return the knowledge with a passive network, searched from zero over horizons that grow."""
     require_allowed(knowledge, config)
-    tension = np.concatenate([it.tension for it in poses.measured])
+    tension = np.concatenate([it.control for it in poses.measured])
     options = config.residual
     assert isinstance(options, PassiveOptions)
     model = residual_model(

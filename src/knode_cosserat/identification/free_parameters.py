@@ -141,7 +141,7 @@ def _require_start(search: ParameterSearch, x: np.ndarray) -> None:
             raise DataError(
                 f"{data.name}: row 0 is {1e3 * away:.3g} mm from the equilibrium under "
                 f"{np.round(data.held, 4).tolist()}; allowed is data that start at rest. Use the rows "
-                "after the robot has settled, state initial_tension, give full states, or correct what is "
+                "after the robot has settled, state initial_control, give full states, or correct what is "
                 "not identified, such as the length"
             )
 

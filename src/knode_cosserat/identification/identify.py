@@ -109,7 +109,7 @@ def identify(
             experiments = experiments_of(rows, model, space)
         else:
             model = library_model(
-                robot, np.concatenate([it.tension for it in rows]), rows[0].fractions, plain
+                robot, np.concatenate([it.control for it in rows]), rows[0].fractions, plain
             )
             experiments = [it.rough() for it in experiments_of(rows, model, space)]
         return ParameterSearch(Misfit(model, experiments), journal)

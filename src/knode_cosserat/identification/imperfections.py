@@ -89,6 +89,6 @@ def nominal_robot() -> TendonRod:
 
 def drawn_robot(seed: int) -> Imperfect:
     """Return the virtual robot of a seed: the paper's robot with random imperfections."""
-    tension = np.concatenate([commands(signal, END).tension for signal in TRAINING.values()])
+    tension = np.concatenate([commands(signal, END).values for signal in TRAINING.values()])
     bodies = [marker.fraction for marker in RecordingConfig.paper_robot().markers]
     return imperfect_robot(nominal_robot(), tension, seed, bodies)

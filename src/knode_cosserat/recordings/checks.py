@@ -14,17 +14,16 @@ from scipy.spatial.transform import Rotation
 
 from knode_cosserat.estimation.outputs import BaseWrench, BendingAngles, Curvatures, Orientations, Output
 from knode_cosserat.recordings.config import (
-    POSITION_UNITS,
     SENSOR_UNITS,
-    MotorSource,
+    ControlSource,
     RecordingConfig,
     SensorSource,
-    TensionSource,
 )
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
 from knode_cosserat.recordings.frame import NORMAL, rotation_steps
+from knode_cosserat.recordings.quantities import QUANTITIES
 from knode_cosserat.recordings.recording import bridge, continuous
-from knode_cosserat.recordings.streams import SLOW, Body, Rows, Sensor, Tensions, period
+from knode_cosserat.recordings.streams import SLOW, Body, ControlRows, Rows, Sensor, merged, period
 
 #: allowed numbers in a row of a sensor, by its kind; of curvatures two for each place
 SENSOR_COUNTS = {"orientation": (4, 3), "bending_angle": (2,), "base_wrench": (6,)}
@@ -35,10 +34,10 @@ LONGEST_SPIKE = 0.04
 #: smallest number of frames of a body
 FEWEST_FRAMES = 2
 #: plausible range of a tendon robot's tensions (N)
-SLACK, STRONG = 0.12, 120.0
+SLACK, STRONG = QUANTITIES["tension"].low, QUANTITIES["tension"].high
 #: plausible range of a rod's length (m)
 SHORT, LONG = 0.02, 20.0
-#: largest plausible ratio of measured to commanded tensions, or the inverse
+#: largest plausible ratio of measured to commanded controls, or the inverse
 FACTOR = 20.0
 #: largest share of rows with implausible tensions; more of them are no accidents
 RARE = 0.05
@@ -50,8 +49,8 @@ class Sensed(NamedTuple):
     bodies: list[Body]
     base: Body | None
     sensors: list[Sensor]
-    tension: Tensions | None
-    command: Tensions | None
+    control: ControlRows | None
+    command: ControlRows | None
 
 
 def cleaned(config: RecordingConfig, rows: Mapping[str, Rows]) -> Sensed:
@@ -59,16 +58,21 @@ def cleaned(config: RecordingConfig, rows: Mapping[str, Rows]) -> Sensed:
 
     Raises:
         RecordingError: a body or sensor has fewer than two usable rows, rows have another count of numbers
-            than the configuration, or required tensions have no usable row.
+            than the configuration, or required controls have no usable row.
     """
     bodies = [_body(config, it.name, it.fraction, rows[it.topic]) for it in config.markers]
     base = _body(config, "base", math.nan, rows[config.base.topic]) if config.base else None
     sensors = [_sensor(config, source, rows[source.topic]) for source in config.sensors]
-    tension, command = (
-        _tensions(config, source, rows[source.topic], kind) if source and source.topic in rows else None
-        for source, kind in ((config.measured, "measured"), (config.command, "commanded"))
-    )
-    return Sensed(bodies, base, sensors, tension, command)
+    there = [source for source in config.measured if source.topic in rows]
+    measured = [_controls(config, source, rows[source.topic], "measured") for source in there]
+    known = [stream for stream in measured if stream is not None]
+    is_whole = bool(known) and len(known) == len(config.measured)
+    control = merged(known, config.measured) if is_whole else None
+    sent = config.command
+    command = None
+    if sent is not None and sent.topic in rows:
+        command = _controls(config, sent, rows[sent.topic], "commanded")
+    return Sensed(bodies, base, sensors, control, command)
 
 
 def _drop(rows: Rows, wrong: Bool[np.ndarray, " n"], words: tuple[str, str, str], severity: Severity) -> None:
@@ -129,7 +133,7 @@ def _body(config: RecordingConfig, name: str, fraction: float, rows: Rows) -> Bo
         # as many rows as can be bridged, but not most of the filter's window
         usual = float(np.median(np.diff(rows.time))) or 1.0
         longest = int(np.clip(config.longest_gap / usual, 1, 4))
-        floor = SMALLEST_SHIFT / POSITION_UNITS[config.position_unit]
+        floor = SMALLEST_SHIFT / config.position_factor
         wrong = outliers(np.diff(rows.values[:, :3], axis=0), rows.time, floor=floor, longest=longest)
         if is_oriented:
             turns = rotation_steps(rows.values[:, 3:])
@@ -194,41 +198,44 @@ def _sensor(config: RecordingConfig, source: SensorSource, rows: Rows) -> Sensor
     return Sensor(rows.time, values, output, rows.topic)
 
 
-# tensions
+# controls
 
 
-def _tensions(
-    config: RecordingConfig, source: TensionSource | MotorSource, rows: Rows, kind: str
-) -> Tensions | None:
-    """Return measured or commanded tensions (N, tendon 1 first); None without usable rows.
+def _controls(config: RecordingConfig, source: ControlSource, rows: Rows, kind: str) -> ControlRows | None:
+    """Return measured or commanded numbers in SI units, number 1 first; None without usable rows.
+
+    Measured ones are at the times at which they act.
 
     Raises:
-        RecordingError: messages have another number of tendons, or tensions that are required have no usable
-            row.
+        RecordingError: messages have another count of numbers, or required numbers have no usable row.
     """
+    plural = source.kind.plural
     if len(rows.time):
-        _mend_tensions(source, rows, is_sample=kind == "measured" and not source.held)
+        _mend_controls(source, rows, is_sample=kind == "measured" and not source.held)
     else:
-        rows.findings.append(Finding("warning", source.topic, f"there are no {kind} tensions"))
+        rows.findings.append(Finding("warning", source.topic, f"there are no {kind} {plural}"))
     if not len(rows.time):
-        if config.tensions == kind:
-            raise RecordingError(f"topic {source.topic}: no usable {kind} tension")
+        if config.controls == kind:
+            raise RecordingError(f"topic {source.topic}: no usable {kind} {source.kind.name}")
         return None
+    time = rows.time
     if kind == "measured":
         _add_pauses(rows, config.longest_gap)
-    return Tensions(rows.time, rows.values, source.topic)
+        time = time + source.latency
+    return ControlRows(time, rows.values, source.topic, ((source.kind.name, len(source.order)),))
 
 
-def _mend_tensions(source: TensionSource | MotorSource, rows: Rows, *, is_sample: bool) -> None:
-    """Bring tensions to N in the order of the tendons, and remove errors; samples also lose spikes."""
+def _mend_controls(source: ControlSource, rows: Rows, *, is_sample: bool) -> None:
+    """Bring numbers to SI units in order, and remove errors; samples of tensions also lose spikes."""
+    name, plural = source.kind.name, source.kind.plural
     if rows.values.shape[1] != len(source.order):
         raise RecordingError(
-            f"topic {source.topic}: a message has {rows.values.shape[1]} tensions; "
-            f"the configuration's order has {len(source.order)} tendons"
+            f"topic {source.topic}: a message has {rows.values.shape[1]} {plural}; "
+            f"the configuration's order has {len(source.order)} numbers"
         )
     rows.values = rows.values[:, np.argsort(source.order)] * source.factor
-    _drop_unusable(rows, np.zeros(len(rows.time), dtype=bool), ("tension is", "tensions are", "not finite"))
-    if not source.is_force:
+    _drop_unusable(rows, np.zeros(len(rows.time), dtype=bool), (f"{name} is", f"{plural} are", "not finite"))
+    if not source.kind.pulls:
         return
     wrong = implausible_tensions(rows.values)
     if wrong.any():
@@ -356,20 +363,19 @@ def implausible_sizes(
     Times of equilibria are arbitrary.
     """
     findings, sizes = list[Finding](), []
-    for stream, source in ((sensed.tension, config.measured), (sensed.command, config.command)):
-        if stream is None or source is None or not source.is_force:
-            continue
-        size = float(np.median(np.abs(stream.tension)))
-        sizes.append(size)
-        if 0.0 < size < SLACK or size > STRONG:
-            hint = "newtons read as grams-force" if size < SLACK else "grams-force read as newtons"
-            what = f"tensions of {size:.3g} N are not plausible: are {hint}?"
-            findings.append(Finding("problem", stream.topic, what))
-        elif stream is sensed.tension and np.median(stream.tension.min(axis=1)) < -SLACK:
-            findings.append(Finding("warning", stream.topic, "tensions are below zero: is the sign right?"))
-    if len(sizes) == 2 and min(sizes) > 0.0 and max(sizes) > FACTOR * min(sizes):
+    sources = {source.topic: source for source in (*config.measured, *filter(None, (config.command,)))}
+    for stream in _single(sensed.control, config), _single(sensed.command, config):
+        for topic, values in stream.items():
+            source = sources[topic]
+            findings += _implausible_controls(source, values, is_command=source is config.command)
+        known = np.concatenate([np.abs(values).ravel() for values in stream.values()] or [np.zeros(0)])
+        if known.any() and len(stream) == 1:
+            sizes.append(float(np.median(known[known > 0.0])))
+    if len(sizes) == 2 and max(sizes) > FACTOR * min(sizes):
+        kind = config.measured[0].kind
         what = (
-            f"measured tensions are {sizes[0]:.3g} N and commanded ones {sizes[1]:.3g} N: not the same unit?"
+            f"measured {kind.plural} are {sizes[0]:.3g} {kind.unit} and commanded ones {sizes[1]:.3g} "
+            f"{kind.unit}: not the same unit?"
         )
         findings.append(Finding("problem", "", what))
     if not sensed.bodies:
@@ -390,6 +396,37 @@ def implausible_sizes(
         )
         findings.append(Finding("problem", "", what))
     return findings
+
+
+def _single(stream: ControlRows | None, config: RecordingConfig) -> dict[str, Float[np.ndarray, "n c"]]:
+    """Return the values of each source of a stream, by topic."""
+    if stream is None:
+        return {}
+    if config.command is not None and stream.topic == config.command.topic:
+        return {stream.topic: stream.values}
+    ends = np.cumsum([len(source.order) for source in config.measured])[:-1]
+    parts = np.split(stream.values, ends, axis=1)
+    return {source.topic: part for source, part in zip(config.measured, parts, strict=True)}
+
+
+def _implausible_controls(
+    source: ControlSource, values: Float[np.ndarray, "n c"], *, is_command: bool
+) -> list[Finding]:
+    """Return findings on numbers of a size that their quantity does not have, or of the wrong sign."""
+    kind, known = source.kind, np.abs(values[np.isfinite(values) & (values != 0.0)])
+    if not len(known):
+        return []
+    size = float(np.median(known))
+    if not kind.low <= size <= kind.high:
+        stated = QUANTITIES[source.quantity].units
+        raw = size / stated[source.unit or kind.unit]
+        likely = [unit for unit, factor in stated.items() if kind.low <= raw * factor <= kind.high]
+        hint = f"are {likely[0]} read as {source.unit}?" if likely else "is the column the right one?"
+        what = f"{kind.plural} of {size:.3g} {kind.unit} are not plausible: {hint}"
+        return [Finding("problem", source.topic, what)]
+    if kind.pulls and not is_command and np.median(values.min(axis=1)) < -kind.low:
+        return [Finding("warning", source.topic, f"{kind.plural} are below zero: is the sign right?")]
+    return []
 
 
 def implausible_tensions(newtons: Float[np.ndarray, "n tendons"]) -> Bool[np.ndarray, " n"]:

@@ -7,18 +7,22 @@
     markers:
       - {name: tip, topic: /mocap/tip/pose, fraction: 1}
 
-The same settings serve bags and tables. In a table, a topic is the prefix of the columns' titles: the topic
-`tip` has the columns `tip_x [m]`, `tip_y [m]`, `tip_z [m]` and, for its orientation, `tip_qw` to `tip_qz`.
-The topic `tension` has `tension_1 [N]`, `tension_2 [N]` and so on. A robot with motor-driven tendons has
-`motors` in place of `tension`: the measured motor angles. `table` gives the column titles of other
+What drives the robot stands under the name of its quantity (`quantities`): tension, length, angle, current,
+pressure, volume, insertion, rotation, field or input; several of them, if several drive it. The same settings
+serve bags and tables. In a table, a topic is the prefix of the columns' titles: the topic `tip` has the
+columns `tip_x [m]`, `tip_y [m]`, `tip_z [m]` and, for its orientation, `tip_qw` to `tip_qz`. The topic
+`tension` has `tension_1 [N]`, `tension_2 [N]` and so on. `table` gives the column titles of other
 conventions, and the rate of a table without a time column. `columns` names the columns one by one:
 
     format: 1
-    columns: {time: Time (ms), tensions: [T1, T2, T3], tip: [X, Y, Z]}
+    columns: {time: stamp_ms, pressure: ["P_A [mbar]", "P_B [mbar]"], tip: [X (mm), Y (mm), Z (mm)]}
 
-All keys but time, time_unit, tensions, commands and motors are bodies: titles of the position, or of
-position and orientation (scalar first). Markers, tensions and commands that have only to be named follow from
-the columns; several bodies need their fractions in `markers`.
+All keys but time, time_unit, command and quantities are bodies: titles of the position, or of position and
+orientation (scalar first). Units that are not stated are those of the titles. Markers and sources that have
+only to be named follow from the columns; several bodies need their fractions in `markers`.
+
+A recording may be in several files, each with its own clock: `files` states the offset and the drift of a
+file's clock, which are estimated otherwise (`clocks`), and the title of its times.
 """
 
 from __future__ import annotations
@@ -27,6 +31,7 @@ import dataclasses
 import functools
 import itertools
 import math
+from collections.abc import Collection
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, Self
 
@@ -54,20 +59,16 @@ from knode_cosserat._settings import (
     parts,
     plain,
 )
-from knode_cosserat.controls import TENSION_UNITS
 from knode_cosserat.recordings.findings import RecordingError
+from knode_cosserat.recordings.quantities import QUANTITIES, UNITS, Quantity, of_unit, stated_unit
 
 Vector = tuple[float, ...]
 FORMAT = 1
 #: placeholder of the numbers in a command's text, or of the number or topic in a title
 PLACE = "{}"
 #: conversion factors to SI units
-POSITION_UNITS = {"m": 1.0, "mm": 1e-3}
+POSITION_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
 TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
-#: units of the pressures of chambers, in place of tensions, with factors to Pa
-PRESSURE_UNITS = {"Pa": 1.0, "kPa": 1e3, "bar": 1e5}
-#: units of motors: angles to rad, or wound-up lengths to m
-MOTOR_UNITS = {"rad": 1.0, "deg": math.pi / 180.0, "m": 1.0, "mm": 1e-3}
 #: kinds of sensors beside motion capture: their units with factors to SI units, the default first
 SENSOR_UNITS: dict[str, dict[str, float]] = {
     "orientation": {"rad": 1.0, "deg": math.pi / 180.0},
@@ -84,10 +85,6 @@ UP: dict[str, Vector] = {
     "-y": (-math.pi / 2, 0.0, 0.0),
     "-x": (0.0, math.pi / 2, 0.0),
 }
-#: topics of the sources that a map of columns stands for
-MAPPED = {"tensions": "tension", "commands": "command", "motors": "motor"}
-
-
 # rules of settings
 
 
@@ -128,7 +125,7 @@ def _order(value: Any) -> tuple[int, ...] | None:
 
 
 ORDER = Rule(
-    "the tendons 1, 2, 3, … in the order of the wire",
+    "the numbers 1, 2, 3, … in the order of the wire",
     _order,
     {"type": "array", "items": {"type": "integer", "minimum": 1}},
 )
@@ -256,27 +253,53 @@ class BaseSource(_RecordingSettings):
     height: Annotated[float, number(-10.0, 10.0, "m")] = 0.0
 
 
-class _NumbersSource(_RecordingSettings):
-    """Source with a topic, the order of its numbers, and names."""
+@dataclasses.dataclass(frozen=True)
+class ControlSource(_RecordingSettings):
+    """Measured or commanded numbers that drive the robot, of one quantity.
 
-    topic: str
-    order: tuple[int, ...]
-    names: tuple[str, ...] | None
-    unit: str
-    gain: float | None
-    held: bool | None = None
+    Attributes:
+        topic: topic of the numbers. With `{}` in it each number has its own topic: the place stands for
+            `names`, or without names for 1, 2, 3, …
+        order: number, such as the tendon, of each value in a message; they count from 1. Empty: that of
+            `names`.
+        unit: unit of the quantity, such as mbar; None: the one that titles of columns state, or the SI unit.
+        held: True if a value acts unchanged until the next one, as commands do; otherwise it is a sample at
+            that instant, and values are interpolated linearly.
+        names: names in the messages (joints of a JointState), or in the topics, of each number in `order`;
+            None: joints whose names end in numbers are matched by these. Lengths and angles in a JointState
+            are its positions, other quantities its efforts.
+        gain: factor from a message's numbers to this unit, such as 360 / 4096 degrees for a motor's ticks.
+            Currents with a gain are tensions, in N for each A; a rough one will do where gains of load cells
+            are identified. Negative if numbers pull below zero.
+        latency: delay from a stamp until the value acts on the robot (s): of commands, or of the clock of
+            motors against that of motion capture.
+        text: of commands: template of text messages, with `{}` in place of the numbers (other lines of a log
+            are not commands); None for messages of numbers.
+    """
+
+    topic: Annotated[str, LINE]
+    order: Annotated[tuple[int, ...], ORDER] = ()
+    unit: Annotated[str | None, choice(UNITS)] = None
+    held: Annotated[bool | None, FLAG] = None
+    names: Annotated[tuple[str, ...] | None, NAMES] = None
+    gain: Annotated[float | None, number(-1e9, 1e9)] = None
+    latency: Annotated[float, number(-10.0, 10.0, "s")] = 0.0
+    text: Annotated[str | None, TEMPLATE._replace(words=f"text with one {PLACE} where the numbers stand")] = (
+        None
+    )
+    #: name of the quantity, which the configuration states by the key
+    quantity: str = dataclasses.field(default="tension", compare=False)
 
     @property
     def factor(self) -> float:
-        """Tension (N), pressure (Pa), angle (rad) or length (m) over the numbers of the messages."""
-        return {**TENSION_UNITS, **PRESSURE_UNITS, **MOTOR_UNITS}[self.unit] * (
-            1.0 if self.gain is None else self.gain
-        )
+        """Number in the SI unit over the number of the messages."""
+        return UNITS[self.unit or self.kind.unit][0] * (1.0 if self.gain is None else self.gain)
 
     @property
-    def is_force(self) -> bool:
-        """True for tensions (N), and False for pressures and for motors."""
-        return self.unit in TENSION_UNITS
+    def kind(self) -> Quantity:
+        """Quantity of the numbers in the SI unit: currents with a gain are tensions."""
+        is_pull = self.quantity == "current" and self.gain is not None
+        return QUANTITIES["tension" if is_pull else self.quantity]
 
     def __post_init__(self) -> None:
         if self.names is not None:
@@ -296,74 +319,34 @@ class _NumbersSource(_RecordingSettings):
         if self.topic.count(PLACE) > 1:
             raise self.refusal("topic", self.topic, f"one {PLACE} at most")
 
+    def to_dict(self) -> dict[str, Any]:
+        """Return the source as plain values, without a latency of zero."""
+        values = super().to_dict()
+        return values if self.latency else {name: it for name, it in values.items() if name != "latency"}
 
-@dataclasses.dataclass(frozen=True)
-class TensionSource(_NumbersSource):
-    """Measured tensions.
+    def of_quantity(self, name: str, titles: Collection[str] = ()) -> Self:
+        """Return the source as that of a quantity, whose unit may be stated by titles.
 
-    Attributes:
-        topic: topic of the tensions. With `{}` in it each tendon has its own topic: the place stands for the
-            tendons' names, or without names for 1, 2, 3, …
-        order: tendon of each number in a message; tendons count from 1. Empty: that of `names`.
-        unit: "N" or "gf" (grams-force); "Pa", "kPa" or "bar" for pressures of chambers, which are then in Pa.
-        gain: factor from a message's numbers to this unit, such as the tension of a motor current of 1 A; a
-            rough one will do where gains of load cells are identified. Negative if numbers pull below zero.
-        held: True if a tension acts unchanged until the next one, as commands do; otherwise it is a sample
-            at that instant, and tensions are interpolated linearly.
-        names: names in the messages (joints of a JointState), or in the topics, of each number in `order`;
-            None: joints whose names end in numbers are matched by these.
-    """
-
-    topic: Annotated[str, LINE]
-    order: Annotated[tuple[int, ...], ORDER] = ()
-    unit: Annotated[Literal["N", "gf", "Pa", "kPa", "bar"], choice({**TENSION_UNITS, **PRESSURE_UNITS})] = "N"
-    held: Annotated[bool | None, FLAG] = None
-    names: Annotated[tuple[str, ...] | None, NAMES] = None
-    gain: Annotated[float | None, number(-1e6, 1e6)] = None
-
-
-@dataclasses.dataclass(frozen=True)
-class CommandSource(TensionSource):
-    """Commanded tensions, each held until the next.
-
-    Attributes:
-        text: template of text messages, with `{}` in place of the numbers (other lines of a log are not
-            commands); None for messages of numbers.
-        latency: delay from a command's stamp until it reaches the tendons (s).
-    """
-
-    text: Annotated[str | None, TEMPLATE._replace(words=f"text with one {PLACE} where the numbers stand")] = (
-        None
-    )
-    latency: Annotated[float, number(0.0, 10.0, "s")] = 0.0
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.held is False:
-            raise RecordingError("held is false; allowed of a command is true: it is held until the next")
+        Raises:
+            RecordingError: the unit is not one of the quantity, or titles state several.
+        """
+        units, unit = QUANTITIES[name].units, self.unit
+        stated = {stated for title in titles if (stated := stated_unit(title, units))}
+        if unit is None and len(stated) > 1:
+            raise RecordingError(
+                f"{name}: the titles are in {' and '.join(sorted(stated))}; required is one unit, or "
+                f"`unit` in {name}"
+            )
+        unit = unit or next(iter(stated), QUANTITIES[name].unit)
+        if unit not in units:
+            other = next(quantity.name for quantity in QUANTITIES.values() if unit in quantity.units)
+            words = f"{' or '.join(units)}. Did you mean the key {other}, in place of {name}?"
+            raise self.refusal(f"{name}: unit", unit, words)
+        return dataclasses.replace(self, unit=unit, quantity=name)
 
 
-@dataclasses.dataclass(frozen=True)
-class MotorSource(_NumbersSource):
-    """Measured angles of motors that wind up tendons, or the wound-up lengths.
-
-    Attributes:
-        topic: topic of the angles or lengths.
-        order: motor of each number in a message; motors count from 1.
-        unit: "rad" or "deg" for angles; "m" or "mm" for lengths.
-        gain: factor from a message's numbers to this unit, such as 360 / 4096 degrees for a motor's ticks.
-        latency: delay from an angle's stamp until it acts on the robot (s): the offset between the clocks
-            of motors and motion capture.
-        names: names of the motors in messages or topics, as in `TensionSource`. Angles in a JointState are
-            its positions.
-    """
-
-    topic: Annotated[str, LINE]
-    order: Annotated[tuple[int, ...], ORDER] = ()
-    unit: Annotated[Literal["rad", "deg", "m", "mm"], choice(MOTOR_UNITS)] = "rad"
-    latency: Annotated[float, number(-10.0, 10.0, "s")] = 0.0
-    names: Annotated[tuple[str, ...] | None, NAMES] = None
-    gain: Annotated[float | None, number(-1e6, 1e6)] = None
+#: sources that drive the robot, one for each quantity
+Drive = Annotated[ControlSource | None, part(ControlSource)]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -374,13 +357,13 @@ class TableSource(_RecordingSettings):
         rate: rows per second (Hz), for a table without a time column; None: the column `time [s]` is used.
         position: titles of a body's position, with `{}` in place of its topic.
         quaternion: titles of its orientation, scalar first; a body without these columns has no orientation.
-        motor: title of a motor's angle, or of a tension, with `{}` in place of its number.
+        control: title of a number that drives the robot, with `{}` in place of its number.
     """
 
     rate: Annotated[float | None, number(1e-6, 1e6, "Hz")] = None
     position: Annotated[tuple[str, ...] | None, _templates(3)] = None
     quaternion: Annotated[tuple[str, ...] | None, _templates(4)] = None
-    motor: Annotated[str | None, TEMPLATE] = None
+    control: Annotated[str | None, TEMPLATE] = None
 
 
 def _title(value: Any) -> str | None:
@@ -390,6 +373,10 @@ def _title(value: Any) -> str | None:
 BODY_TITLES = _titles(3, 7)
 
 
+#: key of commands, beside the quantities
+COMMAND = "command"
+
+
 @dataclasses.dataclass(frozen=True)
 class ColumnMap(_RecordingSettings):
     """Titles of a table's columns, one by one. In a table without titles they are the numbers from 1 on.
@@ -397,46 +384,79 @@ class ColumnMap(_RecordingSettings):
     Attributes:
         bodies: body's name (the marker's topic, or the base's) and the titles of its position, or of its
             position and orientation (scalar first), for each body.
+        controls: quantity, or "command", and the titles of its numbers, in the order of the source's `order`.
         time: title of the time; None: `time [s]`, or the `rate` of `TableSource`.
         time_unit: "s", "ms", "us" or "ns"; None: the unit that the title states, such as `t (ms)`, or s.
-        tensions: titles of measured tensions, in the order of the source's `order`.
-        commands: titles of commanded tensions.
-        motors: titles of motors' angles.
     """
 
     bodies: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    controls: tuple[tuple[str, tuple[str, ...]], ...] = ()
     time: Annotated[str | None, LINE._replace(read=_title, schema={"type": ["string", "integer"]})] = None
     time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, choice(TIME_UNITS)] = None
-    tensions: Annotated[tuple[str, ...] | None, _titles()] = None
-    commands: Annotated[tuple[str, ...] | None, _titles()] = None
-    motors: Annotated[tuple[str, ...] | None, _titles()] = None
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        bodies = (
-            (self.accepted("body", name, LINE), self.accepted(str(name), titles, BODY_TITLES))
-            for name, titles in self.bodies
-        )
-        object.__setattr__(self, "bodies", tuple(bodies))
+        for name in ("bodies", "controls"):
+            rule = BODY_TITLES if name == "bodies" else _titles()
+            kept = tuple(
+                (self.accepted(name, key, LINE), self._accepted_titles(str(key), titles, rule))
+                for key, titles in getattr(self, name)
+            )
+            object.__setattr__(self, name, kept)
+
+    @classmethod
+    def _accepted_titles(cls, key: str, titles: Any, rule: Rule) -> Any:
+        try:
+            return cls.accepted(key, titles, rule)
+        except RecordingError as error:
+            # the key of a quantity that is misspelt is taken for a body
+            raise RecordingError(f"{error}{did_you_mean(key, [*QUANTITIES, COMMAND])}") from None
 
     @classmethod
     def from_dict(cls, values: dict[Any, Any]) -> Self:
         """Return a map from a mapping, whose other keys are names of bodies. Raises `RecordingError`."""
-        named = {field.name for field in dataclasses.fields(cls)} - {"bodies"}
-        bodies = tuple((key, titles) for key, titles in values.items() if key not in named)
-        return cls(bodies, **{key: value for key, value in values.items() if key in named})
+        named = {"time", "time_unit"}
+        driven = tuple((key, titles) for key, titles in values.items() if key in (*QUANTITIES, COMMAND))
+        others = named | {key for key, _ in driven}
+        bodies = tuple((key, titles) for key, titles in values.items() if key not in others)
+        return cls(bodies, driven, **{key: value for key, value in values.items() if key in named})
 
     def to_dict(self) -> dict[str, Any]:
         """Return the map as plain values."""
         values = super().to_dict()
-        return values | dict(values.pop("bodies"))
+        bodies, controls = values.pop("bodies"), values.pop("controls")
+        return values | dict(controls) | dict(bodies)
 
     @classmethod
     def json_schema(cls) -> dict[str, Any]:
         """Return the JSON Schema of a map, whose other keys are names of bodies."""
         schema = super().json_schema()
-        del schema["properties"]["bodies"]
+        del schema["properties"]["bodies"], schema["properties"]["controls"]
+        schema["properties"] |= dict.fromkeys((*QUANTITIES, COMMAND), _titles().schema)
         return schema | {"additionalProperties": BODY_TITLES.schema}
+
+
+@dataclasses.dataclass(frozen=True)
+class FileSource(_RecordingSettings):
+    """File of a recording in several files, and its clock.
+
+    Attributes:
+        name: name of the file, without its folder.
+        offset: seconds that are added to this file's times, at its first row, so that they are those of the
+            first file's clock; None: estimated.
+        drift: by how much this file's clock is faster than the first one's (ppm, 1e-6); None: estimated with
+            the offset, or zero beside a stated offset.
+        time: title of its times; None: that of `columns`.
+        time_unit: "s", "ms", "us" or "ns"; None: the unit that the title states, or s.
+        rate: rows per second (Hz), for a table without times.
+    """
+
+    name: Annotated[str, LINE]
+    offset: Annotated[float | None, number(-1e10, 1e10, "s")] = None
+    drift: Annotated[float | None, number(-1e4, 1e4, "ppm")] = None
+    time: Annotated[str | None, LINE._replace(read=_title, schema={"type": ["string", "integer"]})] = None
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, choice(TIME_UNITS)] = None
+    rate: Annotated[float | None, number(1e-6, 1e6, "Hz")] = None
 
 
 # configuration
@@ -451,23 +471,24 @@ class RecordingConfig(_RecordingSettings):
     Attributes:
         markers: bodies on the rod, from base to tip: name, topic, fraction of the length, its deviation,
             rotation.
-        tension: measured tensions, or None: topic, order of the tendons, unit (N or gf), held, names.
-        motors: measured motor angles in place of tensions, or None: topic, order, unit, latency (s), names.
-        command: commanded tensions, or None: as `tension`, with text and latency (s).
+        tension, length, angle, current, pressure, volume, insertion, rotation, field, input: measured numbers
+            that drive the robot, or None: topic, order, unit, held, names, gain, latency (s).
+        command: commanded numbers, or None: the same, with text. They are of the measured quantity, or of the
+            first one that has their unit.
         sensors: sensors beside motion capture: kind, columns or topic, fractions, unit, rotation.
         base: body that locates the clamped end, or None (`origin` locates it): topic, height above it (m).
-        tensions: default choice of the tensions that drive the robot, "measured" or "commanded"; "none" for
+        controls: default choice of the numbers that drive the robot, "measured" or "commanded"; "none" for
             a recording of poses only.
-        position_unit: "m" or "mm".
+        position_unit: "m", "cm" or "mm"; None: the units that titles of columns state, or m.
         up: axis of motion capture's frame that points up: "z", "y", "x", "-x", "-y" or "-z". Poses are turned
-            so that z points up before `rotation` applies. None: the file's own, or z.
+            so that z points up before `frame_rotation` applies. None: the file's own, or z.
         origin: position of the clamped end (m), used without a base; in the turned frame, that is, with
-            `up` and `rotation` applied.
-        rotation: rotation from motion capture's frame (with z up) to the robot's frame, whose z points up
-            the straight rod; a quaternion, scalar first.
+            `up` and `frame_rotation` applied.
+        frame_rotation: rotation from motion capture's frame (with z up) to the robot's frame, whose z points
+            up the straight rod; a quaternion, scalar first.
         clock: "header": measurement times from the messages' headers; "received": recording times.
         table: titles of a table's columns, or None (this package's convention): rate of rows without times
-            (Hz), position, quaternion, motor, with `{}` in place of a topic or number.
+            (Hz), position, quaternion, control, with `{}` in place of a topic or number.
         columns: titles of a table's columns, one by one; they take precedence over `table`.
         static: True if each row is a separate equilibrium, not part of a motion.
         repeats: "drop": a frame that repeats the previous pose exactly is not a measurement, because some
@@ -475,7 +496,8 @@ class RecordingConfig(_RecordingSettings):
         longest_gap: longest gap between frames that is bridged (s); 1.5 periods of a stream always are.
         rest: interval in which the robot rests, straight up (s); None: detected from the motion.
         trim: interval of the recording that is used (s); None: no limit at that end.
-        initial_tension: tensions (N) before the first row, tendon 1 first; None: estimated from the rest.
+        initial_control: controls before the first row (SI units); None: estimated from the rest.
+        files: files of a recording in several files, and their clocks: name, offset (s), drift (1e-6), time.
         simulated: True if the robot was itself a simulation; None: not stated.
         description: one-line description of the recording.
         remarks: remarks on the guesses of a proposal: comments in its file, and not read from there.
@@ -485,20 +507,28 @@ class RecordingConfig(_RecordingSettings):
     """
 
     markers: Annotated[tuple[MarkerSource, ...], parts(MarkerSource, "a list of markers")] = ()
-    tension: Annotated[TensionSource | None, part(TensionSource)] = None
-    motors: Annotated[MotorSource | None, part(MotorSource)] = None
-    command: Annotated[CommandSource | None, part(CommandSource)] = None
+    tension: Drive = None
+    length: Drive = None
+    angle: Drive = None
+    current: Drive = None
+    pressure: Drive = None
+    volume: Drive = None
+    insertion: Drive = None
+    rotation: Drive = None
+    field: Drive = None
+    input: Drive = None
+    command: Drive = None
     sensors: Annotated[tuple[SensorSource, ...], parts(SensorSource, "a list of sensors")] = ()
     base: Annotated[BaseSource | None, part(BaseSource)] = None
     table: Annotated[TableSource | None, part(TableSource)] = None
     columns: Annotated[ColumnMap | None, part(ColumnMap)] = None
-    tensions: Annotated[
+    controls: Annotated[
         Literal["measured", "commanded", "none"], choice(("measured", "commanded", "none"))
     ] = "measured"
-    position_unit: Annotated[Literal["m", "mm"], choice(POSITION_UNITS)] = "m"
+    position_unit: Annotated[Literal["m", "cm", "mm"] | None, choice(POSITION_UNITS)] = None
     up: Annotated[str | None, choice(UP)] = None
     origin: Annotated[Vector, numbers(3, "three numbers (m)")] = (0.0, 0.0, 0.0)
-    rotation: Annotated[Vector, QUATERNION] = (1.0, 0.0, 0.0, 0.0)
+    frame_rotation: Annotated[Vector, QUATERNION] = (1.0, 0.0, 0.0, 0.0)
     clock: Annotated[Literal["header", "received"], choice(("header", "received"))] = "header"
     static: Annotated[bool, FLAG] = False
     repeats: Annotated[Literal["keep", "drop"], choice(("keep", "drop"))] = "keep"
@@ -507,7 +537,8 @@ class RecordingConfig(_RecordingSettings):
     trim: Annotated[tuple[float | None, float | None], _interval(is_open=True)] = (None, None)
     simulated: Annotated[bool | None, FLAG] = None
     description: Annotated[str, TEXT] = ""
-    initial_tension: Annotated[Vector | None, numbers(None, "numbers (N), one of each tendon")] = None
+    initial_control: Annotated[Vector | None, numbers(None, "numbers (SI units), one of each control")] = None
+    files: Annotated[tuple[FileSource, ...], parts(FileSource, "a list of files")] = ()
     remarks: tuple[str, ...] = dataclasses.field(default=(), compare=False)
 
     def __post_init__(self) -> None:
@@ -521,26 +552,30 @@ class RecordingConfig(_RecordingSettings):
             )
         if len(set(names)) < len(names):
             raise RecordingError(f"markers have the names {excerpt(names)}; allowed is each once")
-        if self.tension and self.motors:
-            raise RecordingError("tension and motors are both there; allowed is one of them")
-        if self.measured is None and self.tensions == "measured":
+        mapped = dict(self.columns.controls) if self.columns else {}
+        for name in QUANTITIES:
+            if (source := getattr(self, name)) is not None:
+                if source.text is not None:
+                    raise RecordingError(f"{name}: text is of commands; allowed is none")
+                object.__setattr__(self, name, source.of_quantity(name, mapped.get(name, ())))
+        if self.command is not None:
+            object.__setattr__(self, "command", self._commands(mapped.get(COMMAND, ())))
+        if not self.measured and self.controls == "measured":
             raise RecordingError(
-                "tension is missing; required where tensions is measured, or motors (a recording of poses "
-                "only has `tensions: none`)"
+                "tension is missing; required where controls is measured, or another of "
+                f"{', '.join(QUANTITIES)} (a recording of poses only has `controls: none`)"
             )
-        if self.command is None and self.tensions == "commanded":
-            raise RecordingError("command is missing; required where tensions is commanded")
-        if self.motors and self.command:
-            raise RecordingError("motors and command are both there; allowed is one of them")
-        if self.tension and self.command and len(self.tension.order) != len(self.command.order):
+        if self.command is None and self.controls == "commanded":
+            raise RecordingError("command is missing; required where controls is commanded")
+        if self.measured and self.command and self.count != len(self.command.order):
             raise RecordingError(
-                f"order has {len(self.tension.order)} tendons in tension and {len(self.command.order)} in "
-                "command; allowed is the same number"
+                f"order has {self.count} numbers in {' and '.join(it.quantity for it in self.measured)} and "
+                f"{len(self.command.order)} in command; allowed is the same number"
             )
-        if self.initial_tension is not None:
-            words = f"{self.tendons} numbers (N), one of each tendon"
-            self.accept("initial_tension", numbers(self.tendons, words))
-        sources = (*self.markers, *self.sensors, self.base, self.measured, self.command)
+        if self.initial_control is not None:
+            words = f"{self.count} numbers (SI units), one of each control"
+            self.accept("initial_control", numbers(self.count, words))
+        sources = (*self.markers, *self.sensors, self.base, *self.measured, self.command)
         topics = [source.topic for source in sources if source]
         repeated = next((topic for topic in topics if topics.count(topic) > 1), None)
         if repeated is not None:
@@ -553,16 +588,44 @@ class RecordingConfig(_RecordingSettings):
                     f"{', '.join(known)}{did_you_mean(name, known)}"
                 )
 
-    @property
-    def measured(self) -> TensionSource | MotorSource | None:
-        """Measured tensions, or angles of motors."""
-        return self.tension or self.motors
+        names = [file.name for file in self.files]
+        if len(set(names)) < len(names):
+            raise RecordingError(f"files have the names {excerpt(names)}; allowed is each once")
+
+    def _commands(self, titles: Collection[str]) -> ControlSource:
+        """Return the commands as those of a quantity. Raises `RecordingError`."""
+        source = self.command
+        assert source is not None
+        if source.held is False:
+            raise RecordingError(
+                "command: held is false; allowed of a command is true: it is held until the next"
+            )
+        unit = source.unit or next(filter(None, (stated_unit(title, UNITS) for title in titles)), None)
+        kinds = {it.kind.name for it in self.measured}
+        name = kinds.pop() if len(kinds) == 1 else of_unit(UNITS[unit][1]).name if unit else "tension"
+        return source.of_quantity(name, titles)
 
     @property
-    def tendons(self) -> int:
-        """Number of tendons or motors."""
-        source = self.measured or self.command
-        return len(source.order) if source else 0
+    def measured(self) -> tuple[ControlSource, ...]:
+        """Measured sources that drive the robot, in the order of `QUANTITIES`."""
+        return tuple(source for name in QUANTITIES if (source := getattr(self, name)) is not None)
+
+    @property
+    def idle(self) -> tuple[ControlSource, ...]:
+        """Sources that do not drive the robot by default: they may be missing."""
+        sent = (self.command,) if self.command else ()
+        return {"measured": sent, "commanded": self.measured, "none": (*self.measured, *sent)}[self.controls]
+
+    @property
+    def position_factor(self) -> float:
+        """Metres over the unit of the streams' positions."""
+        return POSITION_UNITS[self.position_unit or "m"]
+
+    @property
+    def count(self) -> int:
+        """Number of controls."""
+        sources = self.measured or ((self.command,) if self.command else ())
+        return sum(len(source.order) for source in sources)
 
     @classmethod
     def paper_robot(cls) -> Self:
@@ -571,7 +634,7 @@ class RecordingConfig(_RecordingSettings):
 
     @classmethod
     def asl_trunk(cls) -> Self:
-        """Return the configuration of the ASL trunk (Stanford): six motor angles, three disks, 100 Hz."""
+        """Return the configuration of the ASL trunk (Stanford): six angles of motors, three disks, 100 Hz."""
         return cls._included("asl_trunk.yaml")
 
     @classmethod
@@ -604,7 +667,7 @@ class RecordingConfig(_RecordingSettings):
         defaults = {field.name: plain(field.default) for field in dataclasses.fields(self)}
         lines = [*(f"# {remark}" for remark in self.remarks), f"format: {FORMAT}"]
         for name, value in self.to_dict().items():
-            if name in ("markers", "sensors"):
+            if name in ("markers", "sensors", "files"):
                 lines += [f"{name}:", *(f"  - {flow(source)}" for source in value)] if value else []
             elif name == "columns":
                 lines += ["columns:", *(f"  {flow(key)}: {flow(titles)}" for key, titles in value.items())]
@@ -634,27 +697,29 @@ class RecordingConfig(_RecordingSettings):
         """Return the JSON Schema of a file of settings, for editors."""
         schema = super().json_schema()
         schema["properties"]["format"] = {"const": FORMAT}
-        for source in ("base", "tension", "command", "motors"):
+        for name in ("base", COMMAND, *QUANTITIES):
             # a map of columns names their topics
-            schema["properties"][source]["anyOf"][0]["required"] = []
+            source = {**schema["properties"][name]["anyOf"][0], "required": []}
+            if name in QUANTITIES:
+                units = {"unit": {"enum": [*QUANTITIES[name].units, None]}}
+                source["properties"] = source["properties"] | units
+            schema["properties"][name] = {"anyOf": [source, {"type": "null"}]}
         return {"$schema": "https://json-schema.org/draft/2020-12/schema", "title": "recording", **schema}
 
 
 def _with_mapped_sources(values: dict[Any, Any]) -> dict[Any, Any]:
     """Return settings with the sources that follow from their map of columns. Raises `RecordingError`."""
     if not isinstance(values["columns"], dict):
-        words = "a mapping with time, tensions and the names of bodies"
+        words = "a mapping with time, quantities such as tension, and the names of bodies"
         raise RecordingConfig.refusal("columns", values["columns"], words)
     columns = RecordingConfig.accepted("columns", values["columns"], part(ColumnMap))
     values = {**values, "columns": columns}
-    for name, source in (("tensions", "tension"), ("commands", "command"), ("motors", "motors")):
-        titles, stated = getattr(columns, name), values.get(source) or {}
-        if titles is not None and isinstance(stated, dict):
-            values[source] = {"topic": MAPPED[name], "order": list(range(1, len(titles) + 1))} | stated
-    if columns.commands and not columns.tensions and not columns.motors:
-        values.setdefault("tensions", "commanded")
-    if not any(values.get(source) for source in ("tension", "command", "motors")):
-        values.setdefault("tensions", "none")
+    for name, titles in columns.controls:
+        stated = values.get(name) or {}
+        if isinstance(stated, dict):
+            values[name] = {"topic": name, "order": list(range(1, len(titles) + 1))} | stated
+    if not any(values.get(name) for name in QUANTITIES):
+        values.setdefault("controls", "commanded" if values.get(COMMAND) else "none")
     base = values.get("base")
     if isinstance(base, dict) or (base is None and "base" in dict(columns.bodies)):
         values["base"] = {"topic": "base"} | (base or {})

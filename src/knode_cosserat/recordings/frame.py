@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy.spatial.transform import Rotation
 
-from knode_cosserat.recordings.config import POSITION_UNITS, UP, RecordingConfig
+from knode_cosserat.recordings.config import UP, RecordingConfig
 from knode_cosserat.recordings.findings import Finding
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ def in_robot_frame(
     if not sensed.bodies:
         return sensed, rest
     upright = Rotation.from_rotvec(UP[config.up or "z"])
-    turn = Rotation.from_quat(config.rotation, scalar_first=True) * upright
-    scale = POSITION_UNITS[config.position_unit]
+    turn = Rotation.from_quat(config.frame_rotation, scalar_first=True) * upright
+    scale = config.position_factor
     bodies = [_turned(body, turn, scale) for body in sensed.bodies]
     base, origin = sensed.base, np.array(config.origin)
     if base is not None and config.base is not None:
@@ -91,7 +91,8 @@ def in_robot_frame(
         base = dataclasses.replace(base, position=base.position - origin)
     bodies = [dataclasses.replace(body, position=body.position - origin) for body in bodies]
     rest = rest or rest_of(bodies)
-    findings += _judged(bodies, rest)
+    if rest is not None or (not config.static and any(body.quaternion is not None for body in bodies)):
+        findings += _judged(bodies, rest)
     placed = []
     directions = _frames_at_rest(bodies, rest)
     for recorded, body, marker, at_rest in zip(
@@ -200,7 +201,7 @@ def _judged(bodies: Sequence[Body], rest: tuple[float, float] | None) -> list[Fi
     angle = f"at rest the last body is {np.degrees(leans):.0f} degrees from the axis of the clamped end"
     if leans > BACK or (straight and leans > ASKEW):
         why = "and the others as well" if straight else "and so points back"
-        what = f"{angle}, {why}: is `rotation`, `origin` or the base in the configuration right?"
+        what = f"{angle}, {why}: is `frame_rotation`, `origin` or the base in the configuration right?"
         findings.append(Finding("problem", bodies[-1].topic, what))
     elif leans > LEANING:
         what = (
@@ -294,3 +295,14 @@ def rotation_steps(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "m
     """Return the rotation vectors from row to row (rad)."""
     rotation = Rotation.from_quat(quaternion, scalar_first=True)
     return (rotation[:-1].inv() * rotation[1:]).as_rotvec()
+
+
+def steps_are_smooth(position: Float[np.ndarray, "n 3"]) -> bool:
+    """True if positions follow each other smoothly, as those of a sampled motion, and not in any order.
+
+    Second differences of independent rows are larger than the first by √3, those of a motion far smaller.
+    """
+    known = position[np.isfinite(position).all(axis=1)]
+    steps = np.diff(known, axis=0)
+    turns = np.diff(steps, axis=0)
+    return len(turns) > 0 and float(np.mean(turns**2)) < float(np.mean(steps**2))

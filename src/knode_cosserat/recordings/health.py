@@ -1,4 +1,4 @@
-"""Quality report of a recording: rates, gaps, noise, latency and errors of the tensions."""
+"""Quality report of a recording: rates, gaps, noise, latency and errors of the controls."""
 
 from __future__ import annotations
 
@@ -12,13 +12,14 @@ from jaxtyping import Float
 
 from knode_cosserat.recordings.findings import Finding
 from knode_cosserat.recordings.frame import NORMAL, rest_mask, rest_positions, rod_lengths, rotation_steps
-from knode_cosserat.recordings.streams import period
+from knode_cosserat.recordings.quantities import labels, unit_of
+from knode_cosserat.recordings.streams import SLOW, period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.recording import Recording
-    from knode_cosserat.recordings.streams import Body, Tensions
+    from knode_cosserat.recordings.streams import Body, ControlRows
 
-#: smallest standard deviation of commands for an estimate of their latency (N)
+#: smallest standard deviation of commanded tensions for an estimate of their latency (N)
 QUIET = 0.05
 #: range and resolution of the search for a latency (s)
 LONGEST_LATENCY, _FINE = 0.5, 0.002
@@ -34,7 +35,7 @@ class StreamHealth:
 
     Attributes:
         topic: name of the topic.
-        what: the body's name, or "measured tensions", or "commands".
+        what: the body's name, or "measured tensions" (or another quantity), or "commands".
         rows: number of usable rows.
         rate: usual rate of rows (Hz); None for commands, which are irregular.
         jitter: standard deviation of the time from row to row, without gaps (s); None for commands.
@@ -42,8 +43,9 @@ class StreamHealth:
         gaps: number of gaps; None for commands.
         longest_gap: longest time from row to row (s).
         delay: median delay from stamp to recording (s); None without stamps.
-        noise: standard deviation of a coordinate (m), or of a tension (N); None if it cannot be estimated.
+        noise: standard deviation of a coordinate (m), or of a control; None if it cannot be estimated.
         turn_noise: standard deviation of orientation about an axis (rad); None without orientations.
+        unit: SI unit of `noise`.
     """
 
     topic: str
@@ -57,11 +59,12 @@ class StreamHealth:
     delay: float | None
     noise: float | None
     turn_noise: float | None
+    unit: str = "m"
 
 
 @dataclasses.dataclass(frozen=True)
 class _Latency:
-    """Latency of tensions after commands (s): the best shift, or dead time and time constant of a lag."""
+    """Latency of controls after commands (s): the best shift, or dead time and time constant of a lag."""
 
     shift: float
     delay: float
@@ -74,12 +77,13 @@ class _Latency:
 
 
 @dataclasses.dataclass(frozen=True)
-class _TensionError:
-    """Measured minus commanded tension of one tendon (N), with commands delayed by their latency."""
+class _ControlError:
+    """Measured minus commanded number of one control (SI unit), with commands delayed by their latency."""
 
-    tendon: int
+    control: str
     bias: float
     rms: float
+    unit: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,8 +98,8 @@ class Health:
         rod_length: estimates (m) from each body away from the clamped end, at rest; none from bodies that
             lean by more than 10 degrees, and none without a rest.
         streams: quality of each topic.
-        latency: latency of tensions after commands, or None if it cannot be estimated.
-        tension_errors: errors of each tendon; empty without both tensions.
+        latency: latency of controls after commands, or None if it cannot be estimated.
+        control_errors: errors of each control; empty without measured and commanded ones.
         findings: errors and repairs, the gravest first.
     """
 
@@ -106,7 +110,7 @@ class Health:
     rod_length: tuple[float, ...]
     streams: tuple[StreamHealth, ...]
     latency: _Latency | None
-    tension_errors: tuple[_TensionError, ...]
+    control_errors: tuple[_ControlError, ...]
     findings: tuple[Finding, ...]
 
     def to_dict(self) -> dict[str, Any]:
@@ -118,9 +122,14 @@ def health_of(recording: Recording) -> Health:
     """Return the quality report of a recording."""
     streams = [_of_body(body, recording) for body in (*recording.bodies, recording.base) if body is not None]
     streams += [_stream(it.topic, it.output.fields[0], it.time, recording) for it in recording.sensors]
-    if (tension := recording.tension) is not None:
-        noise = _noise(tension.time, tension.tension, recording.rest)
-        streams.append(_stream(tension.topic, "measured tensions", tension.time, recording, noise=noise))
+    if (control := recording.control) is not None:
+        for k, source in enumerate(recording.config.measured):
+            before = sum(len(each.order) for each in recording.config.measured[:k])
+            values = control.values[:, before : before + len(source.order)]
+            noise, what = _noise(control.time, values, recording.rest), f"measured {source.kind.plural}"
+            streams.append(
+                _stream(source.topic, what, control.time, recording, noise=noise, unit=source.kind.unit)
+            )
     if recording.command is not None:
         none = {"rate": None, "jitter": None, "missing": None, "gaps": None}
         streams.append(
@@ -137,7 +146,7 @@ def health_of(recording: Recording) -> Health:
         rod_length=lengths,
         streams=tuple(streams),
         latency=latency,
-        tension_errors=_tension_errors(recording, latency),
+        control_errors=_control_errors(recording, latency),
         findings=(*recording.findings, *_about_latency(recording, latency)),
     )
 
@@ -184,6 +193,9 @@ def _noise(
     time: Float[np.ndarray, " n"], values: Float[np.ndarray, "n size"], rest: tuple[float, float] | None
 ) -> float | None:
     """Return the noise's standard deviation from third differences, at rest if possible; None if unknown."""
+    # equilibria are not smooth in time
+    if period(time) > 0.95 * SLOW:
+        return None
     still = values[rest_mask(time, rest)]
     known = still if len(still) >= _ENOUGH else values
     if len(known) < _ENOUGH:
@@ -192,24 +204,25 @@ def _noise(
     return float(NORMAL * np.median(np.abs(np.diff(known, 3, axis=0))) / np.sqrt(20.0))
 
 
-# tensions and commands
+# controls and commands
 
 
 def latency_of(recording: Recording) -> _Latency | None:
-    """Return the latency of measured tensions after commands; None without both, or if they hardly change."""
-    tension, command = recording.tension, recording.command
-    if tension is None or command is None or len(tension.time) < _ENOUGH:
+    """Return the latency of measured controls after commands; None without both, or if they hardly change."""
+    control, command = recording.control, recording.command
+    if control is None or command is None or len(control.time) < _ENOUGH:
         return None
-    if np.max(np.std(command.tension, axis=0)) < QUIET:
+    quiet = QUIET if command.quantities[:1] and command.quantities[0][0] == "tension" else 0.0
+    if np.max(np.std(command.values, axis=0)) <= quiet:
         return None
-    fine = np.arange(tension.time[0], tension.time[-1] + _FINE, _FINE)
+    fine = np.arange(control.time[0], control.time[-1] + _FINE, _FINE)
     if len(fine) > 1_000_000:
         return None
 
     def missed(delay: float, lag: float) -> float:
         expected = _followed(command, fine, delay, lag)
-        seen = expected[np.clip(np.searchsorted(fine, tension.time - 1e-9), 0, len(fine) - 1)]
-        error = tension.tension - seen
+        seen = expected[np.clip(np.searchsorted(fine, control.time - 1e-9), 0, len(fine) - 1)]
+        error = control.values - seen
         return float(np.sqrt(np.mean((error - error.mean(axis=0)) ** 2)))
 
     shifts = np.arange(0.0, LONGEST_LATENCY, 5 * _FINE)
@@ -226,10 +239,10 @@ def latency_of(recording: Recording) -> _Latency | None:
     return _Latency(shift, round(float(delay), 4), round(float(lag), 4))
 
 
-def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, lag: float) -> np.ndarray:
+def _followed(command: ControlRows, time: Float[np.ndarray, " n"], delay: float, lag: float) -> np.ndarray:
     """Return commands, each held until the next, after a delay (s) and a first-order lag (s)."""
     last = np.searchsorted(command.time, time - delay + 1e-9, side="right") - 1
-    held = command.tension[np.maximum(last, 0)]
+    held = command.values[np.maximum(last, 0)]
     if lag < 1e-6:
         return held
     stays = np.exp(-_FINE / lag)
@@ -240,29 +253,31 @@ def _followed(command: Tensions, time: Float[np.ndarray, " n"], delay: float, la
     return np.asarray(filtered)
 
 
-def _tension_errors(recording: Recording, latency: _Latency | None) -> tuple[_TensionError, ...]:
-    tension, command = recording.tension, recording.command
-    if tension is None or command is None:
+def _control_errors(recording: Recording, latency: _Latency | None) -> tuple[_ControlError, ...]:
+    control, command = recording.control, recording.command
+    if control is None or command is None:
         return ()
     late = latency.shift if latency else recording.config.command.latency if recording.config.command else 0.0
-    known = tension.time - late >= command.time[0]
+    known = control.time - late >= command.time[0]
     if not known.any():
         return ()
-    last = np.searchsorted(command.time, tension.time[known] - late + 1e-9, side="right") - 1
-    error = tension.tension[known] - command.tension[np.maximum(last, 0)]
+    last = np.searchsorted(command.time, control.time[known] - late + 1e-9, side="right") - 1
+    error = control.values[known] - command.values[np.maximum(last, 0)]
     return tuple(
-        _TensionError(k + 1, float(column.mean()), float(np.sqrt(np.mean(column**2))))
-        for k, column in enumerate(error.T)
+        _ControlError(name, float(column.mean()), float(np.sqrt(np.mean(column**2))), unit_of(name))
+        for name, column in zip(labels(control.quantities), error.T, strict=True)
     )
 
 
 def _about_latency(recording: Recording, latency: _Latency | None) -> list[Finding]:
     if latency is None or recording.config.command is None:
         return []
-    stated = recording.config.command.latency
+    source = recording.config.command
+    stated = source.latency
     if abs(latency.total - stated) <= _OFF:
         return []
     what = (
-        f"tensions follow commands after {latency.total:.2f} s; the configuration's latency is {stated:g} s"
+        f"{source.kind.plural} follow commands after {latency.total:.2f} s; the configuration's latency is "
+        f"{stated:g} s"
     )
-    return [Finding("warning", recording.config.command.topic, what)]
+    return [Finding("warning", source.topic, what)]

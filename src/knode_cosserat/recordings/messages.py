@@ -1,11 +1,11 @@
-"""Messages of ROS 1 and 2, decoded to numbers and made from numbers: poses, tensions and commands.
+"""Messages of ROS 1 and 2, decoded to numbers and made from numbers: poses, controls and commands.
 
 Messages are decoded and encoded by rosbags with its own definitions. Definitions in a bag are not used,
 because rosbags turns definitions into Python code.
 
 A topic may name a part of its messages: `/poses[2]` is the third pose of a PoseArray, `/tf[tip]` the frame
-`tip` of transforms. In a topic of tensions, `{}` stands for the tendons' names or numbers, of which each has
-its own topic.
+`tip` of transforms. In a topic of controls, `{}` stands for their names or numbers, of which each has its own
+topic.
 """
 
 from __future__ import annotations
@@ -21,11 +21,12 @@ import numpy as np
 
 from knode_cosserat._files.limits import MORE
 from knode_cosserat._files.yaml_text import did_you_mean
-from knode_cosserat.recordings.config import PLACE, MotorSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.config import PLACE, ControlSource, RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.streams import OutgoingStream, Stream
+from knode_cosserat.rods.layout import MOVING
 
-Role = Literal["pose", "sensor", "tension", "command"]
+Role = Literal["pose", "sensor", "control", "command"]
 #: stamp and recording time (ns), and the numbers
 _Row = tuple[int, int, Any]
 
@@ -99,24 +100,55 @@ class Bag:
         is_simulated = any(SIMULATED.encode() in message for message in first)
         return config.replace(simulated=True) if config.simulated is None and is_simulated else config
 
-    def streams(self, config: RecordingConfig, findings: list[Finding]) -> dict[str, Stream]:
+    @property
+    def names(self) -> list[str]:
+        """Names of the topics."""
+        return sorted(self.topics)
+
+    def topics_there(self, config: RecordingConfig) -> list[str]:
+        """Return the topics of a configuration whose messages are all there."""
+        sources = roles_of(config)
+        return [source.topic for source in sources if set(topics_of(source)) <= set(self.topics)]
+
+    def uses(self, config: RecordingConfig) -> dict[str, str]:
+        """Return the use of each topic; empty text for those that are not read."""
+        uses = dict.fromkeys(self.names, "")
+        for source, role in roles_of(config).items():
+            word = {"control": getattr(source, "quantity", ""), "pose": getattr(source, "name", "base")}
+            for name in topics_of(source):
+                if name in uses:
+                    uses[name] = ", ".join(filter(None, (uses[name], word.get(role, role))))
+        return uses
+
+    def resets(self, config: RecordingConfig) -> list[float]:
+        """Return no times: the times of recording tell where stamps were set back."""
+        return []
+
+    def streams(
+        self, config: RecordingConfig, findings: list[Finding], topics: Collection[str] | None = None
+    ) -> dict[str, Stream]:
         """Return the messages of each source of a configuration, by topic, and add findings.
+
+        `topics` are those that are read; None: all of the configuration.
 
         Raises:
             RecordingError: a topic is missing, its messages are not of a type for their role, or have no such
                 part.
         """
-        unused = config.command if config.tensions == "measured" else config.measured
         streams: dict[str, Stream] = {}
         for source, role in roles_of(config).items():
+            if topics is not None and source.topic not in topics:
+                continue
             missing = [name for name in topics_of(source) if name not in self.topics]
             if not missing:
                 streams[source.topic] = decoded(self, source, role)
-            elif source is unused:
-                findings.append(Finding("note", missing[0], f"there is no such topic, and so no {role}s"))
+            elif source in config.idle:
+                what = f"{source.kind.plural}" if role == "control" else f"{role}s"
+                findings.append(Finding("note", missing[0], f"there is no such topic, and so no {what}"))
             else:
                 listed = ", ".join(sorted(self.topics)) or "none"
-                raise RecordingError(f"topic {missing[0]} ({role}) is missing; the bag has {listed}")
+                what = source.quantity if role == "control" else role
+                raise RecordingError(f"topic {missing[0]} ({what}) is missing; the bag has {listed}")
         if self.damage:
             received = np.concatenate([[0], *(stream.received for stream in streams.values())])[1:]
             duration = np.ptp(received) * 1e-9 if len(received) else 0.0
@@ -131,7 +163,7 @@ def roles_of(config: RecordingConfig) -> dict[Any, Role]:
     """Return the role of each source of a configuration."""
     roles: dict[Any, Role] = dict.fromkeys((*config.markers, config.base), "pose")
     roles |= dict.fromkeys(config.sensors, "sensor")
-    roles |= {config.measured: "tension", config.command: "command"}
+    roles |= {**dict.fromkeys(config.measured, "control"), config.command: "command"}
     return {source: role for source, role in roles.items() if source is not None}
 
 
@@ -178,6 +210,8 @@ NUMBERS: dict[str, Callable[[Any], Any]] = {
     "geometry_msgs/msg/WrenchStamped": lambda m: (math.hypot(*_xyz(m.wrench.force)),),
     "std_msgs/msg/Float64MultiArray": lambda m: m.data,
     "std_msgs/msg/Float32MultiArray": lambda m: m.data,
+    "sensor_msgs/msg/FluidPressure": lambda m: (m.fluid_pressure,),
+    "sensor_msgs/msg/MagneticField": lambda m: _xyz(m.magnetic_field),
     **{f"std_msgs/msg/{kind}": lambda m: (m.data,) for kind in ("Float64", "Float32", "Int16", "Int32")},
     JOINTS: lambda m: m.effort,
 }
@@ -221,7 +255,7 @@ def topic_and_part(name: str) -> tuple[str, str]:
 
 def topics_of(source: Any) -> list[str]:
     """Return the topics of a bag that a source of a configuration is read from."""
-    if isinstance(source, TensionSource | MotorSource) and PLACE in source.topic:
+    if isinstance(source, ControlSource) and PLACE in source.topic:
         words = source.names or [str(k + 1) for k in range(len(source.order))]
         return [source.topic.replace(PLACE, word) for word in words]
     return [topic_and_part(source.topic)[0]]
@@ -371,15 +405,15 @@ def _seen_from(parent: Stream, child: Stream) -> Stream:
 # numbers
 
 
-def _joints(topic: Topic, source: TensionSource | MotorSource) -> Stream:
-    """Return the efforts, or the angles of motors, of named joints, in the order of the source."""
-    _require_type(topic, (JOINTS,), "tension")
+def _joints(topic: Topic, source: ControlSource) -> Stream:
+    """Return the efforts of named joints, or positions for lengths and angles, in the order of the source."""
+    _require_type(topic, (JOINTS,), "control")
     rows: list[tuple[int, int, list[str], Any]] = []
     broken = 0
     for received, message in topic.messages():
         names = [] if message is None else list(message.name)
         values: Any = () if message is None else message.effort
-        if message is not None and isinstance(source, MotorSource):
+        if message is not None and source.kind.unit in MOVING:
             values = message.position
         if message is None or (names and len(names) != len(values)):
             broken += 1
@@ -389,20 +423,18 @@ def _joints(topic: Topic, source: TensionSource | MotorSource) -> Stream:
     chosen: list[_Row] = []
     for stamp, received, names, values in rows:
         by_name = dict(zip(names, values, strict=True)) if reference else {}
-        # messages about other joints only are not about tendons
+        # messages about other joints only are not about the robot
         if not reference or any(name in by_name for name in reference):
             chosen.append((stamp, received, [by_name.get(name, math.nan) for name in reference] or values))
     stream = _stream(topic.name, chosen, broken)
     return dataclasses.replace(stream, remarks=(Finding("note", topic.name, remark),) if remark else ())
 
 
-def joint_names(
-    source: TensionSource | MotorSource, seen: Sequence[list[str]], topic: str
-) -> tuple[list[str], str]:
+def joint_names(source: ControlSource, seen: Sequence[list[str]], topic: str) -> tuple[list[str], str]:
     """Return the joints in the order of the source's numbers, and a remark; no names if messages have none.
 
-    Numbers in the names (tendon_1, tendon_2, …) say which tendon a joint is. An order that differs from
-    the tendons' own says which tendon each joint of a message is; it must not contradict the names.
+    Numbers in the names (tendon_1, tendon_2, …) say which number a joint is. An order that differs from
+    1, 2, 3, … says which number each joint of a message is; it must not contradict the names.
     """
     if source.names:
         there = sorted({name for names in seen for name in names})
@@ -441,9 +473,9 @@ def joint_names(
 
 
 def _merged(topic: str, parts: Sequence[Stream], *, is_held: bool) -> Stream:
-    """Return one row of all tendons at each time of the topic with most messages.
+    """Return one row of all numbers at each time of the topic with most messages.
 
-    Tensions that are held have their last value there; others are interpolated linearly. A row beyond the
+    Numbers that are held have their last value there; others are interpolated linearly. A row beyond the
     first or last message of another topic is NaN.
     """
     stamped = all(np.all(part.stamped >= 0) for part in parts)
@@ -523,7 +555,7 @@ def message_type(stream: OutgoingStream, ros: int) -> str:
     if topic_and_part(stream.topic)[1] or PLACE in stream.topic:
         raise RecordingError(
             f"topic {stream.topic} cannot be written; allowed is one topic for each body, and one for all "
-            "tensions"
+            "controls"
         )
     size = np.shape(stream.values)[1]
     if stream.role == "pose":

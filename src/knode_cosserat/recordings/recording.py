@@ -18,7 +18,8 @@ from knode_cosserat._reprs import count_of, wrap_lines
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError
 from knode_cosserat.recordings.measurements import Measurements
-from knode_cosserat.recordings.streams import Body, Sensor, Tensions, period
+from knode_cosserat.recordings.quantities import counted_quantities
+from knode_cosserat.recordings.streams import Body, ControlRows, Sensor, period
 
 if TYPE_CHECKING:
     from knode_cosserat.recordings.health import Health
@@ -33,7 +34,7 @@ _SAME = 1e-6
 class Recording:
     """Recording of a robot, as read by `load_recording`.
 
-    Times are seconds from the first pose or tension. Positions are in the robot's frame: z up, origin at
+    Times are seconds from the first pose or control. Positions are in the robot's frame: z up, origin at
     the clamped end. Lost frames are absent; `sampled` bridges them.
 
     Attributes:
@@ -41,42 +42,44 @@ class Recording:
         config: configuration of its topics or columns.
         bodies: bodies on the rod, from base to tip.
         base: body that locates the clamped end, or None.
-        tension: measured tensions, or None.
-        command: commanded tensions, or None.
+        control: measured numbers that drive the robot, or None.
+        command: commanded ones, or None.
         rest: interval in which the robot rests (s), or None.
         simulated: True if the robot was itself a simulation; None: not stated.
         findings: errors and repairs, the gravest first.
         delays: median delay from stamp to recording (s) by topic; NaN without stamps.
         sensors: sensors beside motion capture.
+        uses: use of each column of a table, or topic of a bag; empty text: it is not read.
     """
 
     source: str
     config: RecordingConfig
     bodies: tuple[Body, ...]
     base: Body | None
-    tension: Tensions | None
-    command: Tensions | None
+    control: ControlRows | None
+    command: ControlRows | None
     rest: tuple[float, float] | None
     simulated: bool | None
     findings: tuple[Finding, ...]
     delays: Mapping[str, float]
     sensors: tuple[Sensor, ...] = ()
+    uses: Mapping[str, str] = dataclasses.field(default_factory=dict)
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
         bodies = ", ".join(f"{body.name} at {body.fraction:.4g}" for body in self.bodies) or "none"
         sensors = "".join(f"; {sensor.topic}" for sensor in self.sensors)
-        streams = [name for name in ("tension", "command") if getattr(self, name) is not None]
+        streams = [name for name in ("control", "command") if getattr(self, name) is not None]
         return wrap_lines(
-            f"Recording ({origin}): {self.end:.4g} s; {count_of(self.tendons, 'tendon')} "
+            f"Recording ({origin}): {self.end:.4g} s; {self._driven_by} "
             f"({', '.join(streams)}); bodies {bodies} of the length{sensors}; "
             f"{count_of(len(self.findings), 'finding')}; source: {self.source}"
         )
 
     @property
-    def tendons(self) -> int:
-        """Number of tendons."""
-        return self.config.tendons
+    def _driven_by(self) -> str:
+        stream = self.control or self.command
+        return counted_quantities(stream.quantities if stream else ())
 
     @property
     def _times(self) -> list[Float[np.ndarray, " n"]]:
@@ -85,30 +88,30 @@ class Recording:
 
     @property
     def end(self) -> float:
-        """End of the first stream to end (s): until then all poses and tensions are known."""
-        driver = self._driver(self.config.tensions)
+        """End of the first stream to end (s): until then all poses and controls are known."""
+        driver = self._driver(self.config.controls)
         ends = [time[-1] for time in self._times]
-        if driver is self.tension:
+        if driver is self.control:
             ends.append(driver.time[-1] + (period(driver.time) if self._is_held(driver) else 0.0))
         # a command holds until the next
         return float(min(ends))
 
-    def _is_held(self, driver: Tensions) -> bool:
-        """True if each tension acts unchanged until the next one."""
-        return driver is self.command or bool(self.config.tension and self.config.tension.held)
+    def _is_held(self, driver: ControlRows) -> bool:
+        """True if each value acts unchanged until the next one."""
+        return driver is self.command or all(source.held for source in self.config.measured)
 
     def sampled(
         self,
         dt: float = 0.05,
         start: float | None = None,
         end: float | None = None,
-        tensions: Literal["measured", "commanded", "none"] | None = None,
+        controls: Literal["measured", "commanded", "none"] | None = None,
         *,
         mean: bool = False,
     ) -> Measurements:
         """Return the measurements at the times `start`, `start + dt` and so on, up to `end` (s).
 
-        Tensions are the last ones at or before a row's time (zero-order hold); commands and motor angles are
+        Controls are the last ones at or before a row's time (zero-order hold); commands and measured ones are
         delayed by their latency. Positions are interpolated by cubic splines, orientations by spherical
         linear interpolation. A gap between frames is bridged up to the configuration's `longest_gap`, or up
         to 1.5 usual periods of the stream if that is longer; rows in a longer gap are NaN.
@@ -117,24 +120,22 @@ class Recording:
             dt: time from row to row (s); a recording of equilibria keeps its own rows.
             start: time of the first row (s); None: start of the configuration's `trim` or of the recording.
             end: latest time of the last row (s); None: end of the `trim` or of the first stream to end.
-            tensions: "measured", "commanded" or "none"; None: the configuration's choice.
-            mean: True to average the tensions over dt. Held tensions are averaged from each row to the
-                next. Other tensions are interpolated linearly and averaged about the next row, because
-                an implicit time step is driven by the tension at its end. Rows that reach into a gap too
+            controls: "measured", "commanded" or "none"; None: the configuration's choice.
+            mean: True to average the controls over dt. Held ones are averaged from each row to the
+                next. Others are interpolated linearly and averaged about the next row, because
+                an implicit time step is driven by the control at its end. Rows that reach into a gap too
                 long to be bridged are NaN.
 
         Raises:
-            RecordingError: there are no such tensions or no such rows.
+            RecordingError: there are no such controls or no such rows.
         """
-        driver = self._driver(tensions or self.config.tensions)
+        driver = self._driver(controls or self.config.controls)
         time = self._own_rows(driver, start, end) if self.config.static else self._grid(dt, start, end)
         bridged = self.config.longest_gap
         latency = 0.0
         if driver is self.command and self.config.command is not None:
             latency = self.config.command.latency
-        elif driver is self.tension and self.config.motors is not None:
-            latency = self.config.motors.latency
-        longest = bridged if driver is self.tension else math.inf
+        longest = bridged if driver is self.control else math.inf
         held = _held(driver, time - latency, longest)
         if mean and not self.config.static:
             is_held = self._is_held(driver)
@@ -153,14 +154,14 @@ class Recording:
 
         return Measurements(
             time=time,
-            tension=held,
+            control=held,
             fractions=np.array([body.fraction for body in self.bodies]),
             position=rows(0, 3),
             quaternion=rows(1, 4),
             measured=rows(2).astype(bool),
             simulated=self.simulated,
             source=self.source,
-            initial_tension=self._initial_tension(driver, float(time[0]) - latency, longest),
+            initial_control=self._initial_control(driver, float(time[0]) - latency, longest),
             static=self.config.static,
             continuous=mean and not self.config.static and not self._is_held(driver),
             sensors=tuple(
@@ -170,38 +171,43 @@ class Recording:
                 for it in self.sensors
             ),
             deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
+            quantities=driver.quantities,
         )
 
-    def _initial_tension(self, driver: Tensions, at: float, longest: float) -> Float[np.ndarray, " c"] | None:
-        """Return the tension (N) before a time: the stated one, the mean over the rest, or the held one."""
-        if self.config.initial_tension is not None and at <= driver.time[0] + _SAME:
-            return np.array(self.config.initial_tension)
+    def _initial_control(
+        self, driver: ControlRows, at: float, longest: float
+    ) -> Float[np.ndarray, " c"] | None:
+        """Return the control before a time: the stated one, the mean over the rest, or the held one."""
+        if self.config.initial_control is not None and at <= driver.time[0] + _SAME:
+            return np.array(self.config.initial_control)
         if self.rest is not None and self.rest[0] <= at <= self.rest[1]:
             resting = (driver.time >= self.rest[0] - _SAME) & (driver.time <= at + _SAME)
             if resting.any():
-                return np.asarray(driver.tension[resting].mean(axis=0))
+                return np.asarray(driver.values[resting].mean(axis=0))
         held = _held(driver, np.array([at]), longest)[0]
         return held if np.all(np.isfinite(held)) else None
 
     def health(self) -> Health:
-        """Return the quality report: rates, gaps, noise, latency, tension errors and findings."""
+        """Return the quality report: rates, gaps, noise, latency, errors of controls and findings."""
         # SciPy's optimisation is imported with it
         from knode_cosserat.recordings.health import health_of
 
         return health_of(self)
 
-    def _driver(self, kind: str) -> Tensions:
+    def _driver(self, kind: str) -> ControlRows:
         if kind not in ("measured", "commanded", "none"):
-            raise RecordingError(f"tensions is {kind!r}; allowed is measured, commanded or none")
+            raise RecordingError(f"controls is {kind!r}; allowed is measured, commanded or none")
         if kind == "none":
             time = self._times[0]
-            return Tensions(time, np.zeros((len(time), 0)))
-        driver = self.tension if kind == "measured" else self.command
+            return ControlRows(time, np.zeros((len(time), 0)))
+        driver = self.control if kind == "measured" else self.command
         if driver is None:
-            raise RecordingError(f"{self.source}: there are no {kind} tensions")
+            raise RecordingError(f"{self.source}: there are no {kind} controls")
         return driver
 
-    def _own_rows(self, driver: Tensions, start: float | None, end: float | None) -> Float[np.ndarray, " T"]:
+    def _own_rows(
+        self, driver: ControlRows, start: float | None, end: float | None
+    ) -> Float[np.ndarray, " T"]:
         """Return the times of the rows of equilibria (s)."""
         low, high = -math.inf if start is None else start, math.inf if end is None else end
         time = driver.time[(driver.time >= low - _SAME) & (driver.time <= high + _SAME)]
@@ -236,26 +242,26 @@ def bridge(time: Float[np.ndarray, " n"], longest: float) -> float:
     return max(longest, 1.5 * period(time)) + _SAME
 
 
-def _held(driver: Tensions, time: Float[np.ndarray, " T"], longest: float) -> Float[np.ndarray, "T tendons"]:
+def _held(driver: ControlRows, time: Float[np.ndarray, " T"], longest: float) -> Float[np.ndarray, "T c"]:
     last = np.searchsorted(driver.time, time + _SAME, side="right") - 1
-    # before the first message its tension is used, if it is near
+    # before the first message its value is used, if it is near
     age = time - driver.time[np.maximum(last, 0)]
     old = np.abs(age) > bridge(driver.time, longest)
-    return np.where(old[:, None], np.nan, driver.tension[np.maximum(last, 0)])
+    return np.where(old[:, None], np.nan, driver.values[np.maximum(last, 0)])
 
 
 def _averaged(
-    driver: Tensions, time: Float[np.ndarray, " T"], dt: float, straight: float
-) -> Float[np.ndarray, "T tendons"]:
+    driver: ControlRows, time: Float[np.ndarray, " T"], dt: float, straight: float
+) -> Float[np.ndarray, "T c"]:
     """Return means from each time to `dt` later.
 
-    Tensions are interpolated linearly between messages up to `straight` (s) apart, otherwise held. They are
+    Values are interpolated linearly between messages up to `straight` (s) apart, otherwise held. They are
     constant before the first and after the last message.
     """
-    known, values = driver.time, driver.tension
+    known, values = driver.time, driver.values
     steps = np.diff(known)[:, None]
     rises = np.where(steps <= straight, np.diff(values, axis=0) / np.maximum(steps, _SAME), 0.0)
-    # a piece of constant tension before the first and after the last message
+    # a piece of constant values before the first and after the last message
     rises, starts = np.pad(rises, ((1, 1), (0, 0))), np.concatenate([values[:1], values])
     far = dt + float(np.ptp(known)) + float(np.max(np.abs(time - known[0]), initial=0.0))
     ends = np.concatenate([[known[0] - far], known, [known[-1] + far]])

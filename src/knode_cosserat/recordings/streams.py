@@ -11,8 +11,9 @@ from jaxtyping import Bool, Float, Int
 
 from knode_cosserat._reprs import count_of
 from knode_cosserat.estimation.outputs import Output
-from knode_cosserat.recordings.config import RecordingConfig
+from knode_cosserat.recordings.config import ControlSource, RecordingConfig
 from knode_cosserat.recordings.findings import Finding, RecordingError, Severity, counted
+from knode_cosserat.recordings.quantities import counted_quantities
 
 #: largest disagreement of equal clocks, and smallest jump of a clock (s)
 DISAGREEMENT = 0.5
@@ -37,7 +38,7 @@ class Stream:
     Attributes:
         stamped: measurement times (ns); -1 without a stamp.
         received: recording times (ns).
-        values: poses (position and, if known, quaternion, scalar first) or tensions.
+        values: poses (position and, if known, quaternion, scalar first) or controls.
         broken: number of messages that could not be decoded.
         remarks: findings on the order of its numbers.
     """
@@ -91,26 +92,56 @@ class Sensor:
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
-class Tensions:
-    """Tensions of all tendons (N), or angles (rad) or lengths (m) of all motors, the first one first."""
+class ControlRows:
+    """Numbers that drive a robot: times (s), and values in SI units, in the order of the configuration.
+
+    `quantities` are names of `recordings.quantities`, each with the count of its columns.
+    """
 
     time: Float[np.ndarray, " n"]
-    tension: Float[np.ndarray, "n tendons"]
+    values: Float[np.ndarray, "n c"]
     topic: str = ""
+    quantities: tuple[tuple[str, int], ...] = ()
 
     def __repr__(self) -> str:
-        tendons = count_of(self.tension.shape[-1], "tendon")
-        return f"Tensions of {tendons} (topic {self.topic}): {count_of(len(self.time), 'row')}"
+        what = counted_quantities(self.quantities)
+        return f"ControlRows of {what} (topic {self.topic}): {count_of(len(self.time), 'row')}"
+
+
+def merged(parts: Sequence[ControlRows], sources: Sequence[ControlSource]) -> ControlRows:
+    """Return several quantities as one stream, at the times of the one with most rows.
+
+    Held values have their last value there, others are interpolated linearly; rows beyond the first or last
+    one of another stream are left out.
+    """
+    longest = max(parts, key=lambda part: len(part.time))
+    time = longest.time
+    if len(parts) > 1:
+        time = time[
+            (time >= max(part.time[0] for part in parts)) & (time <= min(part.time[-1] for part in parts))
+        ]
+    columns = []
+    for part, source in zip(parts, sources, strict=True):
+        if source.held:
+            columns.append(part.values[np.searchsorted(part.time, time, side="right") - 1])
+        else:
+            columns.append(np.stack([np.interp(time, part.time, column) for column in part.values.T], axis=1))
+    if not len(time):
+        topics = " and ".join(part.topic for part in parts)
+        raise RecordingError(f"{topics} have no time in common; required is one clock")
+    quantities = tuple(count for part in parts for count in part.quantities)
+    values = longest.values if len(parts) == 1 else np.concatenate(columns, axis=1)
+    return ControlRows(time, values, "+".join(part.topic for part in parts), quantities)
 
 
 class OutgoingStream(NamedTuple):
-    """Numbers of a topic to be written: times (s), and poses, tensions or commands.
+    """Numbers of a topic to be written: times (s), and poses, controls or commands.
 
     `source` is the topic's entry in the configuration; None for poses.
     """
 
     topic: str
-    role: Literal["pose", "tension", "command"]
+    role: Literal["pose", "control", "command"]
     time: Any
     values: Any
     source: Any = None
@@ -162,11 +193,21 @@ class Rows:
 def rows_on_one_clock(
     streams: Mapping[str, Stream], config: RecordingConfig, findings: list[Finding]
 ) -> dict[str, Rows]:
-    """Return the rows of each topic, by increasing times from the first pose or tension, and add findings.
+    """Return the rows of each topic, by increasing times from the first pose or control, and add findings.
 
     Raises:
-        RecordingError: there are no poses and no measured tensions.
+        RecordingError: there are no poses and no measured controls.
     """
+    rows = rows_from_zero(streams, config, findings)[1]
+    if not rows:
+        raise RecordingError("no poses and no controls in this recording")
+    return rows
+
+
+def rows_from_zero(
+    streams: Mapping[str, Stream], config: RecordingConfig, findings: list[Finding]
+) -> tuple[int, dict[str, Rows]]:
+    """Return the time of the first pose or control (ns), and the rows of each topic from there, if any."""
     for stream in streams.values():
         findings += stream.remarks
         if stream.broken:
@@ -176,17 +217,15 @@ def rows_on_one_clock(
     times = _measurement_times(list(streams.values()), config.clock, clocks)
     kept = {topic: _ordered(topic, times[topic], clocks) for topic in streams}
     # commands may start much earlier than anything is measured
-    command = config.command.topic if config.command is not None and config.measured is not None else None
-    zero = min(
-        (times[topic][rows[0]] for topic, rows in kept.items() if len(rows) and topic != command),
-        default=None,
-    )
+    command = config.command.topic if config.command is not None and config.measured else None
+    begins = {topic: times[topic][rows[0]] for topic, rows in kept.items() if len(rows)}
+    zero = min((at for topic, at in begins.items() if topic != command or len(begins) == 1), default=None)
     if zero is None:
-        raise RecordingError("no poses and no tensions in this recording")
+        return 0, {}
     for finding in clocks:
         seconds = tuple((time - zero) * 1e-9 for time in finding.times)
         findings.append(dataclasses.replace(finding, times=seconds))
-    return {
+    return int(zero), {
         topic: Rows(
             topic, np.round((times[topic][rows] - zero) * 1e-9, 9), streams[topic].values[rows], findings
         )
@@ -206,7 +245,8 @@ def _measurement_times(
         times[stream.topic] = stream.received
         if clock == "received" or len(stream.received) == 0:
             continue
-        if np.any(stream.stamped < 0):
+        # times of tables may be negative
+        if np.any(stream.stamped < 0) and not np.array_equal(stream.stamped, stream.received):
             what = "messages have no stamps of their own; the times of recording are used"
             findings.append(Finding("note", stream.topic, what))
         elif not one_clock and abs(late[stream.topic]) > DISAGREEMENT:

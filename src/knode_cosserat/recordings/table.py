@@ -9,10 +9,12 @@ A CSV file (UTF-8) has the metadata as comments before its header, a Parquet fil
     # latency: 0.06
     time [s],tension_1 [N],tension_2 [N],…,command_1 [N],…,rib_x [m],rib_y [m],rib_z [m],rib_qw,…,tip_x [m],…
 
-`tension_k` was measured at the row's time. A tension that is held from its row to the next, such as in a
-simulation, is named `held_tension_k`; a command is always held. `initial tension: 5 5 5 5` gives the tensions
-before the first row (N). `simulated` is true if the robot was itself a simulation; without it this is not
-stated. A single body is at the tip by default; several bodies need their `fraction` of the rod's length.
+`tension_k` was measured at the row's time; in place of it, or beside it, there may be `pressure_k [Pa]`,
+`rotation_k [rad]` and other quantities (`recordings.quantities`). A number that is held from its row to the
+next, such as in a simulation, is named `held_tension_k`; a command is always held. `initial control: 5 5 5 5`
+gives the controls before the first row. `simulated` is true if the robot was itself a simulation; without it
+this is not stated. A single body is at the tip by default; several bodies need their `fraction` of the rod's
+length.
 Without a configuration, positions are in the robot's frame and quaternions (scalar first) are the rod's
 orientation. A row has the measurements at its time: cells of slower sensors stay empty.
 """
@@ -20,7 +22,7 @@ orientation. A row has the measurements at its time: cells of slower sensors sta
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -28,35 +30,40 @@ from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean, excerpt
 from knode_cosserat.recordings.config import (
+    COMMAND,
     PLACE,
+    POSITION_UNITS,
     TIME_UNITS,
     ColumnMap,
-    CommandSource,
+    ControlSource,
     MarkerSource,
     RecordingConfig,
     TableSource,
-    TensionSource,
 )
-from knode_cosserat.recordings.findings import Finding, RecordingError
+from knode_cosserat.recordings.findings import Finding, RecordingError, counted
+from knode_cosserat.recordings.quantities import QUANTITIES, UNITS, stated_unit
 from knode_cosserat.recordings.streams import FAR, SLOW, Outgoing, Stream
 
 if TYPE_CHECKING:
     import pandas as pd  # type: ignore[import-untyped]
 
 TIME = "time [s]"
-#: default prefixes of the columns of tensions
-TENSION, HELD, COMMAND = "tension", "held_tension", "command"
-#: metadata key of the tensions before the first row
-INITIAL = "initial tension"
+#: prefix of the columns of numbers that are held to the next row
+HELD = "held_"
+#: metadata key of the controls before the first row
+INITIAL = "initial control"
 ALLOWED = (
     f"{TIME}, tension_1 [N], tension_2 [N], …, NAME_x [m], NAME_y [m], NAME_z [m] for each body, and, if "
     "they were measured, NAME_qw, NAME_qx, NAME_qy, NAME_qz, and command_1 [N], …; tensions that are held "
-    "from a row to the next are held_tension_1 [N], … instead"
+    "from a row to the next are held_tension_1 [N], … instead, and other quantities have their own names, "
+    f"such as pressure_1 [Pa] ({', '.join(QUANTITIES)})"
 )
+#: parts of a pose, in the order of their columns
+POSE_PARTS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 #: largest number of unread columns that are listed
 MOST_LISTED = 8
 #: largest plausible time (s)
-_LATEST = 9e9
+LATEST = 9e9
 
 
 class Table(NamedTuple):
@@ -89,27 +96,78 @@ class Table(NamedTuple):
             config = config.replace(simulated=simulated == "true")
         return config
 
-    def streams(self, config: RecordingConfig, findings: list[Finding]) -> dict[str, Stream]:
+    @property
+    def names(self) -> list[str]:
+        """Titles of the columns."""
+        return list(map(str, self.numbers.columns))
+
+    def topics_there(self, config: RecordingConfig) -> list[str]:
+        """Return the topics of a configuration whose columns are all there."""
+        titles = _titles_by_topic(config, self.names)
+        return [topic for topic, named in titles.items() if set(named) <= set(self.names)]
+
+    def uses(self, config: RecordingConfig) -> dict[str, str]:
+        """Return the use of each column; empty text for those that are not read."""
+        columns, mapped = self.names, config.columns or ColumnMap()
+        stated = {mapped.time, TIME, *(file.time for file in config.files)}
+        uses = {title: "time" if {title, title.rpartition("/")[2]} & stated else "" for title in columns}
+        bodies = [source.topic for source in (*config.markers, config.base) if source is not None]
+        words: dict[str, str] = {}
+        for source in (*config.measured, config.command):
+            if source is not None:
+                what = COMMAND if source is config.command else source.quantity
+                words[source.topic] = f"{what} {{}} [{source.unit}]"
+        for topic, titles in _titles_by_topic(config, columns).items():
+            for k, title in enumerate(titles):
+                if title not in uses and title.isdecimal() and 1 <= int(title) <= len(columns):
+                    title = columns[int(title) - 1]
+                if title in uses:
+                    part = POSE_PARTS[k] if topic in bodies else k + 1
+                    uses[title] = words.get(topic, f"{topic} {{}}").format(part)
+        return uses
+
+    def resets(self, config: RecordingConfig) -> list[float]:
+        """Return the times (s) at which rows continue after the clock was set back."""
+        time = _times(self.numbers, config.table or TableSource(), config.columns or ColumnMap())
+        return _continued(time)[1]
+
+    def streams(
+        self, config: RecordingConfig, findings: list[Finding], topics: Collection[str] | None = None
+    ) -> dict[str, Stream]:
         """Return the measured rows of each topic, and add findings on unread columns and rows without times.
+
+        `topics` are those that are read; None: all of the configuration. After the clock was set back, the
+        rows are taken to continue one step later.
 
         Raises:
             RecordingError: a column is missing, or the times are not plausible seconds.
         """
         columns = list(self.numbers.columns)
         titles = _titles_by_topic(config, columns)
-        unused = config.command if config.tensions == "measured" else config.measured
+        unused = [source.topic for source in config.idle]
+        bodies = [source.topic for source in (*config.markers, config.base) if source is not None]
         templates, mapped = config.table or TableSource(), config.columns or ColumnMap()
-        time = _times(self.numbers, templates, mapped)
+        time, resets = _continued(_times(self.numbers, templates, mapped))
+        if resets:
+            what = (
+                f"{counted(len(resets), 'reset', 'resets')} of the clock; the next rows are taken to follow"
+            )
+            findings.append(Finding("warning", "", what))
         has_rate = templates.rate is not None and mapped.time is None
         read = set[int]() if has_rate else {_place(mapped.time or TIME, columns)}
         streams = {}
         for topic, named in titles.items():
-            # tensions that do not drive the robot may be missing
-            if unused is not None and topic == unused.topic and not set(named) & set(columns):
+            if topics is not None and topic not in topics:
+                continue
+            # numbers that do not drive the robot may be missing
+            if topic in unused and not set(named) & set(columns):
                 continue
             places = [_place(title, columns) for title in named]
             read |= set(places)
-            values = columns_of(self.numbers, places)
+            values = np.array(columns_of(self.numbers, places))
+            if topic in bodies and config.position_unit is None:
+                units = [stated_unit(columns[place], POSITION_UNITS) or "m" for place in places[:3]]
+                values[:, :3] *= [POSITION_UNITS[unit] for unit in units]
             there = np.isfinite(time) & np.isfinite(values).any(axis=1)
             stamps = np.round(time[there] * 1e9).astype(np.int64)
             # received times may be negative, because a table may begin before zero
@@ -174,21 +232,28 @@ def columns_of(table: pd.DataFrame, places: Sequence[int]) -> Float[np.ndarray, 
 def configured(metadata: Mapping[str, str], columns: list[str]) -> RecordingConfig:
     """Return the configuration derived from a table's titles and metadata. Raises `RecordingError`."""
     others = [name for name in columns if name != TIME]
-    tendons = {
-        prefix: sum(name.startswith(f"{prefix}_") for name in others) for prefix in (TENSION, HELD, COMMAND)
-    }
-    if tendons[TENSION] and tendons[HELD]:
+    controls: dict[str, tuple[str, int]] = {}
+    for name in others:
+        match = re.fullmatch(rf"((?:{HELD})?([a-z]+))_\d+ \[(.+)\]", name)
+        if match is None:
+            continue
+        quantity = QUANTITIES.get(match[2])
+        if match[3] == quantity.unit if quantity else match[1] == COMMAND and match[3] in UNITS:
+            controls[match[1]] = match[3], controls.get(match[1], ("", 0))[1] + 1
+    twice = next((prefix for prefix in controls if HELD + prefix in controls), None)
+    if twice is not None:
         raise RecordingError(
-            f"there are {TENSION}_1 (at the row's time) and {HELD}_1 (from its row to the next); "
+            f"there are {twice}_1 (at the row's time) and {HELD}{twice}_1 (from its row to the next); "
             "allowed is one of them"
         )
-    measured = HELD if tendons[HELD] else TENSION
     bodies = [name.removesuffix("_x [m]") for name in others if name.endswith("_x [m]")]
-    known = [title for prefix, count in tendons.items() for title in tension_titles(prefix, "N", count)]
+    known = list[str]()
+    for prefix, (unit, count) in controls.items():
+        known += control_titles(prefix, unit, count)
     for body in bodies:
         oriented = quaternion_titles(body)
         known += position_titles(body, "m") + (oriented if oriented[0] in columns else [])
-    wrong = TIME not in columns or not bodies or not any(tendons.values()) or len(set(columns)) < len(columns)
+    wrong = TIME not in columns or not bodies or not controls or len(set(columns)) < len(columns)
     if wrong or sorted(known) != sorted(others):
         raise RecordingError(f"the columns are {', '.join(columns)}; allowed is {ALLOWED}, once each")
     markers = []
@@ -201,31 +266,34 @@ def configured(metadata: Mapping[str, str], columns: list[str]) -> RecordingConf
             )
         (fraction,) = _metadata_numbers(key, metadata) or (1.0,)
         markers.append(MarkerSource(body, body, fraction, rotation=(1.0, 0.0, 0.0, 0.0)))
-    order = {prefix: tuple(range(1, count + 1)) for prefix, count in tendons.items()}
     (latency,) = _metadata_numbers("latency", metadata) or (0.0,)
-    tension = command = None
-    if order[measured]:
-        tension = TensionSource(measured, order[measured], held=True if measured == HELD else None)
-    if order[COMMAND]:
-        command = CommandSource(COMMAND, order[COMMAND], latency=latency)
+    sources = {
+        prefix.removeprefix(HELD): ControlSource(
+            prefix,
+            tuple(range(1, count + 1)),
+            unit,
+            held=True if prefix.startswith(HELD) else None,
+            latency=latency if prefix == COMMAND else 0.0,
+        )
+        for prefix, (unit, count) in controls.items()
+    }
     return RecordingConfig(
         markers=tuple(sorted(markers, key=lambda marker: marker.fraction)),
-        tension=tension,
-        command=command,
-        tensions="measured" if tension else "commanded",
-        initial_tension=_metadata_numbers(INITIAL, metadata),
+        controls="measured" if set(sources) - {COMMAND} else "commanded",
+        initial_control=_metadata_numbers(INITIAL, metadata),
+        **sources,  # type: ignore[arg-type]
     )
 
 
 def _metadata_numbers(key: str, metadata: Mapping[str, str]) -> tuple[float, ...] | None:
-    """Return the numbers of the metadata under a key, one except of tensions; None without the key."""
+    """Return the numbers of the metadata under a key, one except of controls; None without the key."""
     if key not in metadata:
         return None
     words = metadata[key].replace(",", " ").split() if key == INITIAL else [metadata[key]]
     try:
         return tuple(map(float, words))
     except ValueError:
-        kind = "numbers (N)" if key == INITIAL else "a number"
+        kind = "numbers (SI units)" if key == INITIAL else "a number"
         raise RecordingError(f"{key} is {excerpt(metadata[key])}; allowed is {kind}") from None
 
 
@@ -239,8 +307,8 @@ def quaternion_titles(body: str) -> list[str]:
     return [f"{body}_{part}" for part in ("qw", "qx", "qy", "qz")]
 
 
-def tension_titles(topic: str, unit: str, count: int) -> list[str]:
-    """Return the titles of tensions or commands, in the order of a message."""
+def control_titles(topic: str, unit: str, count: int) -> list[str]:
+    """Return the titles of controls or commands, in the order of a message."""
     return [f"{topic}_{k + 1} [{unit}]" for k in range(count)]
 
 
@@ -256,29 +324,26 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str]) -> dict[str, l
                 for named in (templates.position, templates.quaternion)
             )
             quaternion = quaternion or quaternion_titles(topic)
-            usual = position or position_titles(topic, config.position_unit)
+            usual = position or position_titles(topic, config.position_unit or "m")
             usual = usual + (quaternion if quaternion[0] in columns else [])
             titles[topic] = list(dict(mapped.bodies).get(topic, usual))
     for sensor in config.sensors:
         if sensor.columns is None:
             raise RecordingError(f"the columns of the sensor {sensor.topic} are missing; name them")
         titles[sensor.topic] = list(sensor.columns)
-    for tendons, named in (
-        (config.tension, mapped.tensions),
-        (config.motors, mapped.motors),
-        (config.command, mapped.commands),
-    ):
-        if tendons is not None:
-            count = len(tendons.order)
-            usual = tension_titles(tendons.topic, tendons.unit, count)
-            if templates.motor is not None:
-                usual = [templates.motor.replace(PLACE, str(k + 1)) for k in range(count)]
+    for source in (*config.measured, config.command):
+        if source is not None:
+            named = dict(mapped.controls).get(COMMAND if source is config.command else source.quantity)
+            count = len(source.order)
+            usual = control_titles(source.topic, source.unit or "", count)
+            if templates.control is not None:
+                usual = [templates.control.replace(PLACE, str(k + 1)) for k in range(count)]
             if named is not None and len(named) != count:
                 raise RecordingError(
-                    f"{len(named)} columns are mapped and order has {count} tendons; allowed is the "
+                    f"{len(named)} columns are mapped and order has {count} numbers; allowed is the "
                     "same number"
                 )
-            titles[tendons.topic] = list(named or usual)
+            titles[source.topic] = list(named or usual)
     return titles
 
 
@@ -307,18 +372,39 @@ def _times(table: pd.DataFrame, templates: TableSource, mapped: ColumnMap) -> Fl
     else:
         time = columns_of(table, [_place(title, columns)])[:, 0]
         time = time * TIME_UNITS[mapped.time_unit or stated_time_unit(title) or "s"]
-    late = np.abs(time) > _LATEST
+    late = np.abs(time) > LATEST
     known = np.sort(time[np.isfinite(time)])
     step = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
     if late.any() or step > FAR:
         row = int(np.argmax(late))
         what, most = f"its rows are {step:g} s apart; allowed is up to {FAR:g} s", step / SLOW
         if late.any():
-            what = f"row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {_LATEST:g}"
-            most = abs(time[row]) / _LATEST
+            what = f"row {row + 1}: {TIME} is {time[row]:g}; allowed is up to {LATEST:g}"
+            most = abs(time[row]) / LATEST
         unit = next((unit for unit, size in (("ms", 1e3), ("µs", 1e6)) if most <= size), "ns")
         raise RecordingError(f"{what}. Are the times in {unit}?")
     return time
+
+
+#: smallest step back of a clock that was reset (s), and rows after which it has not come back
+_BACK, _STAYS = 1.0, 5
+
+
+def _continued(time: Float[np.ndarray, " n"]) -> tuple[Float[np.ndarray, " n"], list[float]]:
+    """Return times (s) that continue one step later where the clock was set back, and where that is."""
+    known = np.flatnonzero(np.isfinite(time))
+    seconds, begins = time[known].copy(), list[float]()
+    step = float(np.median(np.abs(np.diff(seconds)))) if len(seconds) > 1 else 0.0
+    for row in np.flatnonzero(np.diff(seconds) < -_BACK):
+        after = seconds[row + 1 : row + 1 + _STAYS]
+        # a row out of order comes back; whole parts out of order do not follow the last part
+        if len(after) < _STAYS or np.any(np.diff(after) < 0.0) or after.max() > seconds[row] - _BACK / 2:
+            continue
+        seconds[row + 1 :] += seconds[row] + step - seconds[row + 1]
+        begins.append(float(seconds[row + 1]))
+    continued = np.array(time)
+    continued[known] = seconds
+    return continued, begins
 
 
 #: spellings of units of time in titles
@@ -342,10 +428,10 @@ def columns_and_metadata(outgoing: Outgoing) -> tuple[pd.DataFrame, dict[str, st
     config, columns = outgoing.config, dict[str, pd.Series]()
     for stream in outgoing.streams:
         if stream.role == "pose":
-            titles = position_titles(stream.topic, config.position_unit)
+            titles = position_titles(stream.topic, config.position_unit or "m")
             titles += quaternion_titles(stream.topic) if np.shape(stream.values)[1] == 7 else []
         else:
-            titles = tension_titles(stream.topic, stream.source.unit, len(stream.source.order))
+            titles = control_titles(stream.topic, stream.source.unit, len(stream.source.order))
         columns |= {
             title: pd.Series(values, index=stream.time)
             for title, values in zip(titles, stream.values.T, strict=True)
@@ -355,8 +441,8 @@ def columns_and_metadata(outgoing: Outgoing) -> tuple[pd.DataFrame, dict[str, st
         metadata["source"] = " ".join(config.description.split())
     if config.simulated is not None:
         metadata["simulated"] = "true" if config.simulated else "false"
-    if config.initial_tension is not None:
-        metadata[INITIAL] = " ".join(map(repr, config.initial_tension))
+    if config.initial_control is not None:
+        metadata[INITIAL] = " ".join(map(repr, config.initial_control))
     if config.command is not None and config.command.latency:
         metadata["latency"] = repr(config.command.latency)
     # one concatenation, because repeated merges would sort the rows each time

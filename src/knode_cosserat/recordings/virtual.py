@@ -17,7 +17,7 @@ from jaxtyping import Float
 from knode_cosserat import controls
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
-from knode_cosserat.recordings.streams import Body, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows
 from knode_cosserat.recordings.write import write_recording, writer_of
 from knode_cosserat.rods.tendon_robots import TendonRod, VirtualRobot
 from knode_cosserat.schemes.time import LIGHTLY_DAMPED
@@ -125,7 +125,7 @@ def record_virtual(
 # commands and tensions
 
 
-def commands(signal: str, seconds: float) -> Tensions:
+def commands(signal: str, seconds: float) -> ControlRows:
     """Return the commands of a signal (see `record_virtual`): whole grams-force, in N, every 50 ms."""
     time = np.round(np.arange(0.0, seconds - 1e-9, COMMANDED), 9)
     grams = np.full((len(time), 4), REST)
@@ -156,26 +156,26 @@ def commands(signal: str, seconds: float) -> Tensions:
         used = newtons[:count]
         grams[len(time) - count : len(time) - count + len(used)] = used / GRAM
         grams[len(time) - count + len(used) :] = grams[len(time) - count + len(used) - 1]
-    return Tensions(time, np.round(grams) * GRAM)
+    return ControlRows(time, np.round(grams) * GRAM, "", (("tension", 4),))
 
 
-def lagged(sent: Tensions, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:
+def lagged(sent: ControlRows, time: Float[np.ndarray, " n"], lag: float) -> Float[np.ndarray, "n 4"]:
     """Return tensions (N) at evenly spaced times (s): the held commands after a first-order lag.
 
     The result is exact if each command's time is one of these times.
     """
     if lag <= 0.0:
-        return sent.tension[np.searchsorted(sent.time, time + 1e-9, side="right") - 1]
+        return sent.values[np.searchsorted(sent.time, time + 1e-9, side="right") - 1]
     stays = np.exp(-(time[1] - time[0]) / lag)
     # the last command before an interval acts during it
-    held = sent.tension[np.searchsorted(sent.time, time - 1e-9, side="right").clip(1) - 1]
+    held = sent.values[np.searchsorted(sent.time, time - 1e-9, side="right").clip(1) - 1]
     followed = [held[0]]
     for target in held[1:]:
         followed.append(target + (followed[-1] - target) * stays)
     return np.array(followed)
 
 
-def driven(sent: Tensions, lag: float, robot: TendonRod) -> Trajectory:
+def driven(sent: ControlRows, lag: float, robot: TendonRod) -> Trajectory:
     """Return the motion of a robot under commands, in rows 10 ms apart."""
     robot = robot.replace(nodes=PLANT_NODES)
     time = np.arange(round((sent.time[-1] + COMMANDED) / PLANT_STEP) + 1) * PLANT_STEP
@@ -192,8 +192,8 @@ def driven(sent: Tensions, lag: float, robot: TendonRod) -> Trajectory:
 
 
 def simulated_sensors(
-    truth: Trajectory, sent: Tensions, seed: int, sensors: Sensors
-) -> tuple[dict[str, Body], Tensions]:
+    truth: Trajectory, sent: ControlRows, seed: int, sensors: Sensors
+) -> tuple[dict[str, Body], ControlRows]:
     """Return simulated motion capture (poses by the paper's marker names) and load cells of a motion."""
     from scipy.spatial.transform import Rotation
 
@@ -231,4 +231,4 @@ def simulated_sensors(
     true = lagged(sent, fine, sensors.lag)[np.round(stamps / PLANT_STEP).astype(int)]
     noisy = true + random.normal(0.0, sensors.tension_noise, true.shape)
     step = sensors.tension_step
-    return poses, Tensions(stamps, np.round(noisy / step) * step if step > 0.0 else noisy)
+    return poses, ControlRows(stamps, np.round(noisy / step) * step if step > 0.0 else noisy)

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from knode_cosserat.recordings.config import POSITION_UNITS, CommandSource, RecordingConfig, TensionSource
+from knode_cosserat.recordings.config import ControlSource, RecordingConfig
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.formats import formats, written_suffixes
-from knode_cosserat.recordings.streams import Body, Outgoing, OutgoingStream, Tensions
+from knode_cosserat.recordings.streams import Body, ControlRows, Outgoing, OutgoingStream
 
 #: default of time zero on the clock of a bag (s since 1970)
 START = 1_720_000_000
@@ -22,8 +22,8 @@ def write_recording(
     path: str | Path,
     config: RecordingConfig,
     poses: Mapping[str, Body],
-    tension: Tensions | None = None,
-    command: Tensions | None = None,
+    control: ControlRows | None = None,
+    command: ControlRows | None = None,
     *,
     start: int = START,
     delays: Mapping[str, float] | None = None,
@@ -37,8 +37,8 @@ def write_recording(
         config: topics, order and units of the messages. Text commands in grams-force are rounded to whole
             numbers, as the paper's robot sends them.
         poses: poses by the markers' names; the base's under "base".
-        tension: measured tensions.
-        command: commanded tensions.
+        control: measured numbers that drive the robot, in SI units and in the order of `config.measured`.
+        command: commanded ones.
         start: time zero on the bag's clock (s since 1970); tables begin at zero.
         delays: delay from stamp to recording (s) by topic; zero by default.
 
@@ -53,7 +53,7 @@ def write_recording(
         sources["base"] = config.base.topic
     if set(poses) != set(sources):
         raise RecordingError(f"{path}: poses are given of {sorted(poses)}; required is {sorted(sources)}")
-    scale = POSITION_UNITS[config.position_unit]
+    scale = config.position_factor
     streams = []
     for name, topic in sources.items():
         pose = poses[name]
@@ -61,16 +61,21 @@ def write_recording(
         if pose.quaternion is not None:
             parts.append(np.asarray(pose.quaternion))
         streams.append(OutgoingStream(topic, "pose", pose.time, np.concatenate(parts, axis=1)))
-    for role, source, pulls in (("tension", config.tension, tension), ("command", config.command, command)):
-        if pulls is None:
+    sent = (config.command,) if config.command else ()
+    for role, sources, rows in (("control", config.measured, control), ("command", sent, command)):
+        if rows is None:
             continue
-        if source is None or np.shape(pulls.tension)[1:] != (len(source.order),):
+        counts = [len(source.order) for source in sources]
+        if np.shape(rows.values)[1:] != (sum(counts),):
             raise RecordingError(
-                f"{path}: {role} of shape {np.shape(pulls.tension)}; the configuration has "
-                f"{len(source.order) if source else 'no'} tendons there"
+                f"{path}: {role} of shape {np.shape(rows.values)}; the configuration has "
+                f"{sum(counts) or 'no'} numbers there"
             )
-        values = sent_tensions(source, pulls.tension)
-        streams.append(OutgoingStream(source.topic, role, pulls.time, values, source))  # type: ignore[arg-type]
+        parts = np.split(rows.values, np.cumsum(counts)[:-1], axis=1)
+        streams += [
+            OutgoingStream(source.topic, role, rows.time, sent_numbers(source, part), source)  # type: ignore[arg-type]
+            for source, part in zip(sources, parts, strict=True)
+        ]
     try:
         write(path, Outgoing(config, streams, start, delays or {}))
     except (OSError, sqlite3.Error) as error:
@@ -86,8 +91,7 @@ def writer_of(path: Path) -> Any:
     return writers[path.suffix]
 
 
-def sent_tensions(source: TensionSource, newtons: Any) -> Any:
-    """Return tensions (N), shape (n, tendons), in the unit and the order of a source's messages."""
-    sent = np.asarray(newtons)[:, np.array(source.order) - 1] / source.factor
-    in_text = isinstance(source, CommandSource) and source.text is not None
-    return np.round(sent) if in_text and source.unit == "gf" else sent
+def sent_numbers(source: ControlSource, values: Any) -> Any:
+    """Return numbers in SI units, shape (n, c), in the unit and the order of a source's messages."""
+    sent = np.asarray(values)[:, np.array(source.order) - 1] / source.factor
+    return np.round(sent) if source.text is not None and source.unit == "gf" else sent

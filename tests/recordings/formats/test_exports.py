@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from knode_cosserat.recordings import RecordingConfig, RecordingError, load_recording
-from knode_cosserat.recordings.config import BaseSource, ColumnMap, MarkerSource, TensionSource
+from knode_cosserat.recordings.config import BaseSource, ColumnMap, ControlSource, MarkerSource
 from knode_cosserat.recordings.formats import format_of, formats
 from tests.recordings.formats import exported
 
@@ -24,7 +24,7 @@ def config(prefix="", ending="", **changes):
     """The configuration that a user writes: a base, and two bodies at measured places."""
     names = {name: f"{prefix}{name}{ending}" for name in exported.BODIES}
     markers = (MarkerSource("rib", names["rib"], 0.5), MarkerSource("tip", names["tip"], 1.0))
-    given = {"markers": markers, "base": BaseSource(names["base"]), "tensions": "none"} | changes
+    given = {"markers": markers, "base": BaseSource(names["base"]), "controls": "none"} | changes
     return RecordingConfig(**given)
 
 
@@ -106,13 +106,15 @@ def test_nexus(tmp_path, variant):
     agrees(load_recording(path, config("Robot:")), 1e-6, None, NEXUS[variant].get("lost", ()))
     if "forces" in NEXUS[variant]:
         titles = tuple(f"Load cells - Force T{k} [N]" for k in (2, 1, 4, 3))
-        source = TensionSource("cells", (2, 1, 4, 3))
-        mapped = config("Robot:", tension=source, columns=ColumnMap(tensions=titles), tensions="measured")
-        tension = load_recording(path, mapped).tension
+        source = ControlSource("cells", (2, 1, 4, 3))
+        mapped = config(
+            "Robot:", tension=source, columns=ColumnMap(controls=(("tension", titles),)), controls="measured"
+        )
+        tension = load_recording(path, mapped).control
         np.testing.assert_allclose(tension.time, np.arange(10 * len(TIME)) / 1000.0, atol=1e-9)
-        np.testing.assert_allclose(tension.tension, np.array([forces(at) for at in tension.time]), atol=1e-5)
+        np.testing.assert_allclose(tension.values, np.array([forces(at) for at in tension.time]), atol=1e-5)
         # the same channels are found without a configuration
-        np.testing.assert_allclose(load_recording(path).tension.tension, tension.tension, atol=1e-12)
+        np.testing.assert_allclose(load_recording(path).control.values, tension.values, atol=1e-12)
 
 
 @pytest.mark.parametrize(
@@ -170,13 +172,15 @@ def test_c3d(tmp_path, variant):
     agrees(load_recording(path, config()), tolerance, None, options.get("lost", ()))
     if "forces" in options:
         titles = tuple(f"cell{k + 1} [N]" for k in range(4))
-        source = TensionSource("cells", (1, 2, 3, 4))
-        mapped = config(tension=source, columns=ColumnMap(tensions=titles), tensions="measured")
-        tension = load_recording(path, mapped).tension
+        source = ControlSource("cells", (1, 2, 3, 4))
+        mapped = config(
+            tension=source, columns=ColumnMap(controls=(("tension", titles),)), controls="measured"
+        )
+        tension = load_recording(path, mapped).control
         rate = 100.0 * options.get("per_frame", 2)
         np.testing.assert_allclose(np.diff(tension.time), 1.0 / rate, atol=1e-9)
         expected = np.array([forces(at) for at in tension.time])
-        np.testing.assert_allclose(tension.tension, expected, atol=5.1e-3 if tolerance > 1e-5 else 1e-5)
+        np.testing.assert_allclose(tension.values, expected, atol=5.1e-3 if tolerance > 1e-5 else 1e-5)
 
 
 def test_a_c3d_file_that_was_cut_is_read_to_its_end(tmp_path):

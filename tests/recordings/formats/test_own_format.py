@@ -50,7 +50,7 @@ def test_a_registered_format_is_read_inspected_written_and_listed(tip_path, tmp_
     recording = kc.load_recording(path)
     assert recording.source == "it.txt, a path"
     np.testing.assert_allclose(recording.bodies[0].position[:, 0], rows[3])
-    np.testing.assert_allclose(recording.tension.tension, rows[1:3].T)
+    np.testing.assert_allclose(recording.control.values, rows[1:3].T)
     assert "it.txt, a path" in succeeded("inspect", path)
     assert ".path" in formats.read_suffixes()
     measured = recording.sampled(0.05)

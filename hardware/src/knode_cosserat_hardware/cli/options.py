@@ -182,10 +182,9 @@ def recording_config(machine: OpenedDriver, names: Sequence[str]) -> RecordingCo
     """Return the topics of a bag: tensions, commands, and bodies at even fractions of the length."""
     from knode_cosserat.recordings.config import (
         BaseSource,
-        CommandSource,
+        ControlSource,
         MarkerSource,
         RecordingConfig,
-        TensionSource,
     )
 
     order = tuple(range(1, machine.driver.tendon_count + 1))
@@ -198,8 +197,8 @@ def recording_config(machine: OpenedDriver, names: Sequence[str]) -> RecordingCo
             MarkerSource(name, f"/{name}", (k + 1) / len(markers), rotation=rotation)
             for k, name in enumerate(markers)
         ),
-        tension=TensionSource("/tension", order),
-        command=CommandSource("/command", order),
+        tension=ControlSource("/tension", order),
+        command=ControlSource("/command", order),
         base=BaseSource("/base", machine.base_height) if "base" in names else None,
         simulated=is_simulated,
         description=f"recorded at {machine.name}",

@@ -137,7 +137,7 @@ def _stretch(part: _Interval, robot: System) -> float:
 
 
 def _estimated(part: _Interval, robot: System, method: str) -> Trajectory:
-    tension, settings = part.rows.tension, None
+    tension, settings = part.rows.control, None
     # the tension held from the row before; for the first row, its own
     control = np.concatenate([tension[:1], tension[:-1]])
     if method == "paper":
@@ -274,11 +274,12 @@ def _parts(
     recording: Recording | Measurements, rows: Measurements, robot: System, dt: float
 ) -> list[_Interval]:
     """Return the parts with enough rows for an estimation. Raises `RecordingError` without any."""
-    _check(rows, robot)
+    rows = rows.controls_for(robot)
+    _check(rows)
     pieces = rows.parts(shortest=(FEWEST_ROWS - 1) * dt)
     if not pieces:
         raise RecordingError(
-            f"no {FEWEST_ROWS} rows of {dt:g} s one after the other with all positions and tensions"
+            f"no {FEWEST_ROWS} rows of {dt:g} s one after the other with all positions and controls"
         )
     used = rows.fractions > 0.0
     parts = []
@@ -292,13 +293,7 @@ def _parts(
     return parts
 
 
-def _check(rows: Measurements, robot: System) -> None:
-    tendons = rows.tension.shape[1]
-    if tendons != robot.control_layout.size:
-        raise RecordingError(
-            f"the recording has {tendons} tendons and the robot {robot.control_layout.size} "
-            "controls; allowed is the same number"
-        )
+def _check(rows: Measurements) -> None:
     away = rows.fractions > 0.0
     if away.sum() < FEWEST_BODIES:
         raise RecordingError(
