@@ -8,7 +8,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from knode_cosserat import controls
 from knode_cosserat.figures.drawing import AXES, curves_of, legend_above
 from knode_cosserat.figures.style import PALETTE, new_figure
 
@@ -25,6 +24,8 @@ PREDICTED: dict[str, Any] = {"color": PALETTE[0], "linewidth": 1.0}
 ERROR, OUTSIDE = PALETTE[1], "#F5D9A8"
 #: largest number of drawn points of a line; of longer ones, extremes of equal intervals are drawn
 MOST_POINTS = 2400
+#: largest number of controls that are named beside their lines
+MOST_NAMES = 12
 #: instants whose shapes are drawn, and the smallest time between two, as a part of the whole
 INSTANTS, APART = 3, 0.05
 #: smallest extent of a drawn shape, as a part of its largest one
@@ -76,9 +77,13 @@ def worst_instants(it: Comparison) -> Figure:
     points = points[np.isfinite(points).all(axis=1)]
     low, high = points.min(axis=0), points.max(axis=0)
     centre, half = (low + high) / 2, (high - low) / 2
+    views = _views(curves[0])
+    # the same scale and the same extent in both views
+    along = set(views[0]).intersection(*views)
+    sides = [k for k in range(len(half)) if k not in along] if len(views) > 1 else []
+    half[sides] = np.max(half[sides], initial=0.0)
     half = 1.1 * np.maximum(half, THINNEST * half.max())
     factor, unit = length_unit(2.0 * float(half.max()))
-    views = _views(curves[0])
     across, up = half[views[0][0]], half[views[0][1]]
     wide = (WIDTH - 0.75) / INSTANTS
     with new_figure(WIDTH, 0.85 + len(views) * (0.22 + wide * up / across)) as figure:
@@ -170,7 +175,7 @@ def _plot(axes: Any, it: Comparison, values: NDArray[np.float64], **look: Any) -
     """Draw values over the rows: a line, or points of separate equilibria."""
     x = _abscissa(it)
     if it.measured.static:
-        size = 2.2 * look["linewidth"]
+        size = 1.7 * look["linewidth"]
         axes.plot(
             x, values, "o", markersize=size, markeredgewidth=0.0, color=look["color"], label=look.get("label")
         )
@@ -206,7 +211,7 @@ def _tip(it: Comparison, k: int) -> Any:
             limits = (factor * side[:, -1, k] for side in (it.band.low, it.band.high))
             axes.fill_between(
                 _abscissa(it), *limits, color=PALETTE[5], alpha=0.4, linewidth=0.0,
-                label=f"{it.band.level:.0%} band", rasterized=len(it.rows) > MOST_POINTS,
+                label=f"{100.0 * it.band.level:.0f} % band", rasterized=len(it.rows) > MOST_POINTS,
             )  # fmt: skip
         _plot(axes, it, factor * seen, label="measured", **MEASURED)
         if predicted is not None:
@@ -241,14 +246,24 @@ def _angle(it: Comparison) -> Any:
 def _controls(it: Comparison) -> Any:
     def draw(axes: Any) -> None:
         values, layout = it.measured.held_tension[it.rows], it.robot.control_layout
-        units = set(controls.units(layout)) if layout.size == values.shape[1] else set()
-        for k in range(values.shape[1]):
+        count = values.shape[1]
+        lines = []
+        for k in range(count):
             look = {"color": PALETTE[k % len(PALETTE)], "linewidth": max(0.6, 1.6 - 0.3 * k)}
             if it.measured.static:
-                axes.plot(_abscissa(it), values[:, k], ".", markersize=2.5, color=look["color"])
+                lines += axes.plot(_abscissa(it), values[:, k], ".", markersize=2.5, color=look["color"])
             else:
-                axes.plot(*thinned(it.time, values[:, k]), drawstyle="steps-post", **look)
-        axes.set_ylabel(f"controls\n[{units.pop()}]" if len(units) == 1 else "controls")
+                lines += axes.plot(*thinned(it.time, values[:, k]), drawstyle="steps-post", **look)
+        fields = layout.fields if layout.size == count else ()
+        name = fields[0].name if len(fields) == 1 else "controls"
+        units = {field.unit for field in fields}
+        axes.set_ylabel(f"{name}\n[{units.pop()}]" if len(units) == 1 else name)
+        if 1 < count <= MOST_NAMES:
+            names = [str(k + 1) for k in range(count)]
+            axes.legend(
+                lines, names, loc="lower right", bbox_to_anchor=(1.0, 0.94), ncols=count, fontsize=7,
+                handlelength=0.9, columnspacing=0.8, handletextpad=0.3, borderpad=0.0,
+            )  # fmt: skip
 
     return draw
 

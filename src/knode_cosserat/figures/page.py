@@ -133,6 +133,10 @@ def _errors(evaluations: Mapping[str, Evaluation]) -> _Errors:
     return _Errors(it.comparison for it in evaluations.values() if it.comparison is not None)
 
 
+def _percent(part: float) -> str:
+    return f"{100.0 * part:.0f} %"
+
+
 def _number(value: float | None, unit: str = "") -> str:
     return "–" if value is None else f"{value:.3g}{unit}"
 
@@ -192,16 +196,16 @@ def _table(evaluations: Mapping[str, Evaluation]) -> str:
         rows = "–" if it.comparison is None else str(len(it.comparison.rows))
         first = f"<tr><td>{_text(name)}</td><td>{rows}</td>"
         if it.failed is not None:
-            words = f"failed: {_text(it.failed)}"
+            words = f"<div>failed: {_text(it.failed)}</div>"
             lines.append(f'{first}<td class="bad" colspan="{max(1, len(heads))}">{words}</td></tr>')
             continue
         errors = _Errors([it.comparison] if it.comparison else [])
-        share = "–" if it.extrapolated is None else f"{it.extrapolated:.0%}"
+        share = "–" if it.extrapolated is None else _percent(it.extrapolated)
         cells = chosen(
             tips(errors),
             _number(errors.degrees),
             f"<b>{share}</b>" if it.extrapolated else share,
-            f"{it.band.coverage:.0%}" if it.band else "–",
+            _percent(it.band.coverage) if it.band else "–",
             _number(it.pose_mse),
         )
         lines.append(first + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
@@ -209,7 +213,7 @@ def _table(evaluations: Mapping[str, Evaluation]) -> str:
     if len(compared) > 1 and has_tip:
         cells = [str(sum(len(it.rows) for it in compared))]
         cells += chosen(tips(whole), _number(whole.degrees), "", "", "")
-        cells = ["all that were predicted", *cells]
+        cells = ["all predicted", *cells]
         lines.append('<tr class="all">' + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>")
     top = "".join(f"<th>{head}</th>" for head in ("recording", "rows", *heads))
     notes = ["Small figures: parts of the length."] * has_tip
@@ -235,6 +239,10 @@ def _conditions(evaluations: Mapping[str, Evaluation], robot: str) -> str:
     if compared:
         first = compared[0]
         settings = first.trajectory.settings if first.trajectory is not None else None
+        facts["recordings"] = ", ".join(evaluations)
+        facts["rows compared"] = sum(len(it.rows) for it in compared if it.position is not None)
+        if not first.measured.static:
+            facts["time between rows"] = _distinct(f"{_step(it):.4g} s" for it in compared)
         facts["kind"] = type(first.robot).__name__
         facts["length"] = f"{_Errors([first]).length:.4g} m"
         facts["nodes"] = first.robot.nodes
@@ -256,8 +264,13 @@ def _conditions(evaluations: Mapping[str, Evaluation], robot: str) -> str:
         )
     bands = [it.band for it in evaluations.values() if it.band]
     if bands:
-        facts["band"] = f"{bands[0].level:.0%}, of {_distinct(str(it.members) for it in bands)} models" + (
-            f"; {sum(it.failed for it in bands)} without a solution" if any(it.failed for it in bands) else ""
+        facts["band"] = (
+            f"{_percent(bands[0].level)}, of {_distinct(str(it.members) for it in bands)} models"
+            + (
+                f"; {sum(it.failed for it in bands)} without a solution"
+                if any(it.failed for it in bands)
+                else ""
+            )
         )
     facts["knode-cosserat"] = package_version()
     facts["date"] = datetime.datetime.now().astimezone().strftime("%Y-%m-%d %H:%M %Z")
@@ -265,6 +278,11 @@ def _conditions(evaluations: Mapping[str, Evaluation], robot: str) -> str:
         f"<div><dt>{_text(name)}</dt><dd>{_text(value)}</dd></div>" for name, value in facts.items()
     )
     return f"<dl>{items}</dl>"
+
+
+def _step(it: Comparison) -> float:
+    """Return the time between compared rows (s)."""
+    return float(np.median(np.diff(it.time))) if len(it.time) > 1 else float("nan")
 
 
 def _distinct(values: Iterable[str]) -> str:
@@ -284,8 +302,8 @@ def _section(name: str, it: Evaluation) -> str:
     if it.band is not None:
         lost = f" {it.band.failed} more had no solution." if it.band.failed else ""
         parts.append(
-            f"<p>{it.band.coverage:.0%} of the measured coordinates are inside the {it.band.level:.0%} band "
-            f"of {it.band.members} models.{lost} A band is calibrated if the two are equal; if far fewer are "
+            f"<p>{_percent(it.band.coverage)} of the measured coordinates are inside the "
+            f"{_percent(it.band.level)} band of {it.band.members} models.{lost} A band is calibrated if the two are equal; if far fewer are "
             "inside, the models share an error.</p>"
         )
     if it.sensors:
@@ -310,7 +328,7 @@ def _rows_text(it: Comparison) -> str:
     else:
         rows = count_of(len(it.rows), "row") + f" from {it.time[0]:g} to {it.time[-1]:g} s"
         if len(it.rows) > 1:
-            rows += f", {it.time[1] - it.time[0]:.4g} s apart"
+            rows += f", {_step(it):.4g} s apart"
             if it.rows[1] - it.rows[0] > 1:
                 rows += f" (controls every {measured.dt:.4g} s)"
     places = ", ".join(f"{100.0 * at:.3g} %" for at in measured.fractions)
@@ -322,28 +340,26 @@ def _rows_text(it: Comparison) -> str:
 
 
 def _cards(it: Comparison) -> str:
-    thin = len(it.rows) > MOST_POINTS
-    known, several = bool(np.isfinite(it.distance).any()), it.seen.shape[1] > 1
-    left = _card(
-        "Tip, errors and controls"
-        + ("; of neighbouring rows the smallest and the largest value are drawn" if thin else ""),
-        over_time, it,
-    ) if it.seen.shape[1] or it.measured.held_tension.shape[1] else ""  # fmt: skip
-    right = []
+    known = bool(np.isfinite(it.distance).any())
+    thin = "; of neighbouring rows the smallest and the largest value are drawn" * (
+        len(it.rows) > MOST_POINTS
+    )
+    several = it.seen.shape[1] > 1
+    columns: list[list[str]] = [[], []]
+    if it.seen.shape[1] or it.measured.held_tension.shape[1]:
+        columns[0].append(_card(f"Tip, errors and controls{thin}", over_time, it))
     if known:
-        right.append(
+        columns[1].append(
             _card(
                 "Worst instants: shapes from two sides, and the largest error of a body", worst_instants, it
             )
         )
         if several:
-            right.append(_card("Errors along the rod, by body", along_rod, it))
-        right.append(_card("Distribution of the tip's error", histogram, it))
-    if not right:
-        return left
-    return (
-        f'<div class="cards"><div class="stack">{left}</div><div class="stack">{"".join(right)}</div></div>'
-    )
+            columns[1].append(_card("Errors along the rod, by body", along_rod, it))
+        # in the shorter column
+        columns[0 if several else 1].append(_card("Distribution of the tip's error", histogram, it))
+    stacks = "".join(f'<div class="stack">{"".join(cards)}</div>' for cards in columns)
+    return f'<div class="cards">{stacks}</div>'
 
 
 def _card(caption: str, draw: Callable[[Comparison], Any], it: Comparison) -> str:
