@@ -303,8 +303,8 @@ def _section(name: str, it: Evaluation) -> str:
         lost = f" {it.band.failed} more had no solution." if it.band.failed else ""
         parts.append(
             f"<p>{_percent(it.band.coverage)} of the measured coordinates are inside the "
-            f"{_percent(it.band.level)} band of {it.band.members} models.{lost} A band is calibrated if the two are equal; if far fewer are "
-            "inside, the models share an error.</p>"
+            f"{_percent(it.band.level)} band of {it.band.members} models.{lost} A band is calibrated if the "
+            "two are equal; if far fewer are inside, the models share an error.</p>"
         )
     if it.sensors:
         rows = "".join(

@@ -37,8 +37,8 @@ function say(text) {
 
 class Viewer {
   constructor(scene, tracks, rows) {
-    Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: "" });
-    this.parts = { tendons: true, ribs: true, frames: false, path: true };
+    Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: (scene.notes ?? []).join(" ") });
+    this.parts = { tendons: true, ribs: true, frames: false, path: true, measured: true };
     $("title").textContent = scene.title;
     for (const track of tracks) track.wanted = true;
     const starts = tracks.map((track) => track.times[0]);
