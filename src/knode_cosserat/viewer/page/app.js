@@ -127,6 +127,13 @@ class Viewer {
       track.wanted = this.robots[k].group.userData.wanted = !track.wanted;
       this.#seen();
     });
+    const measured = this.tracks.map((track) => track.measured).filter(Boolean);
+    if (measured.length) {
+      $("error-panel").querySelector("h2").firstChild.textContent = "Tip error, predicted and measured ";
+      this.legend.add("var(--target)", "measured");
+      const levels = new Set(measured.map(({ level }) => level).filter(Boolean));
+      for (const level of levels) this.legend.add("color-mix(in srgb, var(--accent) 30%, transparent)", `${Math.round(100 * level)} % band`);
+    }
     this.tensions = new Tensions($("tension"), this.robots, this.range);
     $("scale").textContent = this.#scale();
     this.hover = new Hover(this.stage, this.robots, { box: $("hover"), mark: $("hover-mark"), field: () => this.panels.field });

@@ -161,7 +161,7 @@ export class Panels {
       track.body("predicted", last, moment, b);
       return [`${shown.length > 1 ? `${track.name} ` : ""}${distance(apart([...a], [...b]))}`];
     });
-    const text = `predicted and measured${words.length ? `: ${words.join(", ")}` : ""}`;
+    const text = words.join(", ");
     if ($("error-now").textContent !== text) $("error-now").textContent = text;
   }
 
