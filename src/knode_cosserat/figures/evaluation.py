@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from knode_cosserat.figures.drawing import AXES, curves_of, legend_above
 from knode_cosserat.figures.style import PALETTE, new_figure
+from knode_cosserat.rods.wrapped import nominal_model
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -85,6 +86,8 @@ def worst_instants(it: Comparison) -> Figure:
     half = 1.1 * np.maximum(half, THINNEST * half.max())
     factor, unit = length_unit(2.0 * float(half.max()))
     across, up = half[views[0][0]], half[views[0][1]]
+    gravity = np.asarray(getattr(nominal_model(it.robot), "gravity", 0.0), dtype=float)
+    down = gravity if gravity.shape == half.shape else np.zeros(half.shape)
     wide = (WIDTH - 0.75) / INSTANTS
     with new_figure(WIDTH, 0.85 + len(views) * (0.22 + wide * up / across)) as figure:
         grid = figure.subplots(len(views), INSTANTS, squeeze=False, sharex="row", sharey="row")
@@ -92,7 +95,9 @@ def worst_instants(it: Comparison) -> Figure:
             for axes, view in zip(grid[:, column], views, strict=True):
                 _draw_shape(axes, [curve[column] for curve in curves], seen[column], predicted[column], view)
                 for name, k in zip("xy", view, strict=True):
-                    getattr(axes, f"set_{name}lim")(centre[k] - half[k], centre[k] + half[k])
+                    # what hangs down is drawn so
+                    towards = -half[k] if name == "y" and down[k] > 0.0 else half[k]
+                    getattr(axes, f"set_{name}lim")(centre[k] - towards, centre[k] + towards)
                 axes.set_aspect("equal")
                 axes.set_xlabel(f"{AXES[view[0]]} [{unit}]")
                 _scale(axes, factor)

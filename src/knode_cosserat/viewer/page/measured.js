@@ -14,16 +14,20 @@ export class Measured {
     Object.assign(this, { track, size });
     const { seen, low } = track.measured.arrays;
     this.count = seen.width / 3;
-    this.ball = new THREE.MeshStandardMaterial({ roughness: 0.6 });
+    // seen through the robot, which may be thick
+    const through = { depthTest: false, transparent: true };
+    this.ball = new THREE.MeshStandardMaterial({ roughness: 0.6, ...through });
     this.balls = Array.from({ length: this.count }, () => new THREE.Mesh(new THREE.SphereGeometry(BALL * size, 24, 16), this.ball));
     const lines = new THREE.BufferGeometry();
     lines.setAttribute("position", new THREE.BufferAttribute(new Float32Array(6 * this.count), 3));
-    this.line = new THREE.LineBasicMaterial();
+    this.line = new THREE.LineBasicMaterial(through);
     this.errors = new THREE.LineSegments(lines, this.line);
     this.errors.frustumCulled = false;
     this.band = new THREE.MeshStandardMaterial({ color: colour, transparent: true, opacity: BAND, depthWrite: false });
     this.bands = low ? this.balls.map(() => new THREE.Mesh(new THREE.SphereGeometry(1, 32, 24), this.band)) : [];
     this.objects = [...this.balls, this.errors, ...this.bands];
+    this.errors.renderOrder = 1;
+    for (const ball of this.balls) ball.renderOrder = 2;
     this.point = [new Float32Array(3), new Float32Array(3)];
     this.recolour(colour);
   }
