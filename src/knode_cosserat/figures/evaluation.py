@@ -49,7 +49,7 @@ def over_time(it: Comparison) -> Figure:
         drawn.append(_distance(it))
     if np.isfinite(it.angle).any():
         drawn.append(_angle(it))
-    if it.measured.held_tension.shape[1]:
+    if it.control.shape[1]:
         drawn.append(_controls(it))
     with new_figure(WIDTH, 0.6 + 0.95 * len(drawn)) as figure:
         column = figure.subplots(len(drawn), 1, sharex=True, squeeze=False)[:, 0]
@@ -250,7 +250,7 @@ def _angle(it: Comparison) -> Any:
 
 def _controls(it: Comparison) -> Any:
     def draw(axes: Any) -> None:
-        values, layout = it.measured.held_tension[it.rows], it.robot.control_layout
+        values, layout = it.control, it.robot.control_layout
         count = values.shape[1]
         lines = []
         for k in range(count):

@@ -346,7 +346,7 @@ def _cards(it: Comparison) -> str:
     )
     several = it.seen.shape[1] > 1
     columns: list[list[str]] = [[], []]
-    if it.seen.shape[1] or it.measured.held_tension.shape[1]:
+    if it.seen.shape[1] or it.control.shape[1]:
         columns[0].append(_card(f"Tip, errors and controls{thin}", over_time, it))
     if known:
         columns[1].append(

@@ -91,6 +91,11 @@ class Comparison:
         return self.measured.time[self.rows]
 
     @property
+    def control(self) -> Float[np.ndarray, "T c"]:
+        """Measured controls, each held to the next row of the recording."""
+        return self.measured.tension[self.rows]
+
+    @property
     def seen(self) -> Float[np.ndarray, "T M d"]:
         """Measured positions of the bodies (m); NaN in rows that do not count."""
         known = self.measured.complete[self.rows]
