@@ -160,12 +160,12 @@ def histogram(it: Comparison) -> Figure:
 
 def worst_rows(it: Comparison) -> list[int]:
     """Return the rows with the largest error of any body, apart from each other, the worst first."""
-    error = np.nan_to_num(np.max(np.nan_to_num(it.distance, nan=-1.0), axis=1), nan=-1.0)
-    apart = 0.0 if it.measured.static else APART * float(np.ptp(it.time))
+    error, at = np.max(np.nan_to_num(it.distance, nan=-1.0), axis=1), _abscissa(it)
+    apart = 0.0 if it.measured.static else APART * float(np.ptp(at))
     rows: list[int] = []
     while len(rows) < INSTANTS and error.max() >= 0.0:
         rows.append(int(np.argmax(error)))
-        error[np.abs(it.time - it.time[rows[-1]]) <= apart] = -1.0
+        error[np.abs(at - at[rows[-1]]) <= apart] = -1.0
     return rows
 
 
@@ -177,9 +177,9 @@ def _abscissa(it: Comparison) -> Float[np.ndarray, " T"]:
 
 
 def _plot(axes: Any, it: Comparison, values: NDArray[np.float64], **look: Any) -> None:
-    """Draw values over the rows: a line, or points of separate equilibria."""
+    """Draw values over the rows: a line, or points of separate equilibria and of a single row."""
     x = _abscissa(it)
-    if it.measured.static:
+    if it.measured.static or len(x) == 1:
         size = 1.7 * look["linewidth"]
         axes.plot(
             x, values, "o", markersize=size, markeredgewidth=0.0, color=look["color"], label=look.get("label")
@@ -255,7 +255,7 @@ def _controls(it: Comparison) -> Any:
         lines = []
         for k in range(count):
             look = {"color": PALETTE[k % len(PALETTE)], "linewidth": max(0.6, 1.6 - 0.3 * k)}
-            if it.measured.static:
+            if it.measured.static or len(it.rows) == 1:
                 lines += axes.plot(_abscissa(it), values[:, k], ".", markersize=2.5, color=look["color"])
             else:
                 lines += axes.plot(*thinned(it.time, values[:, k]), drawstyle="steps-post", **look)

@@ -241,7 +241,7 @@ def _conditions(evaluations: Mapping[str, Evaluation], robot: str) -> str:
         settings = first.trajectory.settings if first.trajectory is not None else None
         facts["recordings"] = ", ".join(evaluations)
         facts["rows compared"] = sum(len(it.rows) for it in compared if it.position is not None)
-        if not first.measured.static:
+        if not first.measured.static and len(first.rows) > 1:
             facts["time between rows"] = _distinct(f"{_step(it):.4g} s" for it in compared)
         facts["kind"] = type(first.robot).__name__
         facts["length"] = f"{_Errors([first]).length:.4g} m"

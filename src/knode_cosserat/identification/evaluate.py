@@ -185,7 +185,9 @@ class Evaluation:
             )
         if self.extrapolated:
             parts.append(f"{self.extrapolated:.0%} of the rows extrapolated")
-        return ", ".join(parts)
+        return (
+            ", ".join(parts) or "nothing to compare: no row has the positions of all bodies and the controls"
+        )
 
 
 def coverage(
