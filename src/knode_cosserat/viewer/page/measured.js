@@ -1,10 +1,12 @@
-// Measured bodies of a recording beside their prediction: balls, the errors as lines, and the band of the prediction.
+// Measured bodies of a recording beside their prediction: balls, the errors as bars, and the band of the prediction.
 import * as THREE from "three";
 
 const style = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
-/** Radius of a ball, as a part of the size of the scene. */
+/** Radius of a ball, and of a bar of an error, as parts of the size of the scene. */
 const BALL = 0.009;
+const BAR = 0.0022;
+const UP = new THREE.Vector3(0, 1, 0);
 /** Opacity of the band. */
 const BAND = 0.22;
 
@@ -18,48 +20,45 @@ export class Measured {
     const through = { depthTest: false, transparent: true };
     this.ball = new THREE.MeshStandardMaterial({ roughness: 0.6, ...through });
     this.balls = Array.from({ length: this.count }, () => new THREE.Mesh(new THREE.SphereGeometry(BALL * size, 24, 16), this.ball));
-    const lines = new THREE.BufferGeometry();
-    lines.setAttribute("position", new THREE.BufferAttribute(new Float32Array(6 * this.count), 3));
-    this.line = new THREE.LineBasicMaterial(through);
-    this.errors = new THREE.LineSegments(lines, this.line);
-    this.errors.frustumCulled = false;
+    this.bar = new THREE.MeshBasicMaterial(through);
+    this.bars = this.balls.map(() => new THREE.Mesh(new THREE.CylinderGeometry(BAR * size, BAR * size, 1, 10), this.bar));
     this.band = new THREE.MeshStandardMaterial({ color: colour, transparent: true, opacity: BAND, depthWrite: false });
     this.bands = low ? this.balls.map(() => new THREE.Mesh(new THREE.SphereGeometry(1, 32, 24), this.band)) : [];
-    this.objects = [...this.balls, this.errors, ...this.bands];
-    this.errors.renderOrder = 1;
+    this.objects = [...this.balls, ...this.bars, ...this.bands];
+    for (const bar of this.bars) bar.renderOrder = 1;
     for (const ball of this.balls) ball.renderOrder = 2;
-    this.point = [new Float32Array(3), new Float32Array(3)];
     this.recolour(colour);
   }
 
   recolour(colour) {
     this.ball.color.set(style("--target"));
-    this.line.color.set(style("--bad"));
+    this.bar.color.set(style("--bad"));
     this.band.color.set(colour);
   }
 
   /** Draw a moment of the track, while `wanted`. */
   update(moment, wanted) {
-    const { position } = this.errors.geometry.attributes;
-    const [a, b] = this.point;
+    const [a, b] = [new Float32Array(3), new Float32Array(3)];
     for (let k = 0; k < this.count; k++) {
-      const known = this.track.body("seen", k, moment, a);
-      this.balls[k].visible = wanted && known;
-      if (known) this.balls[k].position.fromArray(a);
-      this.track.body("predicted", k, moment, b);
-      position.array.set(b, 6 * k);
-      position.array.set(known ? a : b, 6 * k + 3);
+      const known = this.track.body("seen", k, moment, a) && this.track.body("predicted", k, moment, b);
+      this.balls[k].visible = this.bars[k].visible = wanted && known;
+      if (known) this.#place(k, new THREE.Vector3(...a), new THREE.Vector3(...b));
       if (!this.bands[k]) continue;
-      const [low, high] = this.point;
-      const inside = this.track.body("low", k, moment, low) && this.track.body("high", k, moment, high);
+      const inside = this.track.body("low", k, moment, a) && this.track.body("high", k, moment, b);
       this.bands[k].visible = wanted && inside;
-      if (!inside) continue;
-      for (let c = 0; c < 3; c++) {
-        this.bands[k].position.setComponent(c, 0.5 * (low[c] + high[c]));
-        this.bands[k].scale.setComponent(c, Math.max(0.5 * (high[c] - low[c]), 1e-4 * this.size));
+      for (let c = 0; inside && c < 3; c++) {
+        this.bands[k].position.setComponent(c, 0.5 * (a[c] + b[c]));
+        this.bands[k].scale.setComponent(c, Math.max(0.5 * (b[c] - a[c]), 1e-4 * this.size));
       }
     }
-    this.errors.visible = wanted;
-    position.needsUpdate = true;
+  }
+
+  #place(k, seen, predicted) {
+    const bar = this.bars[k];
+    this.balls[k].position.copy(seen);
+    bar.position.copy(seen).add(predicted).multiplyScalar(0.5);
+    const error = predicted.sub(seen);
+    bar.scale.y = Math.max(error.length(), 1e-6 * this.size);
+    bar.quaternion.setFromUnitVectors(UP, error.normalize());
   }
 }
