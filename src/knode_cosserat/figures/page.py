@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from knode_cosserat._arguments import check_arguments
+from knode_cosserat._arguments import check_arguments, kind_text
 from knode_cosserat._files.writing import package_version, replacing
 from knode_cosserat._reprs import count_of
 from knode_cosserat.figures.evaluation import (
@@ -53,13 +53,18 @@ def evaluation_page(
         The path.
 
     Raises:
-        ValueError: there is no evaluation.
+        ValueError: there is no evaluation, or one is another object.
     """
     check_arguments(evaluation_page, locals())
     require_matplotlib()
     by_name = dict(evaluations) if isinstance(evaluations, Mapping) else {"recording": evaluations}
     if not by_name:
         raise ValueError("there are no evaluations to show; at least one is needed")
+    for name, it in by_name.items():
+        if not hasattr(it, "comparison"):
+            raise ValueError(
+                f"evaluations: {name} is {kind_text(it)}; allowed is an Evaluation (from identification.evaluate)"
+            )
     text = _document(by_name, robot)
     with replacing(Path(path)) as temporary:
         temporary.write_text(text, encoding="utf-8")
