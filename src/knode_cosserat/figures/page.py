@@ -63,7 +63,8 @@ def evaluation_page(
     for name, it in by_name.items():
         if not hasattr(it, "comparison"):
             raise ValueError(
-                f"evaluations: {name} is {kind_text(it)}; allowed is an Evaluation (from identification.evaluate)"
+                f"evaluations: {name} is {kind_text(it)}; allowed is an Evaluation "
+                "(from identification.evaluate)"
             )
     text = _document(by_name, robot)
     with replacing(Path(path)) as temporary:
