@@ -69,6 +69,9 @@ def test_the_prediction_has_the_times_of_the_recording(softer, seen):
     np.testing.assert_array_equal(it.trajectory.time, later.time[it.rows])
     np.testing.assert_array_equal(it.time, later.time[it.rows])
     np.testing.assert_allclose(it.trajectory.tip_position, it.position[:, -1], atol=1e-12)
+    for wrong in ({"every": 0}, {"last": 0}):
+        with pytest.raises(ValueError, match=r"must be a number of rows from 1 on \(got 0\)"):
+            evaluate(softer, later, **wrong)
 
 
 def test_bodies_without_orientation_leave_those_of_the_others(softer, seen, found):

@@ -145,13 +145,13 @@ class Evaluation:
     @property
     def tip(self) -> Float[np.ndarray, "T 3"] | None:
         """Predicted positions of the last body (m), or None."""
-        found = self.comparison and self.comparison.position
+        found = None if self.comparison is None else self.comparison.position
         return None if found is None or not found.shape[1] else found[:, -1]
 
     @property
     def band(self) -> Band | None:
         """Band of an ensemble's predictions, or None."""
-        return self.comparison and self.comparison.band
+        return None if self.comparison is None else self.comparison.band
 
     def to_dict(self) -> dict[str, Any]:
         """Return the errors, or the reason of a failure, as plain JSON values."""
@@ -296,6 +296,9 @@ def evaluate(
 
     Returns:
         The `Evaluation` over the rows in which all bodies were seen; with `failed` if a step has no solution.
+
+    Raises:
+        ValueError: `every` or `last` is less than one.
     """
     check_arguments(evaluate, locals())
     measured = Measurements.of(measured)
@@ -333,6 +336,9 @@ def _name(space: str | SpaceScheme) -> str:
 
 
 def _rows(measured: Measurements, every: int, last: int | None) -> Int[np.ndarray, " T"]:
+    for name, value in (("every", every), ("last", last)):
+        if value is not None and value < 1:
+            raise ValueError(f"{name} must be a number of rows from 1 on (got {value})")
     return np.arange(len(measured.time))[::every][:last]
 
 
@@ -413,13 +419,14 @@ def _errors(it: Comparison, robot: System, moved: Trajectory) -> Evaluation:
     position, turned = np.asarray(it.position), np.asarray(it.turned)
     known, bodies = it.measured.complete[it.rows], bool(len(it.measured.fractions))
     tip = (position[known, -1], it.seen[known, -1]) if bodies and known.any() else None
+    quaternion = np.asarray(it.quaternion)
     oriented = np.isfinite(turned).all(axis=(1, 2)) & known
     mse = None
     if bodies and oriented.any():
         mse = pose_mse(
             *(
                 types.SimpleNamespace(position=p[oriented], quaternion=h[oriented])
-                for p, h in ((position, it.quaternion), (it.seen, turned))
+                for p, h in ((position, quaternion), (it.seen, turned))
             )
         )
     angle = it.angle[np.isfinite(it.angle)]
