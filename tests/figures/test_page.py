@@ -194,12 +194,15 @@ def test_long_lines_keep_their_extremes():
     np.testing.assert_array_equal(drawn.thinned(time[:10], values[:10])[0], time[:10])
 
 
+@pytest.mark.slow
 def test_the_command_writes_the_page(tmp_path, seen):
     table, out = tmp_path / "seen.csv", tmp_path / "errors.html"
     seen.save(table)
     given = ("evaluate", "delrin-tendon-robot", table, "--dt", DT, "--page", out)
     assert succeeded(*given).endswith(f"wrote {out}\n")
     assert "seen.csv" in words(out.read_text(encoding="utf-8"))
+    succeeded(*given, "--rows", 5)
+    assert "5 rows from 0 to 0.2 s" in words(out.read_text(encoding="utf-8"))
     facts = json.loads(succeeded(*given, "--json"))
     assert facts["page"] == str(out) and facts["recordings"][str(table)]["rotation_rmse"] is not None
     for wrong, said in ((tmp_path / "a.txt", "must end in .html"), (tmp_path / "no" / "a.html", "no folder")):

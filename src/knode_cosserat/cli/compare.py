@@ -131,12 +131,12 @@ def evaluate(
     if sampling.config is not None or not any(is_trajectory(str(path)) for path in references):
         _require_page(page)
         system = load_ensemble_folder(prediction, changes) or load_system(prediction, changes)
-        evaluations = evaluate_on_recordings(system, references, sampling)
+        evaluations = evaluate_on_recordings(system, references, sampling, rows)
         if page:
             kc.figures.evaluation_page(evaluations, page, robot=prediction)
         facts = {"recordings": {name: it.to_dict() for name, it in evaluations.items()}}
-        lines = [f"{name}: {it}" for name, it in evaluations.items()]
-        write_output(report.as_json, facts, lines, **({"page": page} if page else {}))
+        words = [f"{name}: {it}" for name, it in evaluations.items()]
+        write_output(report.as_json, facts, words, **({"page": page} if page else {}))
         return
     if page:
         raise ValueError("--page shows predictions of recordings; the references are trajectories. Use plot")

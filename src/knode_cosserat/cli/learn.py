@@ -262,9 +262,11 @@ def identify(
 
 
 def evaluate_on_recordings(
-    system: System | Ensemble, recordings: list[Path], sampling: Sampling
+    system: System | Ensemble, recordings: list[Path], sampling: Sampling, most: int | None = None
 ) -> dict[str, Evaluation]:
     """Return the evaluations of predictions of recordings from their measured controls, by path.
+
+    At most `most` rows are compared.
 
     A prediction starts at the equilibrium under the first controls. Rotations are relative to the start,
     because the mounting of the tracked bodies is unknown.
@@ -277,5 +279,7 @@ def evaluate_on_recordings(
         count = math.ceil(dt / FINELY - 1e-6) if FINELY < dt < math.inf else 1
         rows = recording.sampled(dt / count, sampling.start, sampling.end, mean=True)
         every = 1 if rows.static else count
-        evaluations[str(path)] = compare(system, rows, every=every, space=sampling.space, recovery=None)
+        evaluations[str(path)] = compare(
+            system, rows, every=every, last=most, space=sampling.space, recovery=None
+        )
     return evaluations

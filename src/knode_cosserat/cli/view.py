@@ -68,7 +68,7 @@ class _Rows(NamedTuple):
 
     def sampling(self, simulation: _Simulation) -> Sampling:
         """Return the rows with their time step and the scheme along the rod."""
-        chosen = {"dt": simulation.dt, "space": simulation.space}
+        chosen: dict[str, Any] = {"dt": simulation.dt, "space": simulation.space}
         return Sampling(*self, **{name: value for name, value in chosen.items() if value is not None})
 
 
