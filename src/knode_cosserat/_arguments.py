@@ -37,6 +37,7 @@ _MAKERS = {
     "LoopLog": "control.run_loop",
     "Modes": "statics.modes",
     "Workspace": "workspace",
+    "Evaluation": "identification.evaluate",
 }
 _WORDS = {
     float: "a number",
@@ -111,13 +112,17 @@ def numbers_of(name: str, values: Any, allowed: str) -> np.ndarray:
         raise ArgumentError(f"{name} is not numbers ({error}); allowed is {allowed}") from None
 
 
+#: namespaces that have classes of arguments
+_SPACES = ("", "robots", "recordings", "control", "statics", "identification")
+
+
 class _Names(dict[str, Any]):
     """Names that annotations use, but their module imports for type checking only: the package's own."""
 
     def __missing__(self, name: str) -> Any:
         package = importlib.import_module(__name__.partition(".")[0])
         # one after the other, because a namespace takes a while to import
-        for space in () if hasattr(builtins, name) else ("", "robots", "recordings", "control", "statics"):
+        for space in () if hasattr(builtins, name) else _SPACES:
             names = getattr(package, space) if space else package
             if name in names.__all__:
                 return getattr(names, name)

@@ -296,7 +296,9 @@ def state_errors(
         true = np.asarray(truth.part(name), dtype=float)[np.ix_(rows, nodes)]
         if name == "h":
             upright = np.broadcast_to([1.0, 0.0, 0.0, 0.0], true.shape)
-            errors[name] = StateError(_rms(_angle(found, true)), _rms(_angle(true, upright)), "rad")
+            errors[name] = StateError(
+                _rms(angle_between(found, true)), _rms(angle_between(true, upright)), "rad"
+            )
         else:
             errors[name] = StateError(_rms(_length(found - true)), _rms(_length(true)), unit)
     return errors
@@ -328,7 +330,7 @@ def _length(vectors: Float[np.ndarray, "T N size"]) -> Any:
     return np.linalg.norm(vectors, axis=-1)
 
 
-def _angle(a: Float[np.ndarray, "T N 4"], b: Float[np.ndarray, "T N 4"]) -> Any:
+def angle_between(a: Float[np.ndarray, "T N 4"], b: Float[np.ndarray, "T N 4"]) -> Any:
     """Return the angle (rad) between orientations, accurate also for small angles."""
     a, b = a / np.linalg.norm(a, axis=-1, keepdims=True), b / np.linalg.norm(b, axis=-1, keepdims=True)
     b = np.where(np.sum(a * b, axis=-1, keepdims=True) < 0.0, -b, b)

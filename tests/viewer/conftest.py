@@ -3,6 +3,8 @@
 Imported within fixtures: see `tests/recordings/conftest.py`.
 """
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -75,6 +77,22 @@ def coarse(truth):
         truth.residual,
         truth.iterations,
         position_error=error,
+    )
+
+
+@pytest.fixture(scope="session")
+def evaluation(truth):
+    """A prediction of three bodies of the truth by a softer robot, with the band of three more."""
+    import knode_cosserat as kc
+
+    seen = kc.recordings.Measurements.of(truth, (0.4, 0.7, 1.0)).rows(0, 41)
+    position = np.array(seen.position)
+    position[30, 1] = np.nan
+    stiffness = truth.system.youngs_modulus
+    others = [truth.system.replace(youngs_modulus=factor * stiffness) for factor in (0.85, 0.95, 1.05)]
+    softer = truth.system.replace(youngs_modulus=0.9 * stiffness)
+    return kc.identification.evaluate(
+        softer, dataclasses.replace(seen, position=position), ensemble=others, space="lobatto2"
     )
 
 

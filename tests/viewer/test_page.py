@@ -110,6 +110,43 @@ def test_two_lie_on_each_other_or_stand_side_by_side(page, truth, prediction):
     assert browser.errors() == []
 
 
+def test_measured_bodies_are_drawn_beside_their_prediction(page, evaluation):
+    browser = page(softer=evaluation)
+    it = evaluation.comparison
+    browser.run("viewer.seek(1.0)")
+    settled(browser)
+    drawn = "viewer.robots[0].measured"
+    np.testing.assert_allclose(
+        browser.run(f"{drawn}.balls.map((ball) => ball.position.toArray())"), it.seen[20], atol=1e-6
+    )
+    centre, half = (it.band.high[20] + it.band.low[20]) / 2, (it.band.high[20] - it.band.low[20]) / 2
+    np.testing.assert_allclose(
+        browser.run(f"{drawn}.bands.map((it) => it.position.toArray())"), centre, atol=1e-6
+    )
+    np.testing.assert_allclose(
+        browser.run(f"{drawn}.bands.map((it) => it.scale.toArray())"), np.maximum(half, 1e-4 * 0.6), atol=1e-4
+    )
+    wanted = 1e3 * it.distance[:, -1]
+    np.testing.assert_allclose(
+        [np.nan if x is None else x for x in browser.run("viewer.panels.errors[0].values")],
+        wanted,
+        rtol=1e-3,
+        atol=1e-3,
+    )
+    said, unit = browser.run("document.getElementById('error-now').textContent").split()
+    assert float(said) == pytest.approx(wanted[20], rel=1e-3) and unit == "mm"
+    assert text(browser, "#legend span") == ["softer", "measured", "90 % band"]
+    # a row in which a body was not seen counts for none
+    browser.run("viewer.seek(1.5)")
+    settled(browser)
+    assert browser.run(f"{drawn}.balls.map((ball) => ball.visible)") == [False] * 3
+    browser.run("viewer.seek(1.0)")
+    browser.run("document.querySelector('[data-part=measured]').click()")
+    settled(browser)
+    assert browser.run(f"{drawn}.objects.some((it) => it.visible)") is False
+    assert browser.errors() == []
+
+
 def test_the_distance_of_the_tips_is_that_of_the_states(page, truth, prediction):
     browser = page(truth=truth, prediction=prediction)
     browser.run("viewer.seek(2.0)")

@@ -1,6 +1,7 @@
 """What the page is given: numbers that come back, sizes, names, errors, and nothing that could run."""
 
 import base64
+import dataclasses
 import gzip
 import html.parser
 import json
@@ -144,6 +145,63 @@ def test_robots_of_a_batch_are_shown_one_by_one(truth):
 def test_what_is_no_trajectory_is_named(given, message):
     with pytest.raises(ValueError, match=message):
         scene(given)
+
+
+def test_an_evaluation_brings_what_was_measured_and_its_band(evaluation):
+    shown = scene({"softer": evaluation})
+    (found,) = shown["tracks"]
+    arrays = {name: unpacked(array) for name, array in found["measured"]["arrays"].items()}
+    it = evaluation.comparison
+    expected = {"seen": it.seen, "predicted": it.position, "low": it.band.low, "high": it.band.high}
+    assert set(arrays) == set(expected) and found["measured"]["level"] == 0.9
+    for name, values in expected.items():
+        np.testing.assert_array_equal(arrays[name], values.astype(np.float32))
+    assert np.isnan(arrays["seen"][30]).all() and shown["notes"] == []
+
+
+def test_a_trajectory_is_shown_beside_the_recording_that_it_predicts(prediction, truth):
+    seen = kc.recordings.Measurements.of(truth, (0.5, 1.0))
+    later = dataclasses.replace(seen, time=seen.time + 2.0)
+    for found in scene({"a": prediction, "b": truth}, measured=later)["tracks"]:
+        # both have the clock of the recording
+        np.testing.assert_array_equal(unpacked(found["time"]), later.time)
+        np.testing.assert_array_equal(
+            unpacked(found["measured"]["arrays"]["seen"]), seen.position.astype(np.float32)
+        )
+    with pytest.raises(ValueError, match=r"trajectory has 61 rows and the recording 5; .*predict"):
+        scene(truth, measured=seen.rows(0, 5))
+
+
+def test_a_prediction_that_failed_is_told(truth):
+    failed = kc.identification.Evaluation(failed="no solution found")
+    shown = scene({"good": truth, "bad": failed})
+    assert [each["name"] for each in shown["tracks"]] == ["good"]
+    assert shown["notes"] == ["bad: no prediction: no solution found"]
+    with pytest.raises(ValueError, match="bad: no prediction: no solution found"):
+        scene({"bad": failed})
+
+
+def test_the_command_shows_predictions_of_recordings(truth, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    kc.recordings.Measurements.of(truth, (0.5, 1.0)).rows(0, 11).save("seen.csv")
+    kc.save_robot(truth.system, "robot.yaml")
+
+    def ended(*arguments):
+        monkeypatch.setattr("sys.argv", ["x", "view", *arguments, "--export", "scene.html"])
+        with pytest.raises(SystemExit) as end:
+            main()
+        return end.value.code, capsys.readouterr()
+
+    code, _ = ended("robot.yaml", "seen.csv", "--dt", "0.05", "--seconds", "0.4")
+    shown = json.loads(Scripts((tmp_path / "scene.html").read_text(encoding="utf-8")).found["scene"])
+    assert code == 0 and [each["name"] for each in shown["tracks"]] == ["seen.csv"]
+    seen = unpacked(shown["tracks"][0]["measured"]["arrays"]["seen"])
+    np.testing.assert_allclose(seen[:, 1], truth.tip_position[:9], atol=1e-6)
+    truth.save("truth.nc")
+    code, said = ended("truth.nc", "seen.csv")
+    assert code == 2 and "this is a trajectory; a robot or model predicts" in said.err
+    code, said = ended("truth.nc", "--start", "1")
+    assert code == 2 and "as --config, --start and --seconds" in said.err
 
 
 def test_a_target_is_three_numbers_in_metres(truth):

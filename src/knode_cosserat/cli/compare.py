@@ -98,26 +98,30 @@ def evaluate(
     sampling: Sampling,
     report: Report,
     rows: int | None = None,
+    page: Path | None = None,
 ) -> None:
     """Compute the error of a prediction against references.
 
-    Tip RMSE: root mean square distance of the tips (m). Tip DTW: dynamic-time-warping distance between the
-    tip paths (m). Pose MSE: mean squared error of positions and Euler angles, times 1000. DTW and MSE are
-    defined as in the paper. Orientations: root mean square angle between them, in --json as rotation_rmse
-    (rad).
+    Tip RMSE: root mean square distance of the tips (m). Orientations: root mean square angle between them, in
+    --json as rotation_rmse (rad). Tip DTW: dynamic-time-warping distance between the tip paths (m). Pose MSE:
+    mean squared error of positions and Euler angles, times 1000; the angles jump at 180 degrees. DTW and MSE
+    are defined as in the paper.
 
-    A recording is predicted from its measured tensions, starting at the equilibrium under the first ones.
-    Rotations are relative to the start. --config, --start, --seconds, --dt and --space apply to recordings.
+    A recording is predicted from its measured controls, starting at the equilibrium under the first ones.
+    Rotations are relative to the start. --config, --start, --seconds, --dt, --space and --page apply to
+    recordings. An ensemble also gives the part of the measured positions inside its 90 % band.
 
     Options:
         references (REFERENCE): Trajectory files (.nc); or recordings: bags or tables.
         rows (--rows N≥1): Compare only the first N rows; the paper's tables use 100.
+        page (--page FILE.html): Write errors, figures and conditions to this HTML file.
 
     Examples:
         evaluate prediction.nc truth.nc
         evaluate model truth.nc
         evaluate delrin-tendon-robot truth.nc --set youngs_modulus=10e9 --rows 100
         evaluate found.yaml unseen.bag --json
+        evaluate found.yaml unseen.bag other.bag --page errors.html
         evaluate my-robot.yaml a.csv b.csv --config my-recording.yaml --start 1
     """
     import knode_cosserat as kc
@@ -125,12 +129,21 @@ def evaluate(
     prediction, changes = predictor
     _require_one_kind(prediction, references, sampling.config)
     if sampling.config is not None or not any(is_trajectory(str(path)) for path in references):
-        system = load_system(prediction, changes)
-        return evaluate_on_recordings(system, references, sampling, report.as_json)
+        _require_page(page)
+        system = load_ensemble_folder(prediction, changes) or load_system(prediction, changes)
+        evaluations = evaluate_on_recordings(system, references, sampling, rows)
+        if page:
+            kc.figures.evaluation_page(evaluations, page, robot=prediction)
+        facts = {"recordings": {name: it.to_dict() for name, it in evaluations.items()}}
+        words = [f"{name}: {it}" for name, it in evaluations.items()]
+        write_output(report.as_json, facts, words, **({"page": page} if page else {}))
+        return
+    if page:
+        raise ValueError("--page shows predictions of recordings; the references are trajectories. Use plot")
     source = predictor.load()
     compared: list[dict[str, Any]] = []
     metrics = kc.metrics
-    measures = (metrics.tip_dtw, metrics.pose_mse, metrics.tip_rmse, metrics.rotation_rmse)
+    measures = (metrics.tip_rmse, metrics.rotation_rmse, metrics.tip_dtw, metrics.pose_mse)
     for path in references:
         reference = load_trajectory_file(path)
         try:
@@ -143,10 +156,10 @@ def evaluate(
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from None
         compared.append({"reference": str(path), "rows": len(reference.time[:rows]), **errors})
-    heads = ["reference", "rows", "tip DTW [m]", "pose MSE [1e-3]", "tip RMSE [m]", "orientations [deg]"]
+    heads = ["reference", "rows", "tip RMSE [m]", "orientations [deg]", "tip DTW [m]", "pose MSE [1e-3]"]
     lines = [heads]
-    for name, count, *numbers, angle in (one.values() for one in compared):
-        lines.append([name, str(count), *(f"{each:.4g}" for each in (*numbers, np.degrees(angle)))])
+    for name, count, tip, angle, *paper in (one.values() for one in compared):
+        lines.append([name, str(count), *(f"{each:.4g}" for each in (tip, np.degrees(angle), *paper))])
     write_output(report.as_json, {"prediction": prediction, "references": compared}, table(lines))
 
 
@@ -223,6 +236,16 @@ def animate(
     view = look.of(next(iter(states.values())))
     drawing.animate(states, out, fps=pace.fps, speed=pace.speed, view=view, columns=look.columns)
     write_output(as_json, {"trajectories": [str(path) for path in trajectories]}, [], out=out)
+
+
+def _require_page(path: Path | None) -> None:
+    """Raise `ValueError` or `ImportError` before a long computation if a page cannot be written."""
+    if path is None:
+        return
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise ValueError(f"{path}: the name of a page must end in .html")
+    require_writable(path)
+    figures()
 
 
 def _distinct_trajectories(paths: list[Path]) -> dict[str, Trajectory]:

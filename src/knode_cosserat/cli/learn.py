@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
@@ -31,7 +31,9 @@ from knode_cosserat.cli.summaries import residual_summary
 from knode_cosserat.recordings.formats import read_suffixes
 
 if TYPE_CHECKING:
+    from knode_cosserat.identification import Evaluation
     from knode_cosserat.learning.config import FitConfig
+    from knode_cosserat.learning.ensemble import Ensemble
     from knode_cosserat.rods.system import System
 
 
@@ -265,22 +267,25 @@ def identify(
     write_output(report.as_json, facts, str(identified).splitlines(), out=search.out)
 
 
-def evaluate_on_recordings(system: System, recordings: list[Path], sampling: Sampling, as_json: bool) -> None:
-    """Predict recordings from their measured tensions; print tip RMSE and pose MSE of each.
+def evaluate_on_recordings(
+    system: System | Ensemble, recordings: list[Path], sampling: Sampling, most: int | None = None
+) -> dict[str, Evaluation]:
+    """Return the evaluations of predictions of recordings from their measured controls, by path.
 
-    A prediction starts at the equilibrium under the first tensions. Rotations are relative to the start,
+    At most `most` rows are compared.
+
+    A prediction starts at the equilibrium under the first controls. Rotations are relative to the start,
     because the mounting of the tracked bodies is unknown.
     """
     from knode_cosserat.identification.evaluate import evaluate as compare
 
-    facts: dict[str, Any] = {}
-    lines, dt = [], sampling.dt
+    evaluations, dt = {}, sampling.dt
     for path, recording in zip(recordings, load_recordings(recordings, sampling.config), strict=True):
-        # coarse rows would lose the tensions between them: predict finely, and compare every few rows
+        # coarse rows would lose the controls between them: predict finely, and compare every few rows
         count = math.ceil(dt / FINELY - 1e-6) if FINELY < dt < math.inf else 1
         rows = recording.sampled(dt / count, sampling.start, sampling.end, mean=True)
         every = 1 if rows.static else count
-        evaluation = compare(system, rows, every=every, space=sampling.space, recovery=None)
-        facts[str(path)] = evaluation.to_dict()
-        lines.append(f"{path}: {evaluation}")
-    write_output(as_json, {"recordings": facts}, lines)
+        evaluations[str(path)] = compare(
+            system, rows, every=every, last=most, space=sampling.space, recovery=None
+        )
+    return evaluations

@@ -1,9 +1,10 @@
 """Figures of trajectories in one style, for a screen or a paper; they need matplotlib, the extra `viz`.
 
-Every function returns a new `matplotlib.figure.Figure`. No window is opened and no global setting changes.
-`figure.savefig("it.pdf")` (or .svg, .png) embeds the fonts. The colours are Okabe and Ito's, and every axis
-has its unit. `columns` sets the width: one column of a paper (3.5 in) or two (7.16 in). `trajectories` is one
-trajectory, or a dict of several by label, which are overlaid. Each is of one robot; unsolved rows stay empty.
+Every function returns a new `matplotlib.figure.Figure`; `animate` and `evaluation_page` write a file. No
+window is opened and no global setting changes. `figure.savefig("it.pdf")` (or .svg, .png) embeds the fonts.
+The colours are Okabe and Ito's, and every axis has its unit. `columns` sets the width: one column of a paper
+(3.5 in) or two (7.16 in). `trajectories` is one trajectory, or a dict of several by label, which are
+overlaid. Each is of one robot; unsolved rows stay empty.
 
 Raises, from every function here:
     ImportError: matplotlib is not installed.
@@ -12,6 +13,7 @@ Raises, from every function here:
 
 from knode_cosserat.figures.animation import animate
 from knode_cosserat.figures.comparison import compare
+from knode_cosserat.figures.page import evaluation_page
 from knode_cosserat.figures.recordings import health, prediction_against_measurement
 from knode_cosserat.figures.residuals import residual
 from knode_cosserat.figures.trajectories import (
@@ -30,7 +32,7 @@ from knode_cosserat.figures.trajectories import (
 )
 
 __all__ = [
-    "animate", "closed_loop", "compare", "curves", "error", "health", "overview", "path",
+    "animate", "closed_loop", "compare", "curves", "error", "evaluation_page", "health", "overview", "path",
     "prediction_against_measurement", "residual", "shape", "spread", "states", "tensions", "tips",
     "vibration", "workspace",
 ]  # fmt: skip

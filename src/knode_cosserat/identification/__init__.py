@@ -2,13 +2,14 @@
 
 from knode_cosserat.estimation.parameters import Number, PossibleEffect, numbers_at
 from knode_cosserat.identification.effects import effects_of, register
-from knode_cosserat.identification.evaluate import Evaluation, evaluate, predict
+from knode_cosserat.identification.evaluate import Comparison, Evaluation, evaluate, predict
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.result import Estimate, IdentificationError, Identified
 
 __all__ = [
+    "Comparison",
     "Estimate",
     "Evaluation",
     "Experiment",

@@ -14,11 +14,15 @@ import sys
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat.viewer.scene import Given, Point, scene
+
+if TYPE_CHECKING:
+    from knode_cosserat.recordings.measurements import Measurements
+    from knode_cosserat.recordings.recording import Recording
 
 #: folder of this package
 HERE = Path(__file__).parent
@@ -36,21 +40,29 @@ _POLICY = (
 
 
 def export_scene(
-    trajectories: Given, path: str | Path, *, title: str | None = None, target: Point | None = None
+    trajectories: Given,
+    path: str | Path,
+    *,
+    title: str | None = None,
+    target: Point | None = None,
+    measured: Recording | Measurements | None = None,
 ) -> Path:
     """Write trajectories as one HTML file that any browser opens, without a server or a network.
 
     Args:
         trajectories: a `Trajectory`, several, or several by name; a batch is shown as separate trajectories.
+            An `Evaluation` is shown with the measured bodies and the band of its prediction.
         path: the file to write.
         title: heading of the page; by default the names.
         target: position (x, y, z) in m that is marked, with the distance of every tip to it.
+        measured: recording that the trajectories predict, row by row; its bodies are drawn beside them.
 
     Raises:
-        ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible target.
+        ValueError: no trajectory, more than 12, one that has nothing to be drawn, an impossible target, or
+            another number of rows than the recording.
     """
     check_arguments(export_scene, locals())
-    return write_page(document(scene(trajectories, title, target)), Path(path))
+    return write_page(document(scene(trajectories, title, target, measured)), Path(path))
 
 
 def write_page(text: str, path: Path) -> Path:
@@ -104,28 +116,31 @@ def view(
     *,
     title: str | None = None,
     target: Point | None = None,
+    measured: Recording | Measurements | None = None,
     port: int = 0,
     open_browser: Opening = True,
 ) -> None:
     """Show trajectories in the browser until interrupted (Ctrl-C).
 
     Args:
-        trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one.
+        trajectories: a `Trajectory`, several, or several by name; those of a batch are shown one by one. An
+            `Evaluation` is shown with the measured bodies and the band of its prediction.
         title: heading of the page; by default the names.
         target: position (x, y, z) in m that is marked, with the distance of every tip to it.
+        measured: recording that the trajectories predict, row by row; its bodies are drawn beside them.
         port: port of the server, which only this machine reaches; 0 for any free one.
         open_browser: True opens the page and prints its address; False only prints it. A function is called
             with the address instead.
 
     Raises:
-        ValueError: no trajectory, more than 12, one that has nothing to be drawn, or an impossible target or
-            port.
+        ValueError: no trajectory, more than 12, one that has nothing to be drawn, an impossible target or
+            port, or another number of rows than the recording.
         OSError: the port is taken.
     """
     check_arguments(view, locals())
     import http.server
 
-    page = document(scene(trajectories, title, target)).encode("utf-8")
+    page = document(scene(trajectories, title, target, measured)).encode("utf-8")
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:

@@ -12,7 +12,7 @@ import base64
 import gzip
 import reprlib
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import numpy as np
@@ -28,6 +28,11 @@ from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.schemes.result import Result
 from knode_cosserat.trajectory import Trajectory
 
+if TYPE_CHECKING:
+    from knode_cosserat.identification import Comparison
+    from knode_cosserat.recordings.measurements import Measurements
+    from knode_cosserat.recordings.recording import Recording
+
 #: largest number of trajectories in a view
 MOST = 12
 #: limits for long trajectories: most nodes, most numbers in all rows, and least rows
@@ -36,50 +41,136 @@ MOST_NODES, MOST_NUMBERS, LEAST_ROWS = 41, 500_000, 200
 #: largest distance of a target from the origin, in lengths of the longest robot
 FARTHEST_TARGET = 20.0
 
-Given = Trajectory | Sequence[Trajectory] | Mapping[str, Trajectory]
+
+@runtime_checkable
+class EvaluationLike(Protocol):
+    """Protocol of an `Evaluation`: its prediction is drawn with the measured bodies."""
+
+    @property
+    def comparison(self) -> Comparison | None:
+        """The recording beside its prediction."""
+
+    @property
+    def failed(self) -> str | None:
+        """Why there is no prediction, or None."""
+
+
+One = Trajectory | EvaluationLike
+Given = One | Sequence[One] | Mapping[str, One]
 Point = Sequence[float] | np.ndarray
 
 
-def named(trajectories: Given) -> dict[str, Trajectory]:
-    """Return trajectories of one robot each, by name; a batch is split.
+class Shown(NamedTuple):
+    """A trajectory, and the comparison with the recording that it predicts, or None."""
+
+    trajectory: Trajectory
+    comparison: Comparison | None = None
+
+
+def named(
+    given: Given, measured: Recording | Measurements | None = None
+) -> tuple[dict[str, Shown], list[str]]:
+    """Return what is drawn, by name, and the names and reasons of predictions that failed; a batch is split.
 
     Raises:
-        ValueError: a value is not a trajectory, or there are none or too many.
+        ValueError: a value is neither trajectory nor evaluation, there are none or too many, all predictions
+            failed, or a trajectory has other rows than the recording.
     """
-    if isinstance(trajectories, Trajectory):
-        trajectories = {"trajectory": trajectories}
-    if not isinstance(trajectories, Mapping):
-        values: Any = trajectories
+    if isinstance(given, Trajectory):
+        given = {"trajectory": given}
+    elif isinstance(given, EvaluationLike):
+        given = {"prediction": given}
+    if not isinstance(given, Mapping):
+        values: Any = given
         values = list(values) if isinstance(values, Sequence) else [values]
-        trajectories = {f"trajectory {k + 1}": value for k, value in enumerate(values)}
-    by_name: dict[str, Trajectory] = {}
-    for name, value in trajectories.items():
+        given = {f"trajectory {k + 1}": value for k, value in enumerate(values)}
+    by_name: dict[str, Shown] = {}
+    failed: list[str] = []
+    for name, value in given.items():
+        if isinstance(value, EvaluationLike):
+            found = value.comparison
+            if found is None or found.trajectory is None:
+                failed.append(f"{name}: no prediction: {value.failed}")
+            else:
+                by_name[str(name)] = Shown(found.trajectory, found)
+            continue
         if not isinstance(value, Trajectory):
-            raise ValueError(f"{name} is a {type(value).__name__}; allowed is a Trajectory")
+            raise ValueError(f"{name} is a {type(value).__name__}; allowed is a Trajectory or an Evaluation")
         single = np.ndim(value.y) == 3
-        by_name |= {str(name): value} if single else {f"{name} [{k}]": value[k] for k in range(len(value.y))}
+        names = {str(name): value} if single else {f"{name} [{k}]": value[k] for k in range(len(value.y))}
+        by_name |= {each: _beside(it, measured, each) for each, it in names.items()}
+    if failed and not by_name:
+        raise ValueError(failed[0])
     if not 1 <= len(by_name) <= MOST:
         raise ValueError(
             f"there are {len(by_name)} trajectories, those of batches counted singly; allowed is 1 to {MOST}"
         )
-    return by_name
+    return by_name, failed
 
 
-def scene(trajectories: Given, title: str | None = None, target: Point | None = None) -> dict[str, Any]:
-    """Return the page's scene as plain values for JSON. `target` is a position (x, y, z) in m to be marked.
+def _beside(trajectory: Trajectory, measured: Recording | Measurements | None, name: str) -> Shown:
+    """Return a trajectory, row by row beside a recording, if there is one."""
+    if measured is None:
+        return Shown(trajectory)
+    from knode_cosserat.identification.evaluate import compared
+    from knode_cosserat.recordings.measurements import Measurements
+
+    rows = Measurements.of(measured)
+    if len(rows.time) != len(trajectory.time):
+        raise ValueError(
+            f"{name} has {len(trajectory.time)} rows and the recording {len(rows.time)}; both must have the "
+            "same number, as identification.predict(robot, measured) has"
+        )
+    found = compared(trajectory.system, trajectory, rows).comparison
+    return (
+        Shown(trajectory, found)
+        if found is None or found.trajectory is None
+        else Shown(found.trajectory, found)
+    )
+
+
+def scene(
+    given: Given,
+    title: str | None = None,
+    target: Point | None = None,
+    measured: Recording | Measurements | None = None,
+) -> dict[str, Any]:
+    """Return the page's scene as plain values for JSON.
+
+    Args:
+        given: trajectories or evaluations, also by name.
+        title: heading of the page; by default the names.
+        target: position (x, y, z) in m to be marked.
+        measured: recording that the trajectories predict, row by row.
 
     Raises:
-        ValueError: no trajectory, too many, one that has nothing to be drawn, or an impossible target.
+        ValueError: nothing to show, too much, a trajectory that has nothing to be drawn, or an impossible
+            target.
     """
-    by_name = named(trajectories)
+    by_name, failed = named(given, measured)
     tracks = []
-    for name, trajectory in by_name.items():
+    for name, (trajectory, comparison) in by_name.items():
         try:
             tracks.append(track(trajectory, name))
+            if comparison is not None:
+                tracks[-1]["measured"] = bodies(comparison, trajectory)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from None
-    marked = checked_target(target, [trajectory.system for trajectory in by_name.values()])
-    return {"title": title or ", ".join(by_name), "tracks": tracks, "target": marked}
+    marked = checked_target(target, [it.trajectory.system for it in by_name.values()])
+    return {"title": title or ", ".join(by_name), "tracks": tracks, "target": marked, "notes": failed}
+
+
+def bodies(comparison: Comparison, trajectory: Trajectory) -> dict[str, Any]:
+    """Return the page's data of measured bodies and of the band of their predictions."""
+    _, rows = kept(np.shape(trajectory.y), trajectory.system.z_layout.size)
+    arrays = {"seen": comparison.seen, "predicted": np.asarray(comparison.position)}
+    if comparison.band is not None:
+        arrays |= {"low": comparison.band.low, "high": comparison.band.high}
+    return {
+        "source": comparison.measured.source,
+        "arrays": {name: encoded_array(in_space(points[rows]), "f4") for name, points in arrays.items()},
+        "level": comparison.band and comparison.band.level,
+    }
 
 
 def checked_target(target: Point | None, systems: Sequence[System]) -> list[float] | None:
@@ -399,13 +490,19 @@ def positions_of(system: System, y: np.ndarray) -> np.ndarray:
         points = np.asarray(Drawing.of(system).positions(y), dtype=float)
     except AttributeError as error:
         raise ValueError(f"{error}; without positions there is nothing to draw") from None
-    if points.ndim == 3 and points.shape[-1] == 2:
-        points = np.stack([points[..., 0], np.zeros(points.shape[:-1]), points[..., 1]], axis=-1)
+    points = in_space(points)
     if points.ndim != 3 or points.shape[-1] != 3:
         raise ValueError(
             f"a {type(system).__name__} gives positions of shape {points.shape}; "
             "allowed is (T, N, 3) or (T, N, 2)"
         )
+    return points
+
+
+def in_space(points: np.ndarray) -> np.ndarray:
+    """Return points (T, N, 3); those in a plane are put into x and z."""
+    if points.ndim == 3 and points.shape[-1] == 2:
+        return np.stack([points[..., 0], np.zeros(points.shape[:-1]), points[..., 1]], axis=-1)
     return points
 
 

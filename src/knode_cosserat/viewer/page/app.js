@@ -37,8 +37,8 @@ function say(text) {
 
 class Viewer {
   constructor(scene, tracks, rows) {
-    Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: "" });
-    this.parts = { tendons: true, ribs: true, frames: false, path: true };
+    Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: (scene.notes ?? []).join(" ") });
+    this.parts = { tendons: true, ribs: true, frames: false, path: true, measured: true };
     $("title").textContent = scene.title;
     for (const track of tracks) track.wanted = true;
     const starts = tracks.map((track) => track.times[0]);
@@ -127,6 +127,13 @@ class Viewer {
       track.wanted = this.robots[k].group.userData.wanted = !track.wanted;
       this.#seen();
     });
+    const measured = this.tracks.map((track) => track.measured).filter(Boolean);
+    if (measured.length) {
+      $("error-panel").querySelector("h2").firstChild.textContent = "Tip error, predicted and measured ";
+      this.legend.add("var(--target)", "measured");
+      const levels = new Set(measured.map(({ level }) => level).filter(Boolean));
+      for (const level of levels) this.legend.add("color-mix(in srgb, var(--accent) 30%, transparent)", `${Math.round(100 * level)} % band`);
+    }
     this.tensions = new Tensions($("tension"), this.robots, this.range);
     $("scale").textContent = this.#scale();
     this.hover = new Hover(this.stage, this.robots, { box: $("hover"), mark: $("hover-mark"), field: () => this.panels.field });

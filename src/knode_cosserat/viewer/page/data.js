@@ -28,6 +28,8 @@ export class Track {
     const [time, result, error] = await Promise.all([packed.time, packed.result, packed.position_error].map(unpack));
     const names = Object.keys(packed.arrays);
     const arrays = await Promise.all(names.map((name) => unpack(packed.arrays[name])));
+    const { measured } = packed;
+    if (measured) for (const [name, array] of Object.entries(measured.arrays)) measured.arrays[name] = await unpack(array);
     return new Track(packed, [time.values, result.values, error.values], Object.fromEntries(names.map((n, k) => [n, arrays[k]])));
   }
 
@@ -163,6 +165,26 @@ export class Track {
     return a.map((x, k) => x + part * (b[k] - x));
   }
 
+  /** A measured body, or its prediction or band, at a moment; false if it is not known there. */
+  body(name, k, { drawn, part }, into) {
+    const { values, width } = this.measured.arrays[name];
+    for (let c = 0; c < 3; c++) {
+      const a = values[drawn * width + 3 * k + c];
+      into[c] = part > 0 ? a + part * (values[(drawn + 1) * width + 3 * k + c] - a) : a;
+    }
+    return Number.isFinite(into[0] + into[1] + into[2]);
+  }
+
+  /** Distances (m) of the last measured body from its prediction in all rows; null where it was not seen. */
+  tipErrors() {
+    const { seen, predicted } = this.measured.arrays;
+    return this.times.map((_, row) => {
+      const at = (row + 1) * seen.width - 3;
+      const away = Math.hypot(...[0, 1, 2].map((c) => seen.values[at + c] - predicted.values[at + c]));
+      return this.solved[row] && Number.isFinite(away) ? away : null;
+    });
+  }
+
   /** Put a row in the place of the last one if it is of the same time, or else after it. */
   put({ time, result, error, row }) {
     if (time < this.times[this.rows - 1]) this.forget();
@@ -229,8 +251,9 @@ export class Track {
     const low = [Infinity, Infinity, Infinity];
     const high = [-Infinity, -Infinity, -Infinity];
     const places = [this.position, ...this.curves.map(({ array }) => ({ array, offset: 0, flat: true }))];
-    for (const { array, offset, flat } of places) {
-      const { values, width } = this.arrays[array];
+    const arrays = places.map(({ array, ...place }) => ({ ...this.arrays[array], ...place }));
+    if (this.measured?.arrays.seen.width) arrays.push({ ...this.measured.arrays.seen, offset: 0, flat: true });
+    for (const { values, width, offset, flat } of arrays) {
       const stride = flat ? 3 : width / this.nodes;
       for (let i = offset; i + 2 < values.length; i += stride)
         for (let k = 0; k < 3; k++) {

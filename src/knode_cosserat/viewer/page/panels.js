@@ -120,7 +120,7 @@ export class Panels {
   /** Lines anew, after a robot was shown or hidden or the colours changed. */
   renew() {
     this.errors = errorLines(this.tracks, this.colours(), this.target());
-    $("error-panel").hidden = this.tracks.length < 2 && !this.target();
+    $("error-panel").hidden = this.tracks.length < 2 && !this.target() && !this.errors.length;
     this.errorPlot.show(this.errors, "mm");
     this.plotState();
   }
@@ -133,6 +133,10 @@ export class Panels {
   }
 
   #distances(time) {
+    if (this.tracks.some(({ measured }) => measured)) {
+      this.#measured(time);
+      return;
+    }
     const [first, ...others] = this.tracks;
     const a = first.tipAt(time);
     const target = a && this.target(time);
@@ -143,6 +147,21 @@ export class Panels {
     });
     if (target?.now !== undefined) words.unshift(`target ${rough(target.now)}`);
     const text = `to ${first.name}${words.length ? `: ${words.join(", ")}` : ""}`;
+    if ($("error-now").textContent !== text) $("error-now").textContent = text;
+  }
+
+  /** Distances of the last measured bodies from their predictions, in words. */
+  #measured(time) {
+    const [a, b] = [new Float32Array(3), new Float32Array(3)];
+    const shown = this.tracks.filter(({ wanted, measured }) => wanted && measured?.arrays.seen.width);
+    const words = shown.flatMap((track) => {
+      const moment = track.at(time);
+      const last = track.measured.arrays.seen.width / 3 - 1;
+      if (!moment.solved || !track.body("seen", last, moment, a)) return [];
+      track.body("predicted", last, moment, b);
+      return [`${shown.length > 1 ? `${track.name} ` : ""}${distance(apart([...a], [...b]))}`];
+    });
+    const text = words.join(", ");
     if ($("error-now").textContent !== text) $("error-now").textContent = text;
   }
 

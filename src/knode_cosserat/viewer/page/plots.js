@@ -136,6 +136,7 @@ export function fieldLines(tracks, colours, name, component, node) {
 /** Distances (mm) of the other tips from that of the first trajectory, at their own times, and of a moving target. */
 export function errorLines(tracks, colours, target = null) {
   const [first, ...others] = tracks;
+  if (tracks.some(({ measured }) => measured)) return measuredLines(tracks, colours);
   const moving = target ? [{ ...target, colour: style("--target"), dash: 2 }] : [];
   return moving.concat(others.flatMap((track, k) => {
     if (!track.wanted) return [];
@@ -146,6 +147,15 @@ export function errorLines(tracks, colours, target = null) {
     });
     return [{ label: track.name, times: track.times, values, colour: colours[k + 1], dash: 0 }];
   }));
+}
+
+/** Distances (mm) of the last measured bodies from their predictions. */
+function measuredLines(tracks, colours) {
+  return tracks.flatMap((track, k) => {
+    if (!track.wanted || !track.measured?.arrays.seen.width) return [];
+    const values = track.tipErrors().map((away) => (away === null ? null : 1000 * away));
+    return [{ label: track.name, times: track.times, values, colour: colours[k], dash: 0 }];
+  });
 }
 
 export const dashStyle = (c) => ["solid", "dashed", "dotted", "dash-dot"][c % 4];

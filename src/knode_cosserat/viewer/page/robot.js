@@ -1,6 +1,7 @@
 // One robot as it is drawn: rods, tendons, ribs, frames, base, and the path of its tip.
 import * as THREE from "three";
 import { QUANTITY, TENSION, axisColours, rampColour } from "viewer/colours";
+import { Measured } from "viewer/measured";
 import { Tube } from "viewer/tube";
 import { length } from "viewer/units";
 
@@ -30,7 +31,7 @@ export class RobotModel {
     });
     this.points = new Float32Array(3 * nodes);
     this.turns = track.orientation ? new Float32Array(4 * nodes) : null;
-    this.parts = { rods: [], tendons: [], ribs: [], frames: [], path: [], base: [] };
+    this.parts = { rods: [], tendons: [], ribs: [], frames: [], path: [], base: [], measured: [] };
     this.#rods();
     this.ribs = [];
     this.bases = [];
@@ -42,6 +43,10 @@ export class RobotModel {
       this.#base();
     }
     this.#path();
+    if (track.measured?.arrays.seen.width) {
+      this.measured = new Measured(track, this.colour, size);
+      for (const object of this.measured.objects) this.#add("measured", object, false);
+    }
     this.lines = [...this.#rodLines(), ...this.#tendonLines()];
   }
 
@@ -53,6 +58,7 @@ export class RobotModel {
   }
 
   show(part, wanted) {
+    if (part === "measured") this.seen = wanted;
     for (const object of this.parts[part]) object.visible = wanted;
   }
 
@@ -265,6 +271,7 @@ export class RobotModel {
       else mesh.quaternion.setFromUnitVectors(UP, this.#heading(rod.points));
     }
     if (this.axes) this.#orient();
+    this.measured?.update(moment, this.seen);
     this.path?.until(Math.max(0, this.pathRows.filter((row) => row <= moment.drawn).length - 1));
     const opacity = (moment.solved && !moment.coarse ? 1 : FADED) * (this.overlay ? OVERLAY : 1);
     for (const material of [this.material, this.tendonMaterial]) if (material) material.opacity = opacity;
@@ -378,6 +385,7 @@ export class RobotModel {
     if (!this.quantity) this.material.color.set(colour);
     this.material.emissive.set(colour);
     this.#axisColours();
+    this.measured?.recolour(colour);
     this.pathMaterial.color.set(colour);
     this.ghostMaterial.color.set(colour);
   }
