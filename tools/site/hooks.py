@@ -17,7 +17,17 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File
 
 import knode_cosserat as kc
-from tools.site import api, changelog, equations, examples, notebooks, quantities, robot_file, source
+from tools.site import (
+    api,
+    changelog,
+    contributing,
+    equations,
+    examples,
+    notebooks,
+    quantities,
+    robot_file,
+    source,
+)
 
 #: pages that others write: without them the site is whole
 OPTIONAL = ("viewer.md", "notebooks.md")
@@ -29,6 +39,7 @@ LINKS: dict[str, set[str]] = {}
 MADE = {
     "api": api.page,
     "changelog": changelog.page,
+    "contributing": contributing.page,
     "examples": examples.page,
     "notebook": notebooks.page,
     "quantities": quantities.page,
