@@ -134,19 +134,19 @@ def predict(
     """
     check_arguments(predict, locals())
     robot, measured = fix_grid(robot), Measurements.of(measured)
-    initial: Any = "unstressed" if measured.unstressed else None
-    first = measured.tension[0] if measured.static else measured.initial_tension
-    if first is not None and not measured.unstressed:
-        initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     if measured.static:
         return equilibria(
             robot,
             measured.tension,
             space=space,
-            initial=initial,
+            initial="separate",
             recovery_budget=recovery,
             with_stability=False,
         )
+    initial: Any = "unstressed" if measured.unstressed else None
+    first = measured.initial_tension
+    if first is not None and not measured.unstressed:
+        initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     return simulated_rows(
         robot,
         measured.tension[:-1],

@@ -117,11 +117,16 @@ def moved(
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
-        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY, with_stability=False)
         if like.static:
             tension = np.concatenate([initial[None], remove_delay(robot, tension, dt, initial)])
             rows = equilibria(
-                robot, tension, initial=still, space=space, recovery_budget=RECOVERY, with_stability=False
+                robot,
+                tension,
+                initial="separate",
+                space=space,
+                recovery_budget=RECOVERY,
+                with_stability=False,
             )
-            return still, dataclasses.replace(rows, time=dt * rows.time)
+            return rows[:1], dataclasses.replace(rows, time=dt * rows.time)
+        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY, with_stability=False)
         return still, simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)

@@ -65,6 +65,10 @@ class Ends(_Aspect):
         count = len(self.system.y_layout.indices(self.system.base_unknowns))
         return Layout(("tip", count, "", "conditions at the tip"))
 
+    def unloaded(self, y: Any, control: Any) -> Any:
+        """Return y (…, y) of the unloaded system as the control turns it, without stress; by default y."""
+        return y
+
     def poses(self, control: Any) -> tuple[Any, Any]:
         """Return the constrained poses of base and tip under a control; None for a free end."""
         return None, None

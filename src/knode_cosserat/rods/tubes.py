@@ -132,6 +132,10 @@ class _Tubes(CrossSection):
             fields.append(field)
         return tuple(fields)
 
+    def rotations(self, input: Any) -> Any:
+        """Return αᵢ (rad) from the controls."""
+        return input[::2]
+
     @property
     def cuts(self) -> tuple[float, ...]:
         """Bounds of the intervals."""
@@ -369,6 +373,13 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
     """Ends of a robot of tubes."""
 
     rest_is_guess = True
+
+    def unloaded(self, y: Any, control: Any) -> Any:
+        """Return y with the tubes' angles at their bases."""
+        tubes, input = self.system._tubes_of(control)
+        y = np.array(y)
+        y[..., self.system.y_layout.slice("angle")] = tubes.rotations(input)
+        return y
 
 
 class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
