@@ -23,7 +23,7 @@ from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
-from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
+from knode_cosserat.solvers.places import seen_positions, seen_quaternions
 from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.trajectory import Trajectory
 
@@ -106,8 +106,8 @@ def coverage(
     predicted = list[Any]()
     for robot in members:
         moved = predict(robot, measured, space=space, recovery=RECOVERY)
-        places = places_on(robot, measured.fractions)
-        predicted.append(types.SimpleNamespace(position=positions_at(robot, np.asarray(moved.y), places)))
+        seen = seen_positions(robot, np.asarray(moved.y), measured.fractions)
+        predicted.append(types.SimpleNamespace(position=seen))
     return Prediction(predicted).coverage(measured, level, first=0)
 
 
@@ -199,9 +199,8 @@ def compared(
     """Return the errors of a motion in the rows of a recording; arguments as in `evaluate`."""
     rows = np.arange(len(measured.time))[::every][:last]
     y, z = np.asarray(moved.y)[rows], np.asarray(moved.z)[rows]
-    places = places_on(robot, measured.fractions)
-    position = np.asarray(positions_at(robot, y, places, z))
-    quaternion = np.asarray(quaternions_at(robot, y, places))
+    position = np.asarray(seen_positions(robot, y, measured.fractions, z))
+    quaternion = np.asarray(seen_quaternions(robot, y, measured.fractions))
     seen, known = measured.position[rows], measured.complete[rows]
     # the mounting of bodies is unknown: rotations are relative to the first row, where the robot is at rest
     begun = jnp.broadcast_to(quaternion[0], quaternion.shape)

@@ -48,6 +48,7 @@ def sampled(
         wide = np.clip(x + ratio * (sample - samples.mean(axis=0)), *model.bounds)
         wide = np.where(model.mask(names), wide, 0.0)
         if all(search.misfit.differences(wide)):
-            robot = model.reduced(wide, names).replace(trained=trained)
+            robot = model.reduced(wide, names)
+            robot = robot if trained is None else robot.replace(trained=trained)
             members.append(KNODE(robot, Nothing(), About({"identified": True})))
     return Ensemble(members) if members else None

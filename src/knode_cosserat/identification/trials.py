@@ -44,12 +44,17 @@ def failed_trial(
     recordings' own tensions are added to a list.
     """
     # a tendon does not push; a motor turns either way
-    low = 0.0 if robot.control_layout.names[0] == "tension" else -np.inf
+    fields = robot.control_layout.fields
+    low, high = (
+        np.concatenate([np.zeros(0), *(np.full(it.size, getattr(it, end)) for it in fields)])
+        for end in ("low", "high")
+    )
+    low = np.where(robot.control_layout.names[:1] == ("tension",), np.maximum(low, 0.0), low)
     trials = [
         (
             f"tensions of {it.name} at {amplitude:g} times their amplitude",
             it,
-            np.maximum(it.held + amplitude * (it.control - it.held), low),
+            np.clip(it.held + amplitude * (it.control - it.held), low, high),
         )
         for amplitude in AMPLITUDES
         for it in data

@@ -92,6 +92,10 @@ class Drawing(_Aspect):
         """Return orientations (…, 4), scalar first, of states y (…, y)."""
         return self._named(y, "h", "orientation")
 
+    def attached(self, y: Any) -> Any:
+        """Return the orientations (…, 4) of what is attached to the tip, of states y there."""
+        return self.quaternions(y)
+
     def curves(self, y: Any) -> list[Any]:
         """Return lines (…, points, 3) in m for drawing the states y (…, N, y) of one robot."""
         return [np.asarray(self.positions(y))]

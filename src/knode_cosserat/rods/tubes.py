@@ -30,9 +30,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.parameters import ParameterError, as_number, known_size, parameter, place, slot
+from knode_cosserat.rods.parameters import (
+    Doubt,
+    ParameterError,
+    as_number,
+    known_size,
+    parameter,
+    place,
+    slot,
+)
 from knode_cosserat.rods.parts import Part, RodPoint
 from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
@@ -45,7 +54,7 @@ from knode_cosserat.rods.section import (
     shear_modulus,
 )
 from knode_cosserat.rods.system import CHOSEN_TURN
-from knode_cosserat.rotation import cross, dot, rotation_matrix
+from knode_cosserat.rotation import cross, dot, quaternion_product, rotation_matrix
 
 #: default number of segments of each interval: of order 4, their error is below 1e-4 of the length at rest
 SEGMENTS = 4
@@ -57,14 +66,24 @@ class Tube(Part):
     kind: ClassVar[str] = "tube"
 
     radius: Any = parameter("m", "outer radius", low=1e-6, high=0.5)
-    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
+    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12, doubt=Doubt(0.15))
     density: Any = parameter("kg/m3", "density", low=1.0, high=100e3)
     inner_radius: Any = parameter("m", "inner radius", low=0.0, high=0.5, default=0.0)
     curvature: Any = parameter(
-        "1/m", "κ, curvature at rest of its last part", low=-1e3, high=1e3, default=0.0
+        "1/m",
+        "κ, curvature at rest of its last part",
+        low=-1e3,
+        high=1e3,
+        default=0.0,
+        doubt=Doubt(0.1),
     )
     curved: Any = parameter(
-        "m", "c, length of the curved part; by default all of the tube", low=0.0, high=20.0, default=None
+        "m",
+        "c, length of the curved part; by default all of the tube",
+        low=0.0,
+        high=20.0,
+        default=None,
+        doubt=Doubt(absolute=0.002),
     )
     transmission: Any = parameter(
         "m",
@@ -72,9 +91,31 @@ class Tube(Part):
         low=0.0,
         high=20.0,
         default=0.0,
+        doubt=Doubt(0.1),
     )
     shear_modulus: Any = parameter(
-        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
+        "Pa",
+        "shear modulus; by default E / 2.6",
+        low=1e2,
+        high=1e12,
+        default=None,
+        doubt=Doubt(0.2, of="G"),
+    )
+    rotation_zero: Any = parameter(
+        "rad",
+        "angle of the plane of its curvature where its rotation is zero",
+        low=-10.0,
+        high=10.0,
+        default=0.0,
+        doubt=Doubt(absolute=0.1),
+    )
+    insertion_zero: Any = parameter(
+        "m",
+        "displacement along the rod where its insertion is zero",
+        low=-1.0,
+        high=1.0,
+        default=0.0,
+        doubt=Doubt(absolute=0.002),
     )
     end: float = place("where it ends without insertion", low=1e-3, default=1.0, kw_only=True)
 
@@ -127,14 +168,19 @@ class _Tubes(CrossSection):
             fields.append(Field(f"rotation_{k}", 1, "rad", f"rotation of tube {k} at its base"))
             field = Field(f"insertion_{k}", 1, "m", f"displacement of tube {k} along the rod, at its base")
             length, transmission = as_number(self.length), as_number(tube.transmission)
-            if length is not None and transmission is not None:
-                field = field._replace(low=-tube.end * length, high=transmission)
+            zero = as_number(tube.insertion_zero)
+            if length is not None and transmission is not None and zero is not None:
+                field = field._replace(low=-tube.end * length - zero, high=transmission - zero)
             fields.append(field)
         return tuple(fields)
 
     def rotations(self, input: Any) -> Any:
         """Return αᵢ (rad) from the controls."""
-        return input[::2]
+        return input[::2] + self.values("rotation_zero")
+
+    def insertions(self, input: Any) -> Any:
+        """Return the displacements (m) of the tubes from the controls."""
+        return input[1::2] + self.values("insertion_zero")
 
     @property
     def cuts(self) -> tuple[float, ...]:
@@ -146,7 +192,8 @@ class _Tubes(CrossSection):
 
     def lengths(self, rod: Any, input: Any) -> tuple[list[Any], list[Any]]:
         """Return the arclengths (m) beyond the plate at which each tube begins to be curved, and ends."""
-        ends = [tube.end * rod.length + input[2 * k + 1] for k, tube in enumerate(self.tubes)]
+        moved = self.insertions(input)
+        ends = [tube.end * rod.length + moved[k] for k, tube in enumerate(self.tubes)]
         return [
             None if tube.curved is None else jnp.maximum(end - tube.curved, 0.0)
             for tube, end in zip(self.tubes, ends, strict=True)
@@ -233,8 +280,8 @@ class _Tubes(CrossSection):
 
     def base_y(self, point: RodPoint) -> Fields:
         """Return the angles at the plate."""
-        straight = self.values("transmission") - point.input[1::2]
-        return {"angle": point.input[::2] + straight * self.torsions(point) / self.GJ}
+        straight = self.values("transmission") - self.insertions(point.input)
+        return {"angle": self.rotations(point.input) + straight * self.torsions(point) / self.GJ}
 
     def arclength_rate(self, point: RodPoint) -> Any:
         """Return the rate of arclength along the grid."""
@@ -382,6 +429,19 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
         return y
 
 
+class _TubesDrawing(Drawing, of=ConcentricTubeRobot):
+    """The rod, whose frame does not twist; what is attached to the tip turns with the innermost tube."""
+
+    def attached(self, y: Any) -> Any:
+        """Return the orientations of the innermost tube's tip, of states y (…, y) there."""
+        layout = self.system.y_layout
+        half = 0.5 * layout.get(y, "angle")[..., :1]
+        none = jnp.zeros_like(half)
+        turn = jnp.concatenate([jnp.cos(half), none, none, jnp.sin(half)], axis=-1)
+        product = jnp.vectorize(quaternion_product, signature="(4),(4)->(4)")
+        return product(layout.get(y, "h"), turn)
+
+
 class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
     """Motion, and bending, torsion and sliding of the tubes, from which their laws follow."""
 
@@ -452,4 +512,4 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
     def base_inputs(self, y: Float[Any, " y"], control: Any) -> Float[Any, " b"]:
         """Return the torsion of each tube times its length behind the plate."""
         tubes, at = self._point(0.0, y, control)
-        return (tubes.values("transmission") - at.input[1::2]) * tubes.torsions(at)
+        return (tubes.values("transmission") - tubes.insertions(at.input)) * tubes.torsions(at)

@@ -97,9 +97,7 @@ def static_batch(
     return rows, states, {i: cause for i, (*_, cause) in enumerate(parts) if cause}
 
 
-def separate_run(
-    task: TimeIntegration, system: System, controls: Any
-) -> tuple[StepRows, Any, str]:
+def separate_run(task: TimeIntegration, system: System, controls: Any) -> tuple[StepRows, Any, str]:
     """Solve the equilibria of one robot under controls (T, c), each by itself, in a batch.
 
     They do not depend on their order: the first guess of each is the unloaded shape. What is not found from
