@@ -65,9 +65,12 @@ class Ends(_Aspect):
         count = len(self.system.y_layout.indices(self.system.base_unknowns))
         return Layout(("tip", count, "", "conditions at the tip"))
 
-    def unloaded(self, y: Any, control: Any) -> Any:
-        """Return y (…, y) of the unloaded system as the control turns it, without stress; by default y."""
-        return y
+    def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
+        """Return y (T, points, y) of the system as each control (T, c) turns it, without other loads: guesses.
+
+        By default they are y (points, y), the unloaded shape. The points are at fractions `along` the grid.
+        """
+        return np.broadcast_to(y, (len(controls), *np.shape(y)))
 
     def poses(self, control: Any) -> tuple[Any, Any]:
         """Return the constrained poses of base and tip under a control; None for a free end."""

@@ -21,6 +21,7 @@ neglected.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -43,6 +44,7 @@ from knode_cosserat.rods.parameters import (
     slot,
 )
 from knode_cosserat.rods.parts import Part, RodPoint
+from knode_cosserat.rods.powell import roots
 from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
     ALONG,
@@ -58,6 +60,8 @@ from knode_cosserat.rotation import cross, dot, quaternion_product, rotation_mat
 
 #: default number of segments of each interval: of order 4, their error is below 1e-4 of the length at rest
 SEGMENTS = 4
+#: steps of a shot in each interval
+STEPS = 5
 
 
 class Tube(Part):
@@ -421,12 +425,78 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
 
     rest_is_guess = True
 
-    def unloaded(self, y: Any, control: Any) -> Any:
-        """Return y with the tubes' angles at their bases."""
-        tubes, input = self.system._tubes_of(control)
-        y = np.array(y)
-        y[..., self.system.y_layout.slice("angle")] = tubes.rotations(input)
-        return y
+    def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
+        """Return y with the tubes' angles and torsion: of the equilibrium that shooting from no torsion finds.
+
+        Turned far, tubes have several equilibria, also unstable ones. Programs for such robots shoot from the
+        plate with Powell's hybrid method, and begin without torsion (Rucker et al. 2010).
+        """
+        layout = self.system.y_layout
+        states = np.array(np.broadcast_to(y, (len(controls), *np.shape(y))))
+        if not len(controls):
+            return states
+        pieces, alpha = _pieces_of(self.system, np.asarray(controls, dtype=float))
+        states[..., layout.slice("angle")] = np.asarray(alpha)[:, None]
+        if len(self.system.tubes) == 1:
+            return states
+        twist, found = roots(lambda twist: np.asarray(_shoot(pieces, twist)[1][:, -1]), np.zeros_like(alpha))
+        angles, twists = map(np.asarray, _shoot(pieces, twist))
+        path = np.concatenate([angles, np.asarray(pieces[-1])[:, None] * twists], axis=-1)
+        at, last = np.asarray(along) * (path.shape[1] - 1), path.shape[1] - 2
+        first = np.minimum(at.astype(int), last)
+        part = (at - first)[:, None]
+        values = (1.0 - part) * path[:, first] + part * path[:, first + 1]
+        turned, torsion = np.split(values, 2, axis=-1)
+        states[found, :, layout.slice("angle")] = turned[found]
+        states[found, :, layout.slice("torsion")] = torsion[found, :, 1:]
+        return states
+
+
+@jax.jit
+def _pieces_of(robot: Any, controls: Any) -> Any:
+    """Return the intervals of the grid under each control, and the angles at the actuators.
+
+    They have lengths, and of each tube presence, curvature, angle at the plate without twist, length behind
+    it, and EI and GJ.
+    """
+
+    def of(control: Any) -> Any:
+        tubes, input = robot._tubes_of(control)
+        count = len(tubes.cuts) + 1
+        middles = [(k + 0.5) / count * robot.length for k in range(count)]
+        lengths = jnp.stack([tubes.arclength(robot, s, input)[1] * robot.length / count for s in middles])
+        presence, curvature = map(
+            jnp.stack, zip(*(tubes.present(robot, s, input) for s in middles), strict=True)
+        )
+        alpha = tubes.rotations(input)
+        straight = tubes.values("transmission") - tubes.insertions(input)
+        return (lengths, presence, curvature, alpha, straight, tubes.EI, tubes.GJ), alpha
+
+    return jax.vmap(of)(controls)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0))
+def _shoot(pieces: Any, twist: Any) -> tuple[Any, Any]:
+    """Return angles and twists (1/m) of all tubes from the plate to the tip, without loads."""
+    lengths, presence, curvature, alpha, straight, EI, GJ = pieces
+
+    def step(state: Any, piece: Any) -> tuple[Any, Any]:
+        # leapfrog: half a step with the twist, a step of the twist, half a step
+        h, there, curved = piece
+        angle, twist = state
+        middle = angle + 0.5 * h * there * twist
+        x, y, weight = curved * jnp.cos(middle), curved * jnp.sin(middle), EI * there
+        torque = (jnp.sum(weight * x) * y - jnp.sum(weight * y) * x) / jnp.sum(weight)
+        after = twist + h * EI / GJ * there * torque
+        new = middle + 0.5 * h * there * after, after
+        return new, jnp.stack(new)
+
+    begin = alpha + straight * twist, twist
+    every = tuple(jnp.repeat(part, STEPS, axis=0) for part in (lengths / STEPS, presence, curvature))
+    _, states = jax.lax.scan(step, begin, every, unroll=STEPS)
+    states = jnp.concatenate([jnp.stack(begin)[None], states])
+    return states[:, 0], states[:, 1]
 
 
 class _TubesDrawing(Drawing, of=ConcentricTubeRobot):

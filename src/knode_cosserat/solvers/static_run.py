@@ -107,7 +107,8 @@ def separate_run(task: TimeIntegration, system: System, controls: Any) -> tuple[
     controls, ends = np.asarray(controls), Ends.of(system)
     still = dataclasses.replace(task, steps=1, recovery_budget=0.0)
     begin = unloaded_shape(system, task.settings.space)
-    begins = np.stack([ends.unloaded(begin, control) for control in controls])
+    along = grid_of(system, task.settings.space).along[: len(begin)]
+    begins = ends.unloaded(begin, along, controls)
     rows, points, _ = run_batch(still, system, controls[:, None], (begins, controls), watch=None)
     rows = StepRows(*(np.array(leaf[:, 0]) for leaf in rows))
     size = np.ptp(controls, axis=0) if len(controls) else np.ones(controls.shape[-1])
