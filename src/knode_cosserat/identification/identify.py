@@ -57,11 +57,11 @@ def identify(
 
     Without `effects` and `parameters`, effects are selected by their probabilities
     (`identification.posterior`): those of the library, and the parameters of which the robot's parts state a
-    `Doubt`. Of one recording of equilibria, parts are held out in turn. Where the data do not decide, the robot has the mean over all sets of
-    effects. A robot with effects has to pass trials with larger and random tensions; effects are removed
-    until it does. Between continuous tensions the differences are those of infinitely short time steps, by
-    extrapolation. If the grid is too coarse, its nodes are doubled: the result may have more nodes than the
-    nominal robot.
+    `Doubt`. Of one recording of equilibria, parts are held out in turn. Where the data do not decide, the
+    robot has the mean over all sets of effects. A robot with effects has to pass trials with larger and
+    random controls; effects are removed until it does. Between continuous tensions the differences are those
+    of infinitely short time steps, by extrapolation. If the grid is too coarse, its nodes are doubled: the
+    result may have more nodes than the nominal robot.
 
     The first answer, with all effects, is found from the first quarter of the motions and predicts the other
     rows, which are held out. Where the time is over, the best robot so far is returned, `complete` is
@@ -87,8 +87,8 @@ def identify(
         errors of held-out recordings.
 
     Raises:
-        IdentificationError: the robot's parts state no doubts and nothing is named, it cannot be simulated, the data
-            determine no parameter, or the search does not converge within the allowed ranges.
+        IdentificationError: the robot's parts state no doubts and nothing is named, it cannot be simulated,
+            the data determine no parameter, or the search does not converge within the allowed ranges.
         DataError: data that are too short, do not fit the robot, or do not start at rest.
         ParameterError: an effect or a parameter that does not exist, or cannot be searched.
     """

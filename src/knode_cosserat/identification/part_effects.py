@@ -63,7 +63,7 @@ def _with_camera(robot: Any) -> Any:
 
 
 def _stated(owner: Any, path: str, kind: str) -> Iterator[_Stated]:
-    """Yield the parameters with a doubt of a system or part and its parts, in the order of their statement."""
+    """Yield the parameters with a doubt of a system or part and its parts, in their order."""
     for name, parameter in parameters_of(type(owner)).items():
         value, doubt = getattr(owner, name), parameter.doubt
         if doubt is None:

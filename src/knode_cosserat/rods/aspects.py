@@ -66,7 +66,7 @@ class Ends(_Aspect):
         return Layout(("tip", count, "", "conditions at the tip"))
 
     def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
-        """Return y (T, points, y) of the system as each control (T, c) turns it, without other loads: guesses.
+        """Return guesses of y (T, points, y): the unloaded system as each control (T, c) turns it.
 
         By default they are y (points, y), the unloaded shape. The points are at fractions `along` the grid.
         """

@@ -131,7 +131,8 @@ class Chambers(Stretched, Effect):
             given = np.shape(getattr(self, name))
             if given and given[-1] != self.count:
                 raise ParameterError(
-                    f"Chambers: {name} has {given[-1]} numbers; allowed is one for each of {self.count} angles"
+                    f"Chambers: {name} has {given[-1]} numbers; allowed is one for each of "
+                    f"{self.count} angles"
                 )
         if self.radius is None or any(isinstance(one, jax.core.Tracer) or np.ndim(one) > 1 for one in values):
             return

@@ -173,7 +173,7 @@ def _path_winding(function: Callable[[Any], tuple[Any, Any]]) -> float:
 
 
 class OffsetPaths(NamedTuple):
-    """Paths of tendons at one distance (m) from the axis, or one each; they turn by `twist` (rad) to the tip."""
+    """Paths of tendons at a distance (m) from the axis, or one each, turned by `twist` (rad) to the tip."""
 
     offset: Any
     angles: Float[Any, " c"]

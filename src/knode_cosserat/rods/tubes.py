@@ -426,7 +426,7 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
     rest_is_guess = True
 
     def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
-        """Return y with the tubes' angles and torsion: of the equilibrium that shooting from no torsion finds.
+        """Return y with the angles and torsion of the equilibrium that shooting from no torsion finds.
 
         Turned far, tubes have several equilibria, also unstable ones. Programs for such robots shoot from the
         plate with Powell's hybrid method, and begin without torsion (Rucker et al. 2010).
