@@ -36,7 +36,7 @@ def sampled(
     rollouts = search.solved(x)
     assert rollouts is not None
     search.misfit.differentiated(rollouts)
-    covariance, expected, seen = np.cov(samples, rowvar=False), 0.0, 0.0
+    covariance, expected, seen = np.atleast_2d(np.cov(samples, rowvar=False)), 0.0, 0.0
     for rollout, off in zip(rollouts, held_out or [it.values for it in rollouts], strict=True):
         slopes = rollout.derivatives
         spread = np.einsum("nre,nm,mre->re", slopes, covariance, slopes, optimize=True)
