@@ -19,11 +19,12 @@ from knode_cosserat.rods import (
 )
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.assembly import Assembly, RigidBody
+from knode_cosserat.rods.camera import Camera
 from knode_cosserat.rods.frame import SpinningFrame
 from knode_cosserat.rods.insertion import Insertion
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parallel_robot import ParallelRobot
-from knode_cosserat.rods.parameters import ParameterError, parameter
+from knode_cosserat.rods.parameters import Doubt, ParameterError, parameter
 from knode_cosserat.rods.parts import Effect, Wrench
 from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.robot_file import RobotFileError, robot_schema
@@ -34,7 +35,9 @@ from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot
 
 __all__ = [
     "Assembly",
+    "Camera",
     "Discontinuities",
+    "Doubt",
     "Drawing",
     "Effect",
     "Ends",

@@ -130,7 +130,7 @@ def test_the_mean_of_an_ensemble_is_compared(seen):
 def test_equilibria_are_compared_row_by_row(softer):
     control = np.array([[5.0, 5.0, 5.0, 5.0], [6.0, 5.0, 4.0, 5.0], [7.0, 5.0, 3.0, 5.0]])
     rows = kc.solvers.equilibria(ROBOT, control)
-    seen = dataclasses.replace(kc.recordings.Measurements.of(rows), tension=control, static=True)
+    seen = dataclasses.replace(kc.recordings.Measurements.of(rows), control=control, static=True)
     found = evaluate(softer, seen)
     expected = np.linalg.norm(
         kc.solvers.equilibria(softer, control, space="lobatto4").tip_position - rows.tip_position, axis=1

@@ -257,7 +257,7 @@ def test_other_arguments_that_are_not_allowed(swings):
         identify(BAR, [], parameters=["drag"])
     with pytest.raises(ValueError, match=r"^robot is a list; allowed is a robot"):
         identify([BAR], swings, parameters=["drag"])
-    with pytest.raises(IdentificationError, match=r"^robot is a Bar; allowed is a robot with tendons"):
+    with pytest.raises(DataError, match=r"^data holds a Trajectory; effects need recordings"):
         identify(BAR, swings)
 
 

@@ -206,12 +206,15 @@ class _SearchOptions(NamedTuple):
         out (--out FILE): Write the identified robot to this YAML file.
         effects (--effect NAME): Physical effect to identify, such as friction; may be repeated. Default:
             selected by recordings left out.
+        parameters (--parameter NAME): Parameter to identify without a prior, such as loads.0.mass, or all;
+            may be repeated. With --effect: beside these effects.
         checkpoint (--checkpoint DIR): Keep finished searches here; an interrupted run resumes.
         minutes (--minutes MINUTES): End after this time with the best robot so far. Default: no limit.
     """
 
     out: Path
     effects: list[str] | None = None
+    parameters: list[str] | None = None
     checkpoint: Path | None = None
     minutes: float = math.inf
 
@@ -230,7 +233,7 @@ def identify(
     sampling: Sampling,
     report: Report,
 ) -> None:
-    """Identify a tendon robot's parameters from recordings.
+    """Identify a robot's parameters from recordings.
 
     ROBOT is the nominal robot, from measured dimensions, masses and data sheets. An effect is kept if it
     lowers the error on recordings left out of the search. The result must pass trial simulations with larger
@@ -239,6 +242,7 @@ def identify(
     Examples:
         identify delrin-tendon-robot a.bag b.bag --out found.yaml
         identify my-robot.yaml a.csv b.csv --config my-recording.yaml --out found.yaml
+        identify arm.yaml train.csv --out found.yaml --parameter youngs_modulus --parameter effects.0.radius
     """
     require_writable(search.out)
     import knode_cosserat as kc
@@ -256,6 +260,7 @@ def identify(
             system,
             samples,
             search.effects or None,
+            parameters="all" if search.parameters == ["all"] else search.parameters or None,
             space=sampling.space,
             progress=progress,
             checkpoint=search.checkpoint,

@@ -14,7 +14,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import conjugate, quaternion_product, rotation_matrix
-from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
+from knode_cosserat.solvers.places import places_on, quaternions_at, seen_positions, seen_quaternions
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -97,7 +97,7 @@ class _AtFractions(Output):
 
 @dataclasses.dataclass(frozen=True)
 class BodyPositions(_AtFractions):
-    """Positions (m) of points on the rod at fractions of its length, global frame."""
+    """Positions (m) of points on the rod at fractions of its length: the global or the camera's frame."""
 
     #: standard deviation (m)
     sigma: float = 2e-4
@@ -109,7 +109,7 @@ class BodyPositions(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the positions, one after the other."""
-        return positions_at(system, y[None], places_on(system, self.fractions), z[None])[0].ravel()
+        return seen_positions(system, y[None], self.fractions, z[None])[0].ravel()
 
 
 @dataclasses.dataclass(frozen=True)
@@ -142,7 +142,7 @@ class Orientations(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return the orientations, one after the other."""
-        return quaternions_at(system, y[None], places_on(system, self.fractions))[0].ravel()
+        return seen_quaternions(system, y[None], self.fractions)[0].ravel()
 
     def error(
         self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"], reference: Float[Any, " p"]
@@ -154,7 +154,7 @@ class Orientations(_AtFractions):
         self, system: System, y: Float[Any, "T N y"], z: Float[Any, "T N z"], references: Float[Any, "T p"]
     ) -> Float[Any, "T e"]:
         """Return differences of the rotations since the first row that was seen."""
-        h = quaternions_at(system, y, places_on(system, self.fractions))
+        h = seen_quaternions(system, y, self.fractions)
         wanted = references.reshape(h.shape)
         wanted /= jnp.linalg.norm(wanted, axis=-1, keepdims=True)
         known = jnp.isfinite(wanted[..., :1])
@@ -193,8 +193,8 @@ class BodyPoses(_AtFractions):
 
     def value(self, system: System, y: Float[Any, "N y"], z: Float[Any, "N z"]) -> Float[Any, " p"]:
         """Return position and quaternion of each place."""
-        places = places_on(system, self.fractions)
-        p, h = positions_at(system, y[None], places, z[None])[0], quaternions_at(system, y[None], places)[0]
+        p = seen_positions(system, y[None], self.fractions, z[None])[0]
+        h = seen_quaternions(system, y[None], self.fractions)[0]
         return jnp.concatenate([p, h], axis=1).ravel()
 
     def error(
@@ -225,7 +225,7 @@ class BodyMotions(BodyPoses):
     ) -> Float[Any, "T e"]:
         """Return differences of positions (m), and of rotations since the first row (rad, global frame)."""
         count, reference = len(references), references.reshape(len(references), -1, 7)
-        moved = positions_at(system, y, places_on(system, self.fractions), z) - reference[..., :3]
+        moved = seen_positions(system, y, self.fractions, z) - reference[..., :3]
         turned = Orientations(self.fractions).errors(system, y, z, reference[..., 3:].reshape(count, -1))
         return jnp.concatenate([moved, turned.reshape(count, -1, 3)], axis=-1).reshape(count, -1)
 

@@ -84,7 +84,7 @@ class PossibleEffect:
     By default the numbers replace the parameters that their labels name (`numbers_at`). `part` adds the part
     that the effect changes to a robot without it. `needs` names effects that it requires. A `basic` effect is
     always identified. A search with few effects starts with the `usual` ones. An effect `of_recordings`
-    belongs to the recordings, not to the robot.
+    belongs to the recordings, not to the robot; one `of_motion` changes no equilibrium.
     """
 
     name: str
@@ -95,6 +95,7 @@ class PossibleEffect:
     basic: bool = False
     usual: bool = False
     of_recordings: bool = False
+    of_motion: bool = False
 
     def __post_init__(self) -> None:
         if self.change is None:

@@ -19,6 +19,7 @@ from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.parameters import (
     ParameterError,
 )
+from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 from knode_cosserat.rods.tendons import Markers
 
@@ -41,56 +42,61 @@ class Usual(NamedTuple):
 
 
 #: effects that a robot may have, for usual sizes
-Library = Callable[[RoutedTendonRobot, Usual], list[PossibleEffect]]
-_libraries: dict[Library, int] = {}
+Library = Callable[[Any, Usual], list[PossibleEffect]]
+_libraries: dict[Library, tuple[int, type]] = {}
 
 
-def register(order: int = 9) -> Callable[[Library], Library]:
-    """Register a function that returns effects of a robot; `order` sorts the functions."""
+def register(order: int = 9, of: type = System) -> Callable[[Library], Library]:
+    """Register a function that returns effects of systems of a class; `order` sorts the functions."""
 
     def added(function: Library) -> Library:
-        _libraries[function] = order
+        _libraries[function] = order, of
         return function
 
     return added
 
 
-def effects_of(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
-    """Return all registered effects that a robot may have."""
+def effects_of(nominal: System, usual: Usual) -> list[PossibleEffect]:
+    """Return all registered effects that a robot may have, and those that its parts state."""
     package = importlib.import_module(__name__.rpartition(".")[0])
     for module in pkgutil.iter_modules(package.__path__):
         if module.name.endswith("_effects"):
             importlib.import_module(f"{package.__name__}.{module.name}")
+    functions = sorted(_libraries, key=lambda function: _libraries[function][0])
     return [
         effect
-        for function in sorted(_libraries, key=_libraries.__getitem__)
+        for function in functions
+        if isinstance(nominal, _libraries[function][1])
         for effect in function(nominal, usual)
     ]
 
 
 def library_model(
-    nominal: TendonRod,
+    nominal: System,
     tension: Float[np.ndarray, "T c"],
     bodies: Iterable[float] = (),
     more: Sequence[PossibleEffect] = (),
+    static: bool = False,
 ) -> ParameterModel:
-    """Return the model with all registered effects of a robot whose tendons run beside it.
+    """Return the model with all registered effects of a robot; tendons then run beside it.
 
     Args:
         nominal: the robot of the data sheet.
-        tension: tensions in the recordings (N), which set the widths of some priors.
+        tension: controls in the recordings; tensions (N) set the widths of some priors.
         bodies: places of measured bodies, as parts of the length.
         more: further effects, such as plain parameters.
+        static: leave out effects that change no equilibrium.
     """
-    if not isinstance(nominal, RoutedTendonRobot):
+    if isinstance(nominal, TendonRod) and not isinstance(nominal, RoutedTendonRobot):
         offset = float(nominal.tendon_offset) or OFFSET * float(nominal.section.radius)
         nominal = RoutedTendonRobot.like(nominal, tendon_offset=offset)
     usual = Usual(
-        float(np.nanmean(tension)),
-        float(np.nanmax(tension.sum(axis=1))),
+        float(np.nanmean(tension)) if tension.size else 0.0,
+        float(np.nanmax(tension.sum(axis=1), initial=0.0)),
         tuple(float(at) for at in bodies if at > 0.0),
     )
-    return ParameterModel(nominal, [*effects_of(nominal, usual), *more])
+    effects = [it for it in effects_of(nominal, usual) if not (static and it.of_motion)]
+    return ParameterModel(nominal, [*effects, *more])
 
 
 def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[PossibleEffect]:

@@ -23,7 +23,7 @@ from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
-from knode_cosserat.solvers.places import places_on, positions_at, quaternions_at
+from knode_cosserat.solvers.places import seen_positions, seen_quaternions
 from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.trajectory import Trajectory
 
@@ -93,7 +93,7 @@ class Comparison:
     @property
     def control(self) -> Float[np.ndarray, "T c"]:
         """Measured controls, each held to the next row of the recording."""
-        return self.measured.tension[self.rows]
+        return self.measured.control[self.rows]
 
     @property
     def seen(self) -> Float[np.ndarray, "T M d"]:
@@ -245,19 +245,19 @@ def predict(
     """
     check_arguments(predict, locals())
     robot, measured = fix_grid(robot), Measurements.of(measured).controls_for(robot)
-    initial: Any = "unstressed" if measured.unstressed else None
-    first = measured.control[0] if measured.static else measured.initial_control
-    if first is not None and not measured.unstressed:
-        initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     if measured.static:
         return equilibria(
             robot,
             measured.control,
             space=space,
-            initial=initial,
+            initial="separate",
             recovery_budget=recovery,
             with_stability=False,
         )
+    initial: Any = "unstressed" if measured.unstressed else None
+    first = measured.initial_control
+    if first is not None and not measured.unstressed:
+        initial = equilibrium(robot, first, space=space, recovery_budget=recovery, with_stability=False)
     return simulated_rows(
         robot,
         measured.control[:-1],
@@ -352,10 +352,10 @@ class _Poses(NamedTuple):
     @classmethod
     def of(cls, robot: System, moved: Trajectory, measured: Measurements) -> _Poses:
         """Return the poses of a motion at the places of a recording's bodies."""
-        y, places = np.asarray(moved.y), places_on(robot, measured.fractions)
-        position = np.asarray(positions_at(robot, y, places, np.asarray(moved.z)))
+        y, fractions = np.asarray(moved.y), measured.fractions
+        position = np.asarray(seen_positions(robot, y, fractions, np.asarray(moved.z)))
         try:
-            return cls(position, np.asarray(quaternions_at(robot, y, places)))
+            return cls(position, np.asarray(seen_quaternions(robot, y, fractions)))
         except AttributeError:
             return cls(position, np.full((*position.shape[:2], 4), np.nan))
 

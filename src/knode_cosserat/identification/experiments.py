@@ -26,6 +26,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: a rotation counts as the displacement at this part of the length
 ARM = 0.2
+#: parts of one recording of equilibria, the fewest rows of each, and blocks of consecutive rows in each
+PARTS, FEWEST, BLOCKS = 5, 6, 4
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -164,6 +166,34 @@ def measured_rows(data: Any) -> list[Measurements]:
                 "name parameters to identify them from trajectories"
             )
     return rows  # type: ignore[return-value]
+
+
+def in_parts(rows: list[Measurements]) -> list[Measurements]:
+    """Return one recording of many equilibria in parts, which are held out in turn; others as they are.
+
+    Each part is made of short blocks of consecutive rows all along the recording, so that neighbours, which
+    may be alike, are mostly held out together.
+    """
+    if len(rows) != 1 or not rows[0].static or len(rows[0].time) < PARTS * FEWEST:
+        return rows
+    (whole,) = rows
+    block = max(1, len(whole.time) // (PARTS * BLOCKS))
+    part_of = np.arange(len(whole.time)) // block % PARTS
+    name, _, more = whole.source.partition(":")
+    parts = []
+    for k in range(PARTS):
+        on = part_of == k
+        source = f"{name}, part {k + 1} of {PARTS}" + (f":{more}" if more else "")
+        sensors = tuple(
+            dataclasses.replace(it, time=it.time[on], values=it.values[on]) for it in whole.sensors
+        )
+        arrays: dict[str, Any] = {
+            it: getattr(whole, it)[on] for it in ("tension", "position", "quaternion", "measured")
+        }
+        # rows of equilibria are evenly spaced by name only
+        time = whole.time[: int(on.sum())]
+        parts.append(dataclasses.replace(whole, time=time, sensors=sensors, source=source, **arrays))
+    return parts
 
 
 def experiments_of(

@@ -13,7 +13,13 @@ import numpy as np
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.estimation.parameters import ParameterModel
 from knode_cosserat.identification.effects import library_model, place_effects
-from knode_cosserat.identification.experiments import Experiment, experiments_of, listed_rows, measured_rows
+from knode_cosserat.identification.experiments import (
+    Experiment,
+    experiments_of,
+    in_parts,
+    listed_rows,
+    measured_rows,
+)
 from knode_cosserat.identification.free_parameters import identify_parameters, parameter_effects
 from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError, SearchError
 from knode_cosserat.identification.library import identify_effects
@@ -24,7 +30,6 @@ from knode_cosserat.identification.search import ParameterSearch
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.tendon_robots import TendonRod
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
@@ -50,12 +55,13 @@ def identify(
     parameters of any system, without priors. One objective serves all: robust squares of differences, each
     kind in units of its usual size, and the priors.
 
-    Without `effects` and `parameters`, effects of a tendon robot are selected by their probabilities
-    (`identification.posterior`). Where the data do not decide, the robot has the mean over all sets of
-    effects. A robot with effects has to pass trials with larger and random tensions; effects are removed
-    until it does. Between continuous tensions the differences are those of infinitely short time steps, by
-    extrapolation. If the grid is too coarse, its nodes are doubled: the result may have more nodes than the
-    nominal robot.
+    Without `effects` and `parameters`, effects are selected by their probabilities
+    (`identification.posterior`): those of the library, and the parameters of which the robot's parts state a
+    `Doubt`. Of one recording of equilibria, parts are held out in turn. Where the data do not decide, the
+    robot has the mean over all sets of effects. A robot with effects has to pass trials with larger and
+    random controls; effects are removed until it does. Between continuous tensions the differences are those
+    of infinitely short time steps, by extrapolation. If the grid is too coarse, its nodes are doubled: the
+    result may have more nodes than the nominal robot.
 
     The first answer, with all effects, is found from the first quarter of the motions and predicts the other
     rows, which are held out. Where the time is over, the best robot so far is returned, `complete` is
@@ -63,8 +69,8 @@ def identify(
     same in every run. An interruption by Ctrl-C is a `KeyboardInterrupt`, whose `best` is this robot.
 
     Args:
-        robot: nominal robot, where the search begins; effects need a robot with tendons. A `TendonRobot`,
-            whose tendons push it sideways, is searched as a `RoutedTendonRobot`, whose tendons bend it.
+        robot: nominal robot, where the search begins. A `TendonRobot`, whose tendons push it sideways, is
+            searched as a `RoutedTendonRobot`, whose tendons bend it.
         data: recordings (`load_recording`, or rows of them, `Recording.sampled(0.0125, mean=True)`), each
             starting at rest, at least two to select effects; full states; or experiments.
         effects: names of effects (`effects_of`) that are all identified; None: select effects, unless there
@@ -82,8 +88,8 @@ def identify(
         errors of held-out recordings.
 
     Raises:
-        IdentificationError: the robot has no tendons but effects are wanted, it cannot be simulated, the data
-            determine no parameter, or the search does not converge within the allowed ranges.
+        IdentificationError: the robot's parts state no doubts and nothing is named, it cannot be simulated,
+            the data determine no parameter, or the search does not converge within the allowed ranges.
         DataError: data that are too short, do not fit the robot, or do not start at rest.
         ParameterError: an effect or a parameter that does not exist, or cannot be searched.
     """
@@ -91,15 +97,10 @@ def identify(
     if np.ndim(robot.length):
         raise IdentificationError("robot is a batch; allowed is one robot")
     named = effects is None and parameters is not None
-    if not named and not isinstance(robot, TendonRod):
-        raise IdentificationError(
-            f"robot is a {type(robot).__name__}; allowed is a robot with tendons (TendonRobot, "
-            'RoutedTendonRobot), or name `parameters`, such as parameters="all"'
-        )
     if not minutes > 0.0:
         raise IdentificationError(f"minutes is {minutes}; allowed is a number above zero")
     journal = Journal(progress or log.info, checkpoint, minutes)
-    rows: Any = listed_rows(data) if named else measured_rows(data)
+    rows: Any = listed_rows(data) if named else in_parts(measured_rows(data))
     plain = [] if parameters is None else parameter_effects(robot, parameters)
     plain += place_effects([it for it in rows if isinstance(it, Measurements)], flat=named)
 
@@ -108,9 +109,15 @@ def identify(
             model = ParameterModel(robot, plain)
             experiments = experiments_of(rows, model, space)
         else:
+            static = all(it.static for it in rows)
             model = library_model(
-                robot, np.concatenate([it.control for it in rows]), rows[0].fractions, plain
+                robot, np.concatenate([it.control for it in rows]), rows[0].fractions, plain, static
             )
+            if not model.effects:
+                raise IdentificationError(
+                    f"a {type(robot).__name__} states no doubt of a parameter (`Doubt`); allowed is to name "
+                    '`parameters`, such as parameters="all"'
+                )
             experiments = [it.rough() for it in experiments_of(rows, model, space)]
         return ParameterSearch(Misfit(model, experiments), journal)
 

@@ -23,7 +23,7 @@ from knode_cosserat.identification.result import (
 from knode_cosserat.identification.samples import sampled
 from knode_cosserat.identification.search import HORIZONS, ROUGH, ParameterSearch, SearchEnd, Subset
 from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
-from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.parameters import ParameterError, slots_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -288,7 +288,8 @@ def _accepted(
             journal.step("the nominal robot is returned: it predicts held-out recordings as well")
             return _nominal(search)
     robot = model.reduced(x, kept)
-    robot = robot.replace(trained=trained_range(robot, system, motions))
+    if "trained" in slots_of(type(robot)):
+        robot = robot.replace(trained=trained_range(robot, system, motions))
     pairs = zip(misfit.data, errors, strict=True)
     held_out = {it.name: None if it.positions(it.data) is None else error for it, error in pairs}
     result = Identified.of(search, x, kept, posterior, robot=robot, held_out_error=held_out)
@@ -298,7 +299,7 @@ def _accepted(
     return dataclasses.replace(
         result,
         next_experiment=next_experiment(search, posterior, x, undecided) if undecided else None,
-        ensemble=sampled(search, (x, kept), posterior, selection.held_out, robot.trained),
+        ensemble=sampled(search, (x, kept), posterior, selection.held_out, getattr(robot, "trained", None)),
     )
 
 

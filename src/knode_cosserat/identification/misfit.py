@@ -32,6 +32,8 @@ from knode_cosserat.solvers.tangent_motion import start_at, tangent_motion
 KEPT, DIFFERENTIATED = 8, 2
 #: seconds that recovery of one simulation may take
 RECOVERY = 0.5
+#: an equilibrium that is not found counts as a difference of this part of the length
+LOST = 0.2
 
 
 class Rollout:
@@ -213,8 +215,11 @@ class Misfit:
         seen = len(data.control) if rows is None else min(len(data.control), data.moves + rows)
         system, robot = self.system(x), self.model.robot
         settings = dataclasses.replace(data.settings, time=None) if data.static else data.settings
+        # equilibria are sought in batches only: a search does not depend on the machine's speed
         task = TimeIntegration(
-            settings, 0.0 if data.static else data.dt / data.steps, recovery_budget=RECOVERY
+            settings,
+            0.0 if data.static else data.dt / data.steps,
+            recovery_budget=0.0 if data.static else RECOVERY,
         )
         start = start_at(robot, x, system, task, data.held, data.initial)
         if start is None:
@@ -247,10 +252,15 @@ class Misfit:
             _, slopes = errors_along(
                 system, data.output, filled(records), filled(d_records), seen_data, directions, columns
             )
-            return np.asarray(slopes)[which, : len(records)] / noise
+            slopes = np.array(slopes[:, : len(records)])[which] / noise
+            slopes[:, lost] = 0.0
+            return slopes
 
-        errors = np.asarray(errors_of(system, data.output, filled(records), seen_data))
-        return Rollout(data, errors[: len(records)] / noise, tangents)
+        lost = np.zeros(len(records), bool) if motion.missing is None else motion.missing
+        errors = np.array(errors_of(system, data.output, filled(records), seen_data))[: len(records)] / noise
+        off = LOST * float(np.asarray(self.model.nominal.length))
+        errors[lost] = np.where(np.isfinite(errors[lost]), off, np.nan)
+        return Rollout(data, errors, tangents)
 
     def _columns(
         self, system: Any, output: Output, records: np.ndarray, measured: np.ndarray

@@ -22,7 +22,7 @@ from knode_cosserat.rods.tendons import Reels
 TAKEN_IN, TURN = 0.01, 0.1
 
 
-@register(order=2)
+@register(order=2, of=RoutedTendonRobot)
 def reel_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of a robot with reels, or with stated routing."""
     if nominal.drive != "reel":

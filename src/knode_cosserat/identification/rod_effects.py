@@ -12,9 +12,12 @@ from knode_cosserat.estimation.parameters import Number, PossibleEffect, Replace
 from knode_cosserat.identification.effects import Usual, along_axes, register
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass
+from knode_cosserat.rods.parameters import slots_of
 from knode_cosserat.rods.relaxation import Relaxation
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import ABOUT_X, ABOUT_Y, COUPLED, Sleeve, Stretch
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
+from knode_cosserat.rods.tubes import ConcentricTubeRobot
 from knode_cosserat.rotation import quaternion_of, quaternion_product
 
 #: first natural frequency of a clamped rod: β² with β = 1.8751
@@ -27,9 +30,20 @@ PLACED, PLACED_BY_REELS = 0.004, 0.03
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
-@register(order=0)
+@register(order=0, of=SlenderRod)
+def shape_effects(nominal: SlenderRod, usual: Usual) -> list[PossibleEffect]:
+    """Return the effects of any rod that its parts do not state: of its shape, masses and damping."""
+    if isinstance(nominal, RoutedTendonRobot | ConcentricTubeRobot):
+        return []
+    stated = {"stiffness", "mass along the rod", "rib masses", "sleeve"}
+    # a mass at the tip is in doubt itself
+    stated |= {"tip mass"} if any(load.applied_at == 1.0 for load in nominal.loads) else set()
+    return [it for it in (*_stiffness_effects(nominal), *_inertia_effects(nominal)) if it.name not in stated]
+
+
+@register(order=0, of=RoutedTendonRobot)
 def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
-    """Return the effects of the rod."""
+    """Return the effects of a rod with tendons."""
     placed = (PLACED_BY_REELS if nominal.drive == "reel" else PLACED) * float(nominal.length)
     return [
         *_stiffness_effects(nominal),
@@ -39,7 +53,7 @@ def rod_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect
     ]
 
 
-def _stiffness_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
+def _stiffness_effects(nominal: SlenderRod) -> list[PossibleEffect]:
     L = float(nominal.length)
     if nominal.youngs_modulus is None:
         # a factor of the table's stiffness
@@ -67,7 +81,7 @@ def _stiffness_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     return effects
 
 
-def _inertia_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
+def _inertia_effects(nominal: SlenderRod) -> list[PossibleEffect]:
     """Return the effects of damping, drag and masses."""
     L, EI = float(nominal.length), float(nominal.Kbt[0, 0])
     masses = [(k, float(load.mass)) for k, load in enumerate(nominal.loads) if isinstance(load, AttachedMass)]
@@ -76,11 +90,7 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     frequency = FIRST_MODE * (EI * L / carried) ** 0.5 / L**2
     damping, drag = 2.0 * DAMPING_RATIO * EI / frequency, 2.0 * DAMPING_RATIO * frequency * carried / L
     viscous = Number("bending_damping", "N m2 s", damping, 1.5, 1e-9, 1e2, True)
-    relaxing, tip = _relaxing(nominal), Replace((f"loads.{len(nominal.loads)}.mass",))
-    creep = (
-        *numbers_at(relaxing, "relaxation.stiffness", 0.2, high=100.0, begin=0.3),
-        *numbers_at(relaxing, "relaxation.time", 1.0, low=0.02, high=100.0, logarithmic=True, shape=True),
-    )
+    tip = Replace((f"loads.{len(nominal.loads)}.mass",))
     linear = numbers_at(_draggable(nominal), "linear_drag", 3.0 * drag, begin=0.1)
     square = numbers_at(nominal, "drag", 3.0 * drag / (0.2 * L * frequency), begin=0.1)
     added = Number("tip_mass", "kg", 0.0, 0.2 * carried, 0.0, 100.0 * carried, begin=0.1)
@@ -92,16 +102,28 @@ def _inertia_effects(nominal: RoutedTendonRobot) -> list[PossibleEffect]:
     else:
         along = PossibleEffect("mass along the rod", numbers_at(nominal, "density", 0.1, logarithmic=True))
     effects = [
-        PossibleEffect("damping", (viscous,), basic=True),
-        PossibleEffect("creep", creep, part=_relaxing),
-        PossibleEffect("linear drag", linear, part=_draggable, usual=True),
-        PossibleEffect("square drag", square),
+        PossibleEffect("damping", (viscous,), basic=True, of_motion=True),
+        *_creep_effects(nominal),
+        PossibleEffect("linear drag", linear, part=_draggable, usual=True, of_motion=True),
+        PossibleEffect("square drag", square, of_motion=True),
         PossibleEffect("tip mass", (added,), tip, _with_tip_mass),
         along,
     ]
     ribs = [f"loads.{k}.mass" for k, mass in masses if mass > 0.0]
     known = [it for path in ribs for it in numbers_at(nominal, path, 0.3, logarithmic=True)]
     return [*effects, PossibleEffect("rib masses", tuple(known))] if known else effects
+
+
+def _creep_effects(nominal: SlenderRod) -> list[PossibleEffect]:
+    """Return creep, of robots that may have a Maxwell branch."""
+    if "relaxation" not in slots_of(type(nominal)):
+        return []
+    relaxing = _relaxing(nominal)
+    creep = (
+        *numbers_at(relaxing, "relaxation.stiffness", 0.2, high=100.0, begin=0.3),
+        *numbers_at(relaxing, "relaxation.time", 1.0, low=0.02, high=100.0, logarithmic=True, shape=True),
+    )
+    return [PossibleEffect("creep", creep, part=_relaxing, of_motion=True)]
 
 
 # parts that effects change, where a robot lacks them
@@ -178,7 +200,7 @@ def _with_table(robot: Any, values: list[Any]) -> Any:
 def _with_axes(robot: Any, values: list[Any]) -> Any:
     """Change the stiffness to C (1 + A) Cᵀ, from C Cᵀ of the section and A = [[a, b], [b, -a]]."""
     a, b = values
-    C = jnp.linalg.cholesky(jnp.asarray(robot.section.Kbt))
+    C = jnp.linalg.cholesky(jnp.asarray(robot.Kbt))
     change = a * (ABOUT_X - ABOUT_Y) + b * COUPLED
     return robot.replace(bending_stiffness=C @ (np.eye(3) + change) @ C.T)
 

@@ -36,7 +36,7 @@ def sampled(
     rollouts = search.solved(x)
     assert rollouts is not None
     search.misfit.differentiated(rollouts)
-    covariance, expected, seen = np.cov(samples, rowvar=False), 0.0, 0.0
+    covariance, expected, seen = np.atleast_2d(np.cov(samples, rowvar=False)), 0.0, 0.0
     for rollout, off in zip(rollouts, held_out or [it.values for it in rollouts], strict=True):
         slopes = rollout.derivatives
         spread = np.einsum("nre,nm,mre->re", slopes, covariance, slopes, optimize=True)
@@ -48,6 +48,7 @@ def sampled(
         wide = np.clip(x + ratio * (sample - samples.mean(axis=0)), *model.bounds)
         wide = np.where(model.mask(names), wide, 0.0)
         if all(search.misfit.differences(wide)):
-            robot = model.reduced(wide, names).replace(trained=trained)
+            robot = model.reduced(wide, names)
+            robot = robot if trained is None else robot.replace(trained=trained)
             members.append(KNODE(robot, Nothing(), About({"identified": True})))
     return Ensemble(members) if members else None

@@ -18,7 +18,7 @@ LAST_RIB = 8.0 / 9.0
 UNBOUNDED = {"low": -np.inf, "high": np.inf}
 
 
-@register(order=1)
+@register(order=1, of=RoutedTendonRobot)
 def tendon_effects(nominal: RoutedTendonRobot, usual: Usual) -> list[PossibleEffect]:
     """Return the effects of tendons; a robot with reels has only those that it states."""
     pulled = nominal.drive != "reel"

@@ -44,12 +44,17 @@ def failed_trial(
     recordings' own tensions are added to a list.
     """
     # a tendon does not push; a motor turns either way
-    low = 0.0 if robot.control_layout.names[0] == "tension" else -np.inf
+    fields = robot.control_layout.fields
+    low, high = (
+        np.concatenate([np.zeros(0), *(np.full(it.size, getattr(it, end)) for it in fields)])
+        for end in ("low", "high")
+    )
+    low = np.where(robot.control_layout.names[:1] == ("tension",), np.maximum(low, 0.0), low)
     trials = [
         (
             f"tensions of {it.name} at {amplitude:g} times their amplitude",
             it,
-            np.maximum(it.held + amplitude * (it.control - it.held), low),
+            np.clip(it.held + amplitude * (it.control - it.held), low, high),
         )
         for amplitude in AMPLITUDES
         for it in data
@@ -117,11 +122,16 @@ def moved(
     with warnings.catch_warnings():
         # this trial is about solvable steps, not about their accuracy
         warnings.filterwarnings("ignore", message="the grid is too coarse")
-        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY, with_stability=False)
         if like.static:
             tension = np.concatenate([initial[None], remove_delay(robot, tension, dt, initial)])
             rows = equilibria(
-                robot, tension, initial=still, space=space, recovery_budget=RECOVERY, with_stability=False
+                robot,
+                tension,
+                initial="separate",
+                space=space,
+                recovery_budget=RECOVERY,
+                with_stability=False,
             )
-            return still, dataclasses.replace(rows, time=dt * rows.time)
+            return rows[:1], dataclasses.replace(rows, time=dt * rows.time)
+        still = equilibrium(robot, initial, space=space, recovery_budget=RECOVERY, with_stability=False)
         return still, simulated_rows(robot, tension, dt, still, initial, like.continuous, space, RECOVERY)

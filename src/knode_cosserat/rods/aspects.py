@@ -65,6 +65,13 @@ class Ends(_Aspect):
         count = len(self.system.y_layout.indices(self.system.base_unknowns))
         return Layout(("tip", count, "", "conditions at the tip"))
 
+    def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
+        """Return guesses of y (T, points, y): the unloaded system as each control (T, c) turns it.
+
+        By default they are y (points, y), the unloaded shape. The points are at fractions `along` the grid.
+        """
+        return np.broadcast_to(y, (len(controls), *np.shape(y)))
+
     def poses(self, control: Any) -> tuple[Any, Any]:
         """Return the constrained poses of base and tip under a control; None for a free end."""
         return None, None
@@ -87,6 +94,10 @@ class Drawing(_Aspect):
     def quaternions(self, y: Any) -> Any:
         """Return orientations (…, 4), scalar first, of states y (…, y)."""
         return self._named(y, "h", "orientation")
+
+    def attached(self, y: Any) -> Any:
+        """Return the orientations (…, 4) of what is attached to the tip, of states y there."""
+        return self.quaternions(y)
 
     def curves(self, y: Any) -> list[Any]:
         """Return lines (…, points, 3) in m for drawing the states y (…, N, y) of one robot."""

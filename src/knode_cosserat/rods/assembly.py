@@ -22,11 +22,12 @@ from jaxtyping import Float
 
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.camera import Camera
 from knode_cosserat.rods.ends import AT_ORIGIN, Pose, velocities
 from knode_cosserat.rods.law import JointLaw
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import BodyInertia, Motion
-from knode_cosserat.rods.parameters import ParameterError, parameter, slot, text
+from knode_cosserat.rods.parameters import Doubt, ParameterError, parameter, slot, text
 from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rods.rod import Y_LAYOUT, SlenderRod
 from knode_cosserat.rods.surroundings import ContactLaw, velocity_at
@@ -52,7 +53,7 @@ class RigidBody(Part):
     kind: ClassVar[str] = "body"
 
     name: str = text("name, by which ends refer to it")
-    mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
+    mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0, doubt=Doubt(0.1))
     inertia: Any = parameter(
         "kg m2",
         "inertia about its centre of mass, in its frame",
@@ -126,7 +127,9 @@ class Assembly(System):
         low=-100.0,
         high=100.0,
         default=(0.0, 0.0, -9.81),
+        doubt=Doubt(absolute=0.3),
     )
+    camera: Camera | None = slot("frame and tip marker of measured positions", Camera, default=None)
 
     @functools.cached_property
     def members(self) -> tuple[SlenderRod, ...]:

@@ -30,7 +30,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import ParameterError, as_number, choice, known_size, parameter
+from knode_cosserat.rods.parameters import Doubt, ParameterError, as_number, choice, known_size, parameter
 from knode_cosserat.rods.parts import Effect, RodPoint, Stretched
 from knode_cosserat.rods.routing import OffsetPaths, path_lengths
 from knode_cosserat.rods.tendon_law import Stretching, Tendons, stretches
@@ -45,10 +45,41 @@ class Chambers(Stretched, Effect):
     kind: ClassVar[str] = "chambers"
     actuates: ClassVar[bool] = True
 
-    angles: Any = parameter("rad", "angles of the chambers about the rod", shape="list", low=-10.0, high=10.0)
-    offset: Any = parameter("m", "distance of their centres from the rod's axis", low=0.0, high=1.0)
-    radius: Any = parameter("m", "radius of round chambers", low=1e-6, high=1.0, default=None)
-    area: Any = parameter("m2", "A₀, area of chambers of another shape", low=1e-12, high=1.0, default=None)
+    angles: Any = parameter(
+        "rad",
+        "angles of the chambers about the rod",
+        shape="list",
+        low=-10.0,
+        high=10.0,
+        doubt=Doubt(absolute=0.05),
+    )
+    offset: Any = parameter(
+        "m", "distance of their centres from the rod's axis", low=0.0, high=1.0, doubt=Doubt(0.1)
+    )
+    radius: Any = parameter(
+        "m", "radius of round chambers", low=1e-6, high=1.0, default=None, doubt=Doubt(0.1)
+    )
+    area: Any = parameter(
+        "m2", "A₀, area of chambers of another shape", low=1e-12, high=1.0, default=None, doubt=Doubt(0.2)
+    )
+    area_factors: Any = parameter(
+        "",
+        "area of each chamber over A₀; by default they are alike",
+        shape="list",
+        low=1e-3,
+        high=1e3,
+        default=None,
+        doubt=Doubt(absolute=0.05, of="alike", common=False),
+    )
+    offset_factors: Any = parameter(
+        "",
+        "distance of each from the axis over the offset; by default they are alike",
+        shape="list",
+        low=1e-3,
+        high=1e3,
+        default=None,
+        doubt=Doubt(absolute=0.05, of="alike", common=False),
+    )
     twist: Any = parameter(
         "rad",
         "angle by which they turn about the rod from base to tip; by default they are straight",
@@ -57,10 +88,20 @@ class Chambers(Stretched, Effect):
         default=None,
     )
     area_by_stretch: Any = parameter(
-        "", "α, relative change of the area by the stretch", low=-10.0, high=10.0, default=None
+        "",
+        "α, relative change of the area by the stretch",
+        low=-10.0,
+        high=10.0,
+        default=None,
+        doubt=Doubt(absolute=1.0),
     )
     area_by_pressure: Any = parameter(
-        "1/Pa", "β, relative change of the area by the pressure", low=0.0, high=1e-2, default=0.0
+        "1/Pa",
+        "β, relative change of the area by the pressure",
+        low=0.0,
+        high=1e-2,
+        default=0.0,
+        doubt=Doubt(absolute=3e-6, begin=0.1),
     )
     drive: str = choice(
         "control: pressure (Pa), or volume that a pump delivers (m3), of a liquid or of a gas",
@@ -71,8 +112,12 @@ class Chambers(Stretched, Effect):
     highest: Any = parameter(
         "Pa", "highest pressure that a control may have", low=0.0, high=1e9, default=None
     )
-    compliance: Any = parameter("m3/Pa", "C, of the line of a liquid", low=0.0, high=1.0, default=0.0)
-    dead_volume: Any = parameter("m3", "D, of pump and line of a gas", low=0.0, high=1.0, default=0.0)
+    compliance: Any = parameter(
+        "m3/Pa", "C, of the line of a liquid", low=0.0, high=1.0, default=0.0, doubt=Doubt(0.5)
+    )
+    dead_volume: Any = parameter(
+        "m3", "D, of pump and line of a gas", low=0.0, high=1.0, default=0.0, doubt=Doubt(0.3)
+    )
     atmosphere: Any = parameter(
         "Pa", "p_a, at which a gas was enclosed", low=1e3, high=1e9, default=ATMOSPHERE
     )
@@ -82,6 +127,13 @@ class Chambers(Stretched, Effect):
         if (self.radius is None) == (self.area is None):
             raise ParameterError("Chambers: allowed is either radius, of round chambers, or area")
         values = (self.angles, self.offset, self.radius)
+        for name in ("area_factors", "offset_factors"):
+            given = np.shape(getattr(self, name))
+            if given and given[-1] != self.count:
+                raise ParameterError(
+                    f"Chambers: {name} has {given[-1]} numbers; allowed is one for each of "
+                    f"{self.count} angles"
+                )
         if self.radius is None or any(isinstance(one, jax.core.Tracer) or np.ndim(one) > 1 for one in values):
             return
         angles = np.sort(np.mod(self.angles, 2.0 * np.pi))
@@ -103,9 +155,20 @@ class Chambers(Stretched, Effect):
         return int(np.shape(self.angles)[-1])
 
     @property
+    def alike(self) -> Float[Any, " c"]:
+        """One for each chamber."""
+        return np.ones(self.count)
+
+    @property
     def rest_area(self) -> Any:
-        """A₀ (m²)."""
-        return np.pi * self.radius**2 if self.area is None else self.area
+        """A₀ (m²), of each chamber if they are not alike."""
+        area = np.pi * self.radius**2 if self.area is None else self.area
+        return area if self.area_factors is None else area * self.area_factors
+
+    @property
+    def offsets(self) -> Any:
+        """Distance (m) from the axis, of each chamber if they are not alike."""
+        return self.offset if self.offset_factors is None else self.offset * self.offset_factors
 
     @property
     def control_fields(self) -> tuple[Field, ...]:
@@ -120,9 +183,9 @@ class Chambers(Stretched, Effect):
     def usual_control(self, rod: Any, field: Field) -> float:
         """Return the pressure by which one chamber bends the rod by a radian, or a fifth of its volume."""
         if self.drive != "pressure":
-            return float(0.2 * self.rest_area * rod.length)
-        lever = max(float(self.offset), 1e-6)
-        return min(float(rod.Kbt[0, 0] / (rod.length * self.rest_area * lever)), field.high)
+            return float(0.2 * np.mean(self.rest_area) * rod.length)
+        lever, area = max(float(self.offset), 1e-6), float(np.mean(self.rest_area))
+        return min(float(rod.Kbt[0, 0] / (rod.length * area * lever)), field.high)
 
     def _name(self, rod: Any, field: str) -> str:
         """Return the name of one of the part's fields, which other chambers of the rod may have too."""
@@ -130,7 +193,7 @@ class Chambers(Stretched, Effect):
 
     def paths(self, rod: Any) -> OffsetPaths:
         """Return the paths of the chambers' centres."""
-        return OffsetPaths(self.offset, self.angles, self.twist, rod.length)
+        return OffsetPaths(self.offsets, self.angles, self.twist, rod.length)
 
     def pressure(self, point: RodPoint) -> Float[Any, " c"]:
         """Return p (Pa)."""
@@ -161,8 +224,9 @@ class Chambers(Stretched, Effect):
         if self.twist is not None or self.drive != "pressure":
             return control
         x, y = jnp.cos(self.angles), jnp.sin(self.angles)
-        moment = self.offset * jnp.stack([jnp.sum(control * y), -jnp.sum(control * x)])
-        return self.rest_area * jnp.concatenate([jnp.sum(control)[None], moment])
+        force = self.rest_area * control
+        moment = jnp.stack([jnp.sum(self.offsets * force * y), -jnp.sum(self.offsets * force * x)])
+        return jnp.concatenate([jnp.sum(force)[None], moment])
 
     # a pump's volume: the pressure is unknown, and the chambers' volume is summed up along the rod
 
@@ -239,13 +303,21 @@ class Hyperelastic(Effect):
     kind: ClassVar[str] = "hyperelastic"
 
     second: Any = parameter(
-        "", "c₂, C₂ over C₁ of Yeoh's law; 0 is neo-Hookean", low=0.0, high=1e3, default=0.0
+        "",
+        "c₂, C₂ over C₁ of Yeoh's law; 0 is neo-Hookean",
+        low=0.0,
+        high=1e3,
+        default=0.0,
+        doubt=Doubt(absolute=0.3),
     )
     third: Any = parameter("", "c₃, C₃ over C₁ of Yeoh's law", low=0.0, high=1e3, default=0.0)
+    share: Any = parameter(
+        "", "part of the difference from linear elasticity; 0 is linear", low=0.0, high=10.0, default=1.0
+    )
 
     def law(self, point: RodPoint, law: MaterialLaw, internal: Fields) -> MaterialLaw:
         """Return the law with the difference from linear elasticity, along the axis."""
         one, axis = jnp.ones(1), np.zeros((1, 3))
-        EA = law.strains["v"].stiffness[2, 2]
+        EA = self.share * law.strains["v"].stiffness[2, 2]
         excess = Stretching(0.0 * one, EA * one, self.second * one, self.third * one)
         return law._replace(coupling=Tendons(axis, axis, 0.0 * one, 0.0 * one, excess).joined(law.coupling))

@@ -35,7 +35,7 @@ from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.loads import Motion
-from knode_cosserat.rods.parameters import ParameterError, as_number, parameter
+from knode_cosserat.rods.parameters import Doubt, ParameterError, as_number, parameter
 from knode_cosserat.rods.parts import Effect, RodPoint
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rotation import cross, dot, rotation_matrix
@@ -70,6 +70,7 @@ class Insertion(Effect):
         low=0.0,
         high=20.0,
         default=0.0,
+        doubt=Doubt(0.05),
     )
     retraction: Any = parameter(
         "m",

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
-from knode_cosserat.rods.parameters import choice, parameter, place
+from knode_cosserat.rods.parameters import Doubt, choice, parameter, place
 from knode_cosserat.rods.parts import Part, RodPoint, Stretched, Wrench
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
@@ -189,7 +189,7 @@ class AttachedMass(PointLoad):
 
     kind: ClassVar[str] = "attached-mass"
 
-    mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0)
+    mass: Any = parameter("kg", "mass", low=0.0, high=1e4, default=0.0, doubt=Doubt(0.2))
     inertia: Any = parameter(
         "kg m2", "moments of inertia about its centre", shape="vector", low=0.0, high=1e6, default=None
     )

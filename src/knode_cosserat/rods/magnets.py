@@ -23,7 +23,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.loads import Load, Motion, PointLoad, SpreadLoad
-from knode_cosserat.rods.parameters import choice, parameter, slot
+from knode_cosserat.rods.parameters import Doubt, choice, parameter, slot
 from knode_cosserat.rods.parts import Part, Wrench
 from knode_cosserat.rotation import cross, dot
 
@@ -53,7 +53,13 @@ class UniformField(MagneticField):
     kind: ClassVar[str] = "uniform"
 
     flux_density: Any = parameter(
-        "T", "B, flux density, global frame", shape="vector", low=-100.0, high=100.0, default=(0.0, 0.0, 0.0)
+        "T",
+        "B, flux density, global frame",
+        shape="vector",
+        low=-100.0,
+        high=100.0,
+        default=(0.0, 0.0, 0.0),
+        doubt=Doubt(0.1, absolute=2e-4),
     )
     controlled: bool = choice("true if a control adds to the flux density", (False, True), False)
 
@@ -74,10 +80,20 @@ class DipoleField(MagneticField):
     kind: ClassVar[str] = "dipole"
 
     position: Any = parameter(
-        "m", "position of the dipole, off the rod, global frame", shape="vector", low=-1e3, high=1e3
+        "m",
+        "position of the dipole, off the rod, global frame",
+        shape="vector",
+        low=-1e3,
+        high=1e3,
+        doubt=Doubt(absolute=0.003),
     )
     moment: Any = parameter(
-        "A m2", "magnetic moment of the dipole, global frame", shape="vector", low=-1e6, high=1e6
+        "A m2",
+        "magnetic moment of the dipole, global frame",
+        shape="vector",
+        low=-1e6,
+        high=1e6,
+        doubt=Doubt(0.1),
     )
     controlled: tuple[str, ...] = choice(
         "values to which controls add: x, y, z (m) to the position, mx, my, mz (A m2) to the moment",
@@ -132,6 +148,7 @@ class Magnet(_Magnetic, SpreadLoad):
         low=-1e6,
         high=1e6,
         default=(0.0, 0.0, 0.0),
+        doubt=Doubt(0.2),
     )
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:
@@ -145,7 +162,13 @@ class PointMagnet(_Magnetic, PointLoad):
     kind: ClassVar[str] = "point-magnet"
 
     moment: Any = parameter(
-        "A m2", "magnetic moment, material frame", shape="vector", low=-1e6, high=1e6, default=(0.0, 0.0, 0.0)
+        "A m2",
+        "magnetic moment, material frame",
+        shape="vector",
+        low=-1e6,
+        high=1e6,
+        default=(0.0, 0.0, 0.0),
+        doubt=Doubt(0.2),
     )
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:

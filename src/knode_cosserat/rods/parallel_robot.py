@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Drawing, Ends, Observed
+from knode_cosserat.rods.camera import Camera
 from knode_cosserat.rods.layout import Layout
-from knode_cosserat.rods.parameters import ParameterError, parameter, stated_of
+from knode_cosserat.rods.parameters import Doubt, ParameterError, parameter, slot, stated_of
 from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, SlenderRod
 from knode_cosserat.rods.section import CrossSection
@@ -75,15 +76,29 @@ class ParallelRobot(Bundle):
     youngs_modulus: Any = _of_rod("youngs_modulus")
     tip_radius: Any = _of_rod("tip_radius")
     cross_section: CrossSection | None = _of_rod("cross_section")
-    base_radius: Any = parameter("m", "radius of the circle on which the legs begin", low=0.0, high=20.0)
-    platform_radius: Any = parameter("m", "radius of the platform's circle of joints", low=0.0, high=20.0)
+    base_radius: Any = parameter(
+        "m", "radius of the circle on which the legs begin", low=0.0, high=20.0, doubt=Doubt(0.02)
+    )
+    platform_radius: Any = parameter(
+        "m", "radius of the platform's circle of joints", low=0.0, high=20.0, doubt=Doubt(0.02)
+    )
     base_angles: Any = parameter(
-        "rad", "angles of the legs on the base, one a leg", shape="list", low=-10.0, high=10.0
+        "rad",
+        "angles of the legs on the base, one a leg",
+        shape="list",
+        low=-10.0,
+        high=10.0,
+        doubt=Doubt(absolute=0.02),
     )
     platform_angles: Any = parameter(
-        "rad", "angles of the legs on the platform, one a leg", shape="list", low=-10.0, high=10.0
+        "rad",
+        "angles of the legs on the platform, one a leg",
+        shape="list",
+        low=-10.0,
+        high=10.0,
+        doubt=Doubt(absolute=0.02),
     )
-    platform_mass: Any = parameter("kg", "mass of the platform", low=0.0, high=1e4)
+    platform_mass: Any = parameter("kg", "mass of the platform", low=0.0, high=1e4, doubt=Doubt(0.1))
     platform_inertia: Any = parameter(
         "kg m2",
         "inertia of the platform about its centre; by default of a disc as wide as its joints",
@@ -116,6 +131,7 @@ class ParallelRobot(Bundle):
     gravity: Any = _of_rod("gravity")
     shear_stiffness: Any = _of_rod("shear_stiffness")
     bending_stiffness: Any = _of_rod("bending_stiffness")
+    camera: Camera | None = slot("frame and tip marker of measured positions", Camera, default=None)
 
     def __check_init__(self) -> None:
         base, platform = np.shape(self.base_angles), np.shape(self.platform_angles)

@@ -13,7 +13,7 @@ import inspect
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, ClassVar, Literal, Self, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, Self, get_args
 
 import equinox as eqx
 import jax
@@ -85,6 +85,24 @@ def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, 
     return None
 
 
+class Doubt(NamedTuple):
+    """How well a ruler, data sheet or photograph usually states a parameter: standard deviations.
+
+    Identification searches for a parameter with a doubt (`identification.part_effects`): `relative` is that
+    of a common factor of all its numbers, `absolute` that of each number, in its unit. An optional parameter
+    without a value has that of the property `of` of its owner, or else zero. A search begins at the number
+    `begin` of absolute deviations, where zero has no derivative. `basic` parameters are always searched for.
+    Numbers of a list, or of several parts, have an addend in `common`, unless another parameter states it.
+    """
+
+    relative: float = 0.0
+    absolute: float = 0.0
+    of: str = ""
+    begin: float = 0.0
+    basic: bool = False
+    common: bool = True
+
+
 @dataclasses.dataclass(frozen=True)
 class Parameter:
     """Statement of numbers. `low` and `high` bound each number (of a matrix, each eigenvalue)."""
@@ -95,6 +113,7 @@ class Parameter:
     low: float
     high: float
     optional: bool
+    doubt: Doubt | None = None
 
     @property
     def bounds(self) -> str:
@@ -417,6 +436,7 @@ def parameter(
     low: float,
     high: float,
     default: Any = dataclasses.MISSING,
+    doubt: Doubt | None = None,
 ) -> Any:
     """Return a dataclass field for a physical parameter; default None makes it optional.
 
@@ -428,13 +448,14 @@ def parameter(
         low: lowest allowed number; of a matrix, lowest eigenvalue.
         high: highest one.
         default: value by default; without one the parameter is required.
+        doubt: how well a ruler or a data sheet usually knows it; None: identification does not search it.
 
     Raises:
         ValueError: another shape.
     """
     if shape not in get_args(Shape):
         raise ValueError(f"shape is {shape!r}; allowed is {', '.join(get_args(Shape))}")
-    stated = Parameter(unit, meaning, shape, low, high, optional=default is None)
+    stated = Parameter(unit, meaning, shape, low, high, optional=default is None, doubt=doubt)
     return _field(stated, default, _as_matrix if shape == "matrix" else _as_array)
 
 

@@ -19,11 +19,12 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.aspects import Ends, Observed
+from knode_cosserat.rods.camera import Camera
 from knode_cosserat.rods.ends import AT_ORIGIN, Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw, Viscoelastic
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.loads import Load, Motion, point_wrench, square_law_drag
-from knode_cosserat.rods.parameters import ParameterError, parameter, slot, text
+from knode_cosserat.rods.parameters import Doubt, ParameterError, parameter, slot, text
 from knode_cosserat.rods.parts import Contribution, Effect, RodPoint, Wrench
 from knode_cosserat.rods.section import (
     ALONG,
@@ -83,18 +84,30 @@ class SlenderRod(System):
         ("cross_section",),
     )
 
-    length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0)
+    length: Any = parameter("m", "length of the rod", low=1e-3, high=20.0, doubt=Doubt(0.02))
     # required, unless the cross-section states them
     radius: Any = parameter("m", "radius of the rod", low=1e-6, high=0.5, default=None)
     density: Any = parameter(
-        "kg/m3", "density of the rod, ribs spread over it included", low=1.0, high=100e3, default=None
+        "kg/m3",
+        "density of the rod, ribs spread over it included",
+        low=1.0,
+        high=100e3,
+        default=None,
+        doubt=Doubt(0.1),
     )
-    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12, default=None)
+    youngs_modulus: Any = parameter(
+        "Pa", "Young's modulus", low=1e3, high=2e12, default=None, doubt=Doubt(0.5, basic=True)
+    )
     tip_radius: Any = parameter(
         "m", "radius at the tip, to which a round rod tapers linearly", low=1e-6, high=0.5, default=None
     )
     shear_modulus: Any = parameter(
-        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
+        "Pa",
+        "shear modulus; by default E / 2.6",
+        low=1e2,
+        high=1e12,
+        default=None,
+        doubt=Doubt(0.3, of="usual_shear_modulus"),
     )
     shear_damping: Any = parameter(
         "N s", "Bse, damping of shear and extension", shape="matrix", low=0.0, high=1e6, default=0.0
@@ -103,10 +116,22 @@ class SlenderRod(System):
         "N m2 s", "Bbt, damping of bending and twisting", shape="matrix", low=0.0, high=1e4, default=0.0
     )
     shear_stiffness: Any = parameter(
-        "N", "Kse; by default diag(GA, GA, EA)", shape="matrix", low=1e-9, high=1e15, default=None
+        "N",
+        "Kse; by default diag(GA, GA, EA)",
+        shape="matrix",
+        low=1e-9,
+        high=1e15,
+        default=None,
+        doubt=Doubt(0.3, of="usual_shear_stiffness"),
     )
     bending_stiffness: Any = parameter(
-        "N m2", "Kbt; by default diag(EI, EI, GJ)", shape="matrix", low=1e-15, high=1e9, default=None
+        "N m2",
+        "Kbt; by default diag(EI, EI, GJ)",
+        shape="matrix",
+        low=1e-15,
+        high=1e9,
+        default=None,
+        doubt=Doubt(0.5, basic=True),
     )
     cross_section: CrossSection | None = slot(
         "cross-section; none: solid and round, with the radius", CrossSection, default=None
@@ -126,12 +151,14 @@ class SlenderRod(System):
         low=-100.0,
         high=100.0,
         default=(0.0, 0.0, -9.81),
+        doubt=Doubt(absolute=0.3),
     )
     loads: tuple[Load, ...] = slot("loads beside gravity and drag", Load, many=True, default=())
     surroundings: tuple[Obstacle, ...] = slot("obstacles that it may touch", Obstacle, many=True, default=())
     effects: tuple[Effect, ...] = slot("further physics", Effect, many=True, default=())
     base_end: End = slot("end at s = 0", End, default=Clamped())
     tip_end: End = slot("end at s = length", End, default=Free())
+    camera: Camera | None = slot("frame and tip marker of measured positions", Camera, default=None)
     name: str = text("name in an assembly")
 
     def __check_init__(self) -> None:
@@ -280,6 +307,16 @@ class SlenderRod(System):
     def G(self) -> Any:
         """Shear modulus (Pa): the parameter, or by default from Young's modulus."""
         return shear_modulus(self)
+
+    @property
+    def usual_shear_modulus(self) -> Any:
+        """Shear modulus (Pa) without the parameter; None if a cross-section states stiffnesses."""
+        return self.G if getattr(self.cross_section, "is_homogeneous", True) else None
+
+    @property
+    def usual_shear_stiffness(self) -> Any:
+        """Stiffness of shear and extension (N) without the parameter; None if that varies with a table."""
+        return self.Kse if getattr(self.cross_section, "is_homogeneous", True) else None
 
     def Kse_at(self, part: Any) -> Float[Any, "3 3"]:
         """Return the stiffness of shear and extension (N): the parameter, or by default the section's."""

@@ -173,7 +173,7 @@ def _path_winding(function: Callable[[Any], tuple[Any, Any]]) -> float:
 
 
 class OffsetPaths(NamedTuple):
-    """Paths of tendons at one distance (m) from the axis; they turn about it by `twist` (rad) to the tip."""
+    """Paths of tendons at a distance (m) from the axis, or one each, turned by `twist` (rad) to the tip."""
 
     offset: Any
     angles: Float[Any, " c"]
@@ -200,15 +200,16 @@ class OffsetPaths(NamedTuple):
         """Routings of the tendons."""
         angles = jnp.asarray(self.angles)
         if self.twist is not None:
-            turns = self.twist / (2.0 * np.pi)
-            return tuple(Helical(self.offset, angles[k], turns) for k in range(angles.shape[0]))
+            turns, offsets = self.twist / (2.0 * np.pi), jnp.broadcast_to(self.offset, angles.shape)
+            return tuple(Helical(offsets[k], angles[k], turns) for k in range(angles.shape[0]))
         x, y = self.offset * jnp.cos(angles), self.offset * jnp.sin(angles)
         return tuple(Straight(x[k], y[k]) for k in range(angles.shape[0]))
 
     def routes(self, s: Any) -> tuple[Float[Any, "c 3"], Float[Any, "c 3"]]:
         """Return r (m) and r′ of the tendons at s (m)."""
         angles = self._angles(s)
-        r = self.offset * jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], axis=-1)
+        offset = self.offset if np.ndim(self.offset) == 0 else self.offset[:, None]
+        r = offset * jnp.stack([jnp.cos(angles), jnp.sin(angles), jnp.zeros_like(angles)], axis=-1)
         if self.twist is None:
             return r, np.zeros(r.shape)
         across = jnp.stack([-r[:, 1], r[:, 0], jnp.zeros_like(angles)], axis=-1)

@@ -21,6 +21,7 @@ neglected.
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -30,10 +31,20 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.parameters import ParameterError, as_number, known_size, parameter, place, slot
+from knode_cosserat.rods.parameters import (
+    Doubt,
+    ParameterError,
+    as_number,
+    known_size,
+    parameter,
+    place,
+    slot,
+)
 from knode_cosserat.rods.parts import Part, RodPoint
+from knode_cosserat.rods.powell import roots
 from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
     ALONG,
@@ -45,10 +56,12 @@ from knode_cosserat.rods.section import (
     shear_modulus,
 )
 from knode_cosserat.rods.system import CHOSEN_TURN
-from knode_cosserat.rotation import cross, dot, rotation_matrix
+from knode_cosserat.rotation import cross, dot, quaternion_product, rotation_matrix
 
 #: default number of segments of each interval: of order 4, their error is below 1e-4 of the length at rest
 SEGMENTS = 4
+#: steps of a shot in each interval
+STEPS = 5
 
 
 class Tube(Part):
@@ -57,14 +70,24 @@ class Tube(Part):
     kind: ClassVar[str] = "tube"
 
     radius: Any = parameter("m", "outer radius", low=1e-6, high=0.5)
-    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12)
+    youngs_modulus: Any = parameter("Pa", "Young's modulus", low=1e3, high=2e12, doubt=Doubt(0.15))
     density: Any = parameter("kg/m3", "density", low=1.0, high=100e3)
     inner_radius: Any = parameter("m", "inner radius", low=0.0, high=0.5, default=0.0)
     curvature: Any = parameter(
-        "1/m", "κ, curvature at rest of its last part", low=-1e3, high=1e3, default=0.0
+        "1/m",
+        "κ, curvature at rest of its last part",
+        low=-1e3,
+        high=1e3,
+        default=0.0,
+        doubt=Doubt(0.1),
     )
     curved: Any = parameter(
-        "m", "c, length of the curved part; by default all of the tube", low=0.0, high=20.0, default=None
+        "m",
+        "c, length of the curved part; by default all of the tube",
+        low=0.0,
+        high=20.0,
+        default=None,
+        doubt=Doubt(absolute=0.002),
     )
     transmission: Any = parameter(
         "m",
@@ -72,9 +95,31 @@ class Tube(Part):
         low=0.0,
         high=20.0,
         default=0.0,
+        doubt=Doubt(0.1),
     )
     shear_modulus: Any = parameter(
-        "Pa", "shear modulus; by default E / 2.6", low=1e2, high=1e12, default=None
+        "Pa",
+        "shear modulus; by default E / 2.6",
+        low=1e2,
+        high=1e12,
+        default=None,
+        doubt=Doubt(0.2, of="G"),
+    )
+    rotation_zero: Any = parameter(
+        "rad",
+        "angle of the plane of its curvature where its rotation is zero",
+        low=-10.0,
+        high=10.0,
+        default=0.0,
+        doubt=Doubt(absolute=0.1),
+    )
+    insertion_zero: Any = parameter(
+        "m",
+        "displacement along the rod where its insertion is zero",
+        low=-1.0,
+        high=1.0,
+        default=0.0,
+        doubt=Doubt(absolute=0.002),
     )
     end: float = place("where it ends without insertion", low=1e-3, default=1.0, kw_only=True)
 
@@ -127,10 +172,19 @@ class _Tubes(CrossSection):
             fields.append(Field(f"rotation_{k}", 1, "rad", f"rotation of tube {k} at its base"))
             field = Field(f"insertion_{k}", 1, "m", f"displacement of tube {k} along the rod, at its base")
             length, transmission = as_number(self.length), as_number(tube.transmission)
-            if length is not None and transmission is not None:
-                field = field._replace(low=-tube.end * length, high=transmission)
+            zero = as_number(tube.insertion_zero)
+            if length is not None and transmission is not None and zero is not None:
+                field = field._replace(low=-tube.end * length - zero, high=transmission - zero)
             fields.append(field)
         return tuple(fields)
+
+    def rotations(self, input: Any) -> Any:
+        """Return αᵢ (rad) from the controls."""
+        return input[::2] + self.values("rotation_zero")
+
+    def insertions(self, input: Any) -> Any:
+        """Return the displacements (m) of the tubes from the controls."""
+        return input[1::2] + self.values("insertion_zero")
 
     @property
     def cuts(self) -> tuple[float, ...]:
@@ -142,7 +196,8 @@ class _Tubes(CrossSection):
 
     def lengths(self, rod: Any, input: Any) -> tuple[list[Any], list[Any]]:
         """Return the arclengths (m) beyond the plate at which each tube begins to be curved, and ends."""
-        ends = [tube.end * rod.length + input[2 * k + 1] for k, tube in enumerate(self.tubes)]
+        moved = self.insertions(input)
+        ends = [tube.end * rod.length + moved[k] for k, tube in enumerate(self.tubes)]
         return [
             None if tube.curved is None else jnp.maximum(end - tube.curved, 0.0)
             for tube, end in zip(self.tubes, ends, strict=True)
@@ -229,8 +284,8 @@ class _Tubes(CrossSection):
 
     def base_y(self, point: RodPoint) -> Fields:
         """Return the angles at the plate."""
-        straight = self.values("transmission") - point.input[1::2]
-        return {"angle": point.input[::2] + straight * self.torsions(point) / self.GJ}
+        straight = self.values("transmission") - self.insertions(point.input)
+        return {"angle": self.rotations(point.input) + straight * self.torsions(point) / self.GJ}
 
     def arclength_rate(self, point: RodPoint) -> Any:
         """Return the rate of arclength along the grid."""
@@ -370,6 +425,92 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
 
     rest_is_guess = True
 
+    def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
+        """Return y with the angles and torsion of the equilibrium that shooting from no torsion finds.
+
+        Turned far, tubes have several equilibria, also unstable ones. Programs for such robots shoot from the
+        plate with Powell's hybrid method, and begin without torsion (Rucker et al. 2010).
+        """
+        layout = self.system.y_layout
+        states = np.array(np.broadcast_to(y, (len(controls), *np.shape(y))))
+        if not len(controls):
+            return states
+        pieces, alpha = _pieces_of(self.system, np.asarray(controls, dtype=float))
+        states[..., layout.slice("angle")] = np.asarray(alpha)[:, None]
+        if len(self.system.tubes) == 1:
+            return states
+        twist, found = roots(lambda twist: np.asarray(_shoot(pieces, twist)[1][:, -1]), np.zeros_like(alpha))
+        angles, twists = map(np.asarray, _shoot(pieces, twist))
+        path = np.concatenate([angles, np.asarray(pieces[-1])[:, None] * twists], axis=-1)
+        at, last = np.asarray(along) * (path.shape[1] - 1), path.shape[1] - 2
+        first = np.minimum(at.astype(int), last)
+        part = (at - first)[:, None]
+        values = (1.0 - part) * path[:, first] + part * path[:, first + 1]
+        turned, torsion = np.split(values, 2, axis=-1)
+        states[found, :, layout.slice("angle")] = turned[found]
+        states[found, :, layout.slice("torsion")] = torsion[found, :, 1:]
+        return states
+
+
+@jax.jit
+def _pieces_of(robot: Any, controls: Any) -> Any:
+    """Return the intervals of the grid under each control, and the angles at the actuators.
+
+    They have lengths, and of each tube presence, curvature, angle at the plate without twist, length behind
+    it, and EI and GJ.
+    """
+
+    def of(control: Any) -> Any:
+        tubes, input = robot._tubes_of(control)
+        count = len(tubes.cuts) + 1
+        middles = [(k + 0.5) / count * robot.length for k in range(count)]
+        lengths = jnp.stack([tubes.arclength(robot, s, input)[1] * robot.length / count for s in middles])
+        presence, curvature = map(
+            jnp.stack, zip(*(tubes.present(robot, s, input) for s in middles), strict=True)
+        )
+        alpha = tubes.rotations(input)
+        straight = tubes.values("transmission") - tubes.insertions(input)
+        return (lengths, presence, curvature, alpha, straight, tubes.EI, tubes.GJ), alpha
+
+    return jax.vmap(of)(controls)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0))
+def _shoot(pieces: Any, twist: Any) -> tuple[Any, Any]:
+    """Return angles and twists (1/m) of all tubes from the plate to the tip, without loads."""
+    lengths, presence, curvature, alpha, straight, EI, GJ = pieces
+
+    def step(state: Any, piece: Any) -> tuple[Any, Any]:
+        # leapfrog: half a step with the twist, a step of the twist, half a step
+        h, there, curved = piece
+        angle, twist = state
+        middle = angle + 0.5 * h * there * twist
+        x, y, weight = curved * jnp.cos(middle), curved * jnp.sin(middle), EI * there
+        torque = (jnp.sum(weight * x) * y - jnp.sum(weight * y) * x) / jnp.sum(weight)
+        after = twist + h * EI / GJ * there * torque
+        new = middle + 0.5 * h * there * after, after
+        return new, jnp.stack(new)
+
+    begin = alpha + straight * twist, twist
+    every = tuple(jnp.repeat(part, STEPS, axis=0) for part in (lengths / STEPS, presence, curvature))
+    _, states = jax.lax.scan(step, begin, every, unroll=STEPS)
+    states = jnp.concatenate([jnp.stack(begin)[None], states])
+    return states[:, 0], states[:, 1]
+
+
+class _TubesDrawing(Drawing, of=ConcentricTubeRobot):
+    """The rod, whose frame does not twist; what is attached to the tip turns with the innermost tube."""
+
+    def attached(self, y: Any) -> Any:
+        """Return the orientations of the innermost tube's tip, of states y (…, y) there."""
+        layout = self.system.y_layout
+        half = 0.5 * layout.get(y, "angle")[..., :1]
+        none = jnp.zeros_like(half)
+        turn = jnp.concatenate([jnp.cos(half), none, none, jnp.sin(half)], axis=-1)
+        product = jnp.vectorize(quaternion_product, signature="(4),(4)->(4)")
+        return product(layout.get(y, "h"), turn)
+
 
 class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
     """Motion, and bending, torsion and sliding of the tubes, from which their laws follow."""
@@ -441,4 +582,4 @@ class _TubesObserved(RodObserved, of=ConcentricTubeRobot):
     def base_inputs(self, y: Float[Any, " y"], control: Any) -> Float[Any, " b"]:
         """Return the torsion of each tube times its length behind the plate."""
         tubes, at = self._point(0.0, y, control)
-        return (tubes.values("transmission") - at.input[1::2]) * tubes.torsions(at)
+        return (tubes.values("transmission") - tubes.insertions(at.input)) * tubes.torsions(at)

@@ -40,7 +40,7 @@ from knode_cosserat.solvers.simulate import (
     stack_robots,
 )
 from knode_cosserat.solvers.small_motion import stable_near, verdicts
-from knode_cosserat.solvers.static_run import static_batch, static_run
+from knode_cosserat.solvers.static_run import separate_run, static_batch, static_run
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -115,13 +115,14 @@ def equilibria(
     on_failure: Literal["raise", "return"] = "raise",
     with_stability: bool = True,
 ) -> Trajectory:
-    """Return the static equilibria under a list of controls, each found from the one before.
+    """Return the static equilibria under a list of controls, each found from the one before, or by itself.
 
     Args:
         robot: one system, or a sequence of systems that differ in their parameters only.
         controls: (T, c), or (B, T, c) for a batch.
         space: see `equilibrium`, as all other arguments; `initial` is the guess of the first equilibrium.
-        initial: see `equilibrium`.
+        initial: see `equilibrium`. "separate": each is found by itself, whatever the order of the controls,
+            from the unloaded robot, or else from the one with the nearest controls (one robot only).
         newton: see `equilibrium`.
         recovery_budget: see `equilibrium`.
         on_failure: see `equilibrium`.
@@ -161,6 +162,10 @@ def _solve(
     """Return the equilibria of a robot or a batch on its grid; arguments as in `equilibria`."""
     system, batch = stack_robots(robot)
     controls, batch = checked_controls(system, controls, batch)
+    separate = isinstance(initial, str) and initial == "separate"
+    if separate and (batch or is_traced((system, controls))):
+        raise ValueError('initial is "separate"; that is for one robot, neither a batch nor traced')
+    initial = None if separate else initial
     if initial is not None and not isinstance(initial, Trajectory):
         initial = _guess(robot, initial, controls[(0,) * (np.ndim(controls) - 1)])
     elif initial is not None and isinstance(robot, System) and has_chosen(robot):
@@ -180,7 +185,10 @@ def _solve(
         rows = mark_unseen(system, _solve_traced(bare, controls, rest, task, Pattern.of(bare)))
         tested: Any = jnp.full(jnp.shape(rows.result), int(Verdict.UNTESTED_TRACED))
     else:
-        rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
+        if separate:
+            rows, _, causes = separate_run(task, bare, controls)
+        else:
+            rows, _, causes = (static_batch if batch else static_run)(task, bare, controls, y, before)
         if on_failure == "raise" and causes:
             raise failure(rows, causes, None)
         tested = verdicts(bare, settings, rows, np.asarray(controls) if with_stability else None)

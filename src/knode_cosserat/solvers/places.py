@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.camera import Camera
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import Markers
@@ -40,6 +42,34 @@ def places_on(robot: System, fractions: Iterable[float]) -> Places:
             known |= zip(part.stated or (), part.at, strict=True)
     along = [known.get(float(it), it) for it in fractions]
     return places_at(jnp.stack(along) if known else np.array(along), robot.nodes)
+
+
+def seen_positions(
+    robot: System, y: Float[Any, "T N y"], fractions: Sequence[float], z: Float[Any, "T N z"] | None = None
+) -> Float[Any, "T M d"]:
+    """Return the positions (m) of bodies as the robot's `Camera` measures them, if it states one."""
+    places, drawing = places_on(robot, fractions), Drawing.of(robot)
+    p, camera = positions_at(robot, y, places, z), camera_of(robot)
+    if camera is None:
+        return p
+    tip = None
+    if len(fractions) and fractions[-1] == 1.0:
+        with contextlib.suppress(AttributeError):
+            tip = drawing.attached(y[..., -1, :])
+    return camera.positions(jnp.asarray(p), tip)
+
+
+def seen_quaternions(
+    robot: System, y: Float[Any, "T N y"], fractions: Sequence[float]
+) -> Float[Any, "T M 4"]:
+    """Return the orientations of bodies in the frame of the robot's `Camera`, if it states one."""
+    h, camera = quaternions_at(robot, y, places_on(robot, fractions)), camera_of(robot)
+    return h if camera is None else camera.quaternions(h)
+
+
+def camera_of(robot: System) -> Camera | None:
+    """Return the camera that a robot, or the nominal model of a learned one, states."""
+    return getattr(nominal_model(robot), "camera", None)
 
 
 def positions_at(

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat.rods.aspects import Ends
 from knode_cosserat.rods.ends import Free
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
@@ -40,6 +41,8 @@ DIVISIONS, PARTS = 8, 4
 STRAIGHT = 0.999
 #: part of the length by which a chord is shorter before a rod counts as compressed
 COMPRESSED = 1e-9
+#: tip of systems that state none
+FREE = Free()
 
 
 def static_run(
@@ -92,6 +95,55 @@ def static_batch(
         jax.tree.map(lambda *x: np.stack(x), *each) for each in list(zip(*parts, strict=True))[:2]
     )
     return rows, states, {i: cause for i, (*_, cause) in enumerate(parts) if cause}
+
+
+def separate_run(task: TimeIntegration, system: System, controls: Any) -> tuple[StepRows, Any, str]:
+    """Solve the equilibria of one robot under controls (T, c), each by itself, in a batch.
+
+    They do not depend on their order: the first guess of each is the unloaded shape. What is not found from
+    there is sought from the solved row with the nearest controls, and then with recovery. Returned are rows,
+    y at all points of each, and the likely cause for the first row that is not solved.
+    """
+    controls, ends = np.asarray(controls), Ends.of(system)
+    still = dataclasses.replace(task, steps=1, recovery_budget=0.0)
+    begin = unloaded_shape(system, task.settings.space)
+    along = grid_of(system, task.settings.space).along[: len(begin)]
+    begins = ends.unloaded(begin, along, controls)
+    rows, points, _ = run_batch(still, system, controls[:, None], (begins, controls), watch=None)
+    rows = StepRows(*(np.array(leaf[:, 0]) for leaf in rows))
+    size = np.ptp(controls, axis=0) if len(controls) else np.ones(controls.shape[-1])
+    size, points = np.where(size > 0.0, size, 1.0), np.array(points)
+    alone = np.max(largest_turns(system, controls[:, None]), axis=-1) > LARGEST_TURN * (1.0 + 1e-9)
+    # turns of driven ends are counted, and shapes of a rod between two ends chosen, from the unloaded robot
+    alone |= strand_count(system) == 1 and not isinstance(
+        getattr(nominal_model(system), "tip_end", FREE), Free
+    )
+    good, tried = (rows.result >= 0) & ~alone, np.zeros(len(controls), dtype=int) - 1
+    while good.any() and not (good | alone).all():
+        missing, known = np.flatnonzero(~good & ~alone), np.flatnonzero(good)
+        away = np.linalg.norm((controls[missing, None] - controls[known]) / size, axis=-1)
+        nearest = known[np.argmin(away, axis=1)]
+        new = nearest != tried[missing]
+        if not new.any():
+            break
+        missing, nearest = missing[new], nearest[new]
+        tried[missing] = nearest
+        found, at, _ = run_batch(
+            still, system, controls[missing, None], (points[nearest], controls[nearest]), watch=None
+        )
+        solved = found.result[:, 0] >= 0
+        for every, part in zip(rows, found, strict=True):
+            every[missing[solved]] = part[solved, 0]
+        points[missing[solved]], good[missing[solved]] = np.asarray(at)[solved], True
+    causes = dict[int, str]()
+    for k in np.flatnonzero(alone if task.recovery_budget == 0.0 else ~good):
+        one, points[k], cause = static_run(dataclasses.replace(task, steps=1), system, controls[k][None])
+        for every, part in zip(rows, one, strict=True):
+            every[k] = part[0]
+        if cause:
+            causes[int(k)] = cause
+    failed = np.flatnonzero(rows.result < 0)
+    return rows, points, causes.get(int(failed[0]), "no equilibrium was found") if len(failed) else ""
 
 
 class _Walk:

@@ -25,7 +25,7 @@ from knode_cosserat.solvers.replay import at_one_state
 from knode_cosserat.solvers.rest import constant_history, rest_record, resting_history
 from knode_cosserat.solvers.run import TimeIntegration, run_one
 from knode_cosserat.solvers.sensitivity import Changes, TangentState, static_tangents, tangent_time_loop
-from knode_cosserat.solvers.static_run import static_run
+from knode_cosserat.solvers.static_run import separate_run, static_run
 from knode_cosserat.trajectory import Trajectory
 
 
@@ -44,6 +44,8 @@ class Start(NamedTuple):
     #: from directions of the system and the weights of each in each tangent: tangents of the record, the
     #: history, and its tangents
     tangents: Callable[[Any, np.ndarray], tuple[Any, StateHistory, Any]]
+    #: false if the equilibrium before a list of equilibria was not found: the record is that at rest
+    found: bool = True
 
 
 def start_at(
@@ -72,7 +74,12 @@ def start_at(
     control = np.zeros(system.control_layout.size) if held is None else np.asarray(held, dtype=float)
     still = dataclasses.replace(settings, time=None)
     find = TimeIntegration(still, recovery_budget=task.recovery_budget)
-    rest, y, cause = static_run(find, system, control[None])
+    if settings.time is None:
+        rest, (y,), cause = separate_run(find, system, control[None])
+    else:
+        rest, y, cause = static_run(find, system, control[None])
+    if cause and settings.time is None:
+        return Start(rest_record(system)[:, :size], y, control, 1, True, _unmoved, False)
     if cause:
         return None
     record = np.asarray(rest.records[0][:, :size])
@@ -85,6 +92,11 @@ def start_at(
         return d_rows[0], past, (np.stack([d_records] * settings.memory), np.zeros_like(d_records))
 
     return Start(record, y if past is None else past, control, 1, True, tangents)
+
+
+def _unmoved(directions: Any, weights: np.ndarray) -> Any:
+    """Return no tangents of a record, for a start that does not count."""
+    return np.zeros((1, 1, 1, weights.shape[1])), None, (None, None)
 
 
 def _moving_start(
@@ -143,6 +155,8 @@ class TangentMotion(NamedTuple):
     records: Float[Any, "steps+1 N x"]
     #: rows and unknowns of all stages
     solved: tuple[Any, Any]
+    #: true for equilibria that were not found: their records are those of others
+    missing: Bool[np.ndarray, " steps+1"] | None = None
 
     def tangents(
         self,
@@ -168,13 +182,16 @@ class TangentMotion(NamedTuple):
             state = TangentState.of(self.system, settings.space, past, *d_past)
             d_rows = tangent_time_loop(self.task.coefficients, self.solved, at, changes, state)[1][0]
         last = d_rows[settings.stages - 1 :: settings.stages]
-        return np.concatenate([d_first[None, :, :size][:, kept], last])
+        first = d_first[None, :, :size][:, kept] if self.start.found else np.zeros_like(last[:1])
+        return np.concatenate([first, last])
 
 
 def tangent_motion(
     task: TimeIntegration, system: System, start: Start, controls: Float[np.ndarray, "steps c"], steps: int
 ) -> TangentMotion | None:
-    """Solve some steps, or equilibria, from a start, without estimates of errors; None if one failed.
+    """Solve some steps, or equilibria, from a start, without estimates of errors; None if it failed.
+
+    Equilibria are solved each by itself; it has failed if none is found.
 
     Args:
         task: settings, time step and recovery.
@@ -187,9 +204,27 @@ def tangent_motion(
     if settings.time is not None:
         controls = at_stages(system, settings, controls, start.control[None], start.sudden)
     task = dataclasses.replace(task, settings=settings, steps=max(steps, 1), known=start.known)
+    if settings.time is None:
+        return _equilibria(task, system, start, np.asarray(controls)[: max(steps, 1)], steps)
     rows, _, cause = run_one(task, system, controls, (start.state, start.control), watch=None)
     if cause:
         return None
     records = np.concatenate([start.record[None], rows.records[:steps, :, : start.record.shape[1]]])
     solved = tuple(part[: steps * settings.stages] for part in rows.every_stage)
     return TangentMotion(task, system, start, controls[:steps], records, solved)
+
+
+def _equilibria(
+    task: TimeIntegration, system: System, start: Start, controls: Any, steps: int
+) -> TangentMotion | None:
+    """Return some equilibria that were found each by itself."""
+    rows, _, _ = separate_run(task, system, controls)
+    solved = rows.result >= 0
+    if not solved.any():
+        return None
+    # rows that are not solved are others in the equations, and do not count
+    used = np.where(solved, np.arange(len(solved)), np.argmax(solved))[:steps]
+    records, unknowns = rows.records[used], rows.unknowns[used]
+    missing = np.concatenate([[not start.found], ~solved[:steps]])
+    every = np.concatenate([start.record[None], records[:, :, : start.record.shape[1]]])
+    return TangentMotion(task, system, start, controls[used], every, (records, unknowns), missing)
