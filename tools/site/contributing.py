@@ -6,7 +6,7 @@ from tools.site.source import ROOT
 
 
 def page() -> str:
-    """Return CONTRIBUTING.md without its title; links are relative to the repository, and a page is in docs/."""
+    """Return CONTRIBUTING.md without its title, with links from the folder docs."""
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     _, body = text.split("\n", 1)
     return body.replace("](docs/", "](").strip()
