@@ -30,6 +30,7 @@ from knode_cosserat.io.container import ContainerError
 from knode_cosserat.learning.passive import NaturalUnits, Passive
 from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.residual import Expansion, Load, Structured, Term
+from knode_cosserat.learning.terms import Smooth, Terms, Units
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
@@ -183,6 +184,9 @@ CLASSES: dict[str, type] = {
         Load,
         Expansion,
         Term,
+        Terms,
+        Smooth,
+        Units,
         TrainedRange,
     )
 }
