@@ -153,7 +153,7 @@ def _fit_recordings(
         "config": config.to_dict(),
     }
     if held_out:
-        unseen = [it for it in listed_rows(held_out)]
+        unseen = list(listed_rows(held_out))
         found = [evaluate(learned.robot, it, space=space).tip_rmse for it in unseen]
         facts["unseen_error"] = dict(zip(names_of(unseen), found, strict=True))
     if learned.kept:

@@ -29,7 +29,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
 
 #: widths of priors that are tried, for learned numbers in their units
-TRIED = (0.1, 0.3, 1.0, 3.0, 10.0)
+TRIED = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 #: least expected reduction of the held-out cost by a part
 PROMISE = 4.0
 #: smallest remaining fraction of the cost in linearised predictions
@@ -100,7 +100,7 @@ def learn_residual(
         return LearnedResidual(robot, steps=tuple(journal.steps))
     learner = _Learner.of(ParameterSearch(Misfit(model, data), journal))
     blocks = learner.blocks
-    parts = ", ".join(name.removeprefix(f"{RESIDUAL}.") for name in model.names)
+    parts = ", ".join(map(_short, model.names))
     journal.tell(f"{model.size} numbers in {parts}; {len(blocks)} blocks of rows to leave out")
     widths = promising(learner.problem, model)
     without = [learner.error(learner.begun, block) for block in blocks]
@@ -108,7 +108,7 @@ def learn_residual(
         journal.step("no residual: none of its parts promises a lower error of rows that are left out")
     tested: dict[float, list[float]] = {}
     while widths:
-        listed = ", ".join(f"{part} x {width:g}" for part, width in widths.items())
+        listed = ", ".join(f"{_short(part)} x {width:g}" for part, width in widths.items())
         journal.tell(f"trying {listed}")
         tested = {fraction: [] for fraction in FRACTIONS}
         for k, block in enumerate(blocks):
@@ -132,6 +132,11 @@ def learn_residual(
         widths = dict(list(widths.items())[: len(widths) // 2])
     after = tuple(tested.get(1.0, ()))
     return LearnedResidual(robot, False, tuple(without), after, tuple(journal.steps))
+
+
+def _short(part: str) -> str:
+    """Return the name of a part in words."""
+    return part.removeprefix(f"{RESIDUAL}.").removesuffix(".weights")
 
 
 # blocks of rows
