@@ -29,7 +29,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
 
 #: widths of priors that are tried, for learned numbers in their units
-TRIED = (0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+TRIED = (0.1, 0.3, 1.0, 3.0, 10.0)
 #: least expected reduction of the held-out cost by a part
 PROMISE = 4.0
 #: smallest remaining fraction of the cost in linearised predictions
@@ -67,7 +67,7 @@ class LearnedResidual:
         kept: true if the residual is kept.
         without: by block that was left out, the root mean square error of the robot without a residual: of
             the last body (m), or of all differences where no positions were measured.
-        with_residual: the same with it; empty if no part was promising.
+        with_residual: the same with it; empty if it is not kept.
         steps: the steps of the search, in words.
     """
 
@@ -106,32 +106,45 @@ def learn_residual(
     without = [learner.error(learner.begun, block) for block in blocks]
     if not widths:
         journal.step("no residual: none of its parts promises a lower error of rows that are left out")
-    tested: dict[float, list[float]] = {}
-    while widths:
-        listed = ", ".join(f"{_short(part)} x {width:g}" for part, width in widths.items())
-        journal.tell(f"trying {listed}")
-        tested = {fraction: [] for fraction in FRACTIONS}
-        for k, block in enumerate(blocks):
-            x = learner.searched(widths, [it for j, it in enumerate(blocks) if j != k], f"block {k + 1}")
-            for fraction, errors in tested.items():
-                rollouts = learner.at(fraction * x)
-                errors.append(np.inf if rollouts is None else learner.error(rollouts, block))
-            told = ", ".join(f"{1e3 * errors[-1]:.2f}" for errors in tested.values())
-            journal.tell(f"block {k + 1} left out: {1e3 * without[k]:.2f} mm, with the residual {told} mm")
-        fraction, words = _verdict(blocks, without, tested)
-        journal.step(f"residual ({listed}): {words}")
+    chosen: _Tested | None = None
+    for count in range(1, len(widths) + 1):
+        some = dict(list(widths.items())[:count])
+        tested = learner.tested(some, without)
+        fraction, words = _verdict(blocks, without, tested.errors)
+        journal.step(f"residual ({tested.words}): {words}")
         if fraction:
-            x = fraction * learner.searched(widths, blocks, "all")
-            learned = model.reduced(x, model.names)
-            learned = KNODE(learned.knowledge, learned.residual.clamped().pruned())
-            reason = failed_trial(learned, data, space)
-            if reason is None:
-                errors = tuple(tested[fraction])
-                return LearnedResidual(learned, True, tuple(without), errors, tuple(journal.steps))
-            journal.step(f"not accepted: {reason}")
-        widths = dict(list(widths.items())[: len(widths) // 2])
-    after = tuple(tested.get(1.0, ()))
-    return LearnedResidual(robot, False, tuple(without), after, tuple(journal.steps))
+            tested = tested._replace(errors={fraction: tested.errors[fraction]})
+            if chosen is None or tested.mean < chosen.mean:
+                chosen = tested
+    if chosen is not None:
+        [(fraction, errors)] = chosen.errors.items()
+        x = fraction * learner.searched(chosen.widths, blocks, "all")
+        learned = model.reduced(x, model.names)
+        learned = KNODE(learned.knowledge, learned.residual.clamped().pruned())
+        reason = failed_trial(learned, data, space)
+        if reason is None:
+            if len(widths) > 1:
+                journal.step(f"kept: {chosen.words}")
+            return LearnedResidual(learned, True, tuple(without), tuple(errors), tuple(journal.steps))
+        journal.step(f"not accepted: {reason}")
+    return LearnedResidual(robot, False, tuple(without), (), tuple(journal.steps))
+
+
+class _Tested(NamedTuple):
+    """Parts of a residual with the widths of their priors, and held-out errors by fraction and block."""
+
+    widths: dict[str, float]
+    errors: dict[float, list[float]]
+
+    @property
+    def words(self) -> str:
+        """The parts in words."""
+        return ", ".join(f"{_short(part)} x {width:g}" for part, width in self.widths.items())
+
+    @property
+    def mean(self) -> float:
+        """Mean error with the first fraction."""
+        return float(np.mean(next(iter(self.errors.values()))))
 
 
 def _short(part: str) -> str:
@@ -222,6 +235,20 @@ class _Learner:
     def at(self, x: Float[np.ndarray, " n"]) -> list[Rollout] | None:
         """Return the rollouts with a residual, refined as those without."""
         return self.search.solved(x, Subset(), [it.offset for it in self.begun])
+
+    def tested(self, widths: dict[str, float], without: Sequence[float]) -> _Tested:
+        """Leave each block out of a search, and predict it."""
+        journal, found = self.search.journal, _Tested(widths, {fraction: [] for fraction in FRACTIONS})
+        journal.tell(f"trying {found.words}")
+        for k, block in enumerate(self.blocks):
+            others = [it for j, it in enumerate(self.blocks) if j != k]
+            x = self.searched(widths, others, f"block {k + 1}")
+            for fraction, errors in found.errors.items():
+                rollouts = self.at(fraction * x)
+                errors.append(np.inf if rollouts is None else self.error(rollouts, block))
+            told = ", ".join(f"{1e3 * errors[-1]:.2f}" for errors in found.errors.values())
+            journal.tell(f"block {k + 1} left out: {1e3 * without[k]:.2f} mm, with the residual {told} mm")
+        return found
 
     def searched(
         self, widths: dict[str, float], blocks: Sequence[Block], name: str
