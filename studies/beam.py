@@ -380,6 +380,7 @@ def learned_residual(
         position=position[:, None],
         quaternion=quaternion[:, None],
         measured=np.ones((count, 1), dtype=bool),
+        simulated=False,
         source=recording.name,
         initial_tension=np.asarray(motion.control)[0],
     )

@@ -106,8 +106,10 @@ def test_rows_are_left_out_together_as_long_as_the_controls_are_related():
     assert len(blocks) == 6 and sorted(np.concatenate([it.rows for it in blocks])) == list(range(1, 25))
     assert np.all(np.diff(blocks[0].rows) > 1)
     slow = dataclasses.replace(quick[0], control=np.repeat(np.linspace(0.0, 3.0, 24)[:, None], 4, axis=1))
-    lengths = np.diff(np.flatnonzero(np.diff(np.concatenate([[-9], blocks_of([slow])[0].rows, [99]])) > 1))
-    assert min(lengths) >= 4
+    assert np.all(np.diff(blocks_of([slow])[0].rows) == 1) and len(blocks_of([slow])[0].rows) >= 4
+    # a release is one run
+    still = dataclasses.replace(quick[0], control=np.zeros((24, 4)))
+    assert len(blocks_of([still])) == 1 and len(blocks_of([still, still])) == 2
     # recordings that are many are left out one by one
     assert [it.experiment for it in blocks_of(quick * 7)] == list(range(7))
 
