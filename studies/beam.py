@@ -25,18 +25,13 @@ from knode_cosserat._files import csv_rows
 from knode_cosserat._files.reading import read_bytes
 from knode_cosserat.figures.comparison import REFERENCE, legend_below
 from knode_cosserat.figures.style import PALETTE, TWO_COLUMNS, new_figure
-from knode_cosserat.identification.fit import fit
-from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.residual import Residual
 from knode_cosserat.recordings.findings import RecordingError, naming
 from knode_cosserat.recordings.formats.csv_table import read_csv
-from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.table import columns_of
 from knode_cosserat.rods.ends import Clamped
 from knode_cosserat.rods.loads import AttachedMass, PointWrench
 from knode_cosserat.rods.relaxation import Relaxation
 from knode_cosserat.rods.rod import SlenderRod
-from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
@@ -198,8 +193,6 @@ class Numerics(NamedTuple):
     dt: float = 2.5e-3
 
 
-#: time between the rows that a residual is learned from (s)
-ROW = 0.01
 #: settings of the studies
 DEFAULT = Numerics()
 
@@ -271,7 +264,7 @@ def tip_height(recording: BeamRecording) -> float:
     return float(np.mean(recording.held[:, 0] - MARKERS[:, 0]) - np.mean(recording.base[:, 0]))
 
 
-def held_beam(rod: System, load: float, deflection: float) -> Trajectory:
+def held_beam(rod: SlenderRod, load: float, deflection: float) -> Trajectory:
     """Return the equilibrium with the tip held at a height (m) over that of the unloaded beam.
 
     The height is so nearly linear in the hand's force that two forces give the third.
@@ -284,7 +277,7 @@ def held_beam(rod: System, load: float, deflection: float) -> Trajectory:
     return _settled(rod, forces[0] + slope * (height - heights[0]))
 
 
-def _settled(rod: System, force: float) -> Trajectory:
+def _settled(rod: SlenderRod, force: float) -> Trajectory:
     return equilibrium(rod, np.array([force]))
 
 
@@ -304,88 +297,27 @@ def markers_of(motion: Trajectory) -> Float[np.ndarray, "T 3 3"]:
 
 
 def predict_markers(
-    beam: Beam,
-    recording: BeamRecording,
-    steps: int,
-    numerics: Numerics = DEFAULT,
-    residual: Residual | None = None,
+    beam: Beam, recording: BeamRecording, steps: int, numerics: Numerics = DEFAULT
 ) -> Float[np.ndarray, "T 3 3"]:
     """Return the markers' displacements (m) at the times of a recording; NaN before the release.
 
     The prediction is put on the recording's clock where both tips have dropped by `THRESHOLD`.
     """
-    rod: System = beam_rod(beam, recording.load, numerics.nodes)
-    motion = _released(rod if residual is None else KNODE(rod, residual), beam, recording, steps, numerics)
+    rod = beam_rod(beam, recording.load, numerics.nodes)
+    held = held_beam(rod, recording.load, 0.0 if beam.level is None else tip_height(recording) - beam.level)
+    motion = simulate(
+        rod, np.zeros((steps, 1)), numerics.dt, time=TIME, start="paper", initial=held, on_failure="return"
+    )
     moved = markers_of(motion)
-    times, crossing = np.arange(steps + 1) * numerics.dt, _crossing(moved, numerics.dt)
-    if crossing is None:
+    drop, times = tip_drop(moved), np.arange(steps + 1) * numerics.dt
+    row = int(np.argmax(drop > THRESHOLD))
+    if not row:
         return np.full((len(recording.time), 3, 3), np.nan)
+    crossing = np.interp(THRESHOLD, drop[row - 1 : row + 1], times[row - 1 : row + 1])
     at = recording.time - recording.crossing + crossing
     columns = moved.reshape(len(times), -1).T
     found = np.stack([np.interp(at, times, each, left=np.nan) for each in columns], axis=1)
     return found.reshape(-1, 3, 3)
-
-
-def _released(
-    rod: System, beam: Beam, recording: BeamRecording, steps: int, numerics: Numerics
-) -> Trajectory:
-    """Return the motion from where the beam was held."""
-    height = 0.0 if beam.level is None else tip_height(recording) - beam.level
-    held = held_beam(rod, recording.load, height)
-    return simulate(
-        rod, np.zeros((steps, 1)), numerics.dt, time=TIME, start="paper", initial=held, on_failure="return"
-    )
-
-
-def _crossing(moved: Float[np.ndarray, "T 3 3"], dt: float) -> float | None:
-    """Return the time from the release (s) in which the tip drops by `THRESHOLD`; None: it does not."""
-    drop = tip_drop(moved)
-    row = int(np.argmax(drop > THRESHOLD))
-    return (
-        float(np.interp(THRESHOLD, drop[row - 1 : row + 1], dt * np.arange(row - 1, row + 1)))
-        if row
-        else None
-    )
-
-
-def learned_residual(
-    beam: Beam, recording: BeamRecording, numerics: Numerics = DEFAULT, **options: Any
-) -> Residual | None:
-    """Return what `fit` learns on an identified beam from one recording; None: nothing that helps.
-
-    The three markers give the pose of the end face. The clock is that of the identified beam's prediction.
-    """
-    rod = beam_rod(beam, recording.load, numerics.nodes)
-    motion = _released(rod, beam, recording, step_count([recording], numerics.dt), numerics)
-    crossing = _crossing(markers_of(motion), numerics.dt)
-    if crossing is None:
-        return None
-    begin = Rotation.from_quat(np.asarray(motion.quaternion)[0, -1], scalar_first=True)
-    at_rest = begin.apply(MARKERS)
-    count = int((recording.time[-1] - recording.crossing + crossing) / ROW)
-    time, release = ROW * np.arange(count), recording.crossing - crossing
-    columns = recording.tip.reshape(len(recording.time), -1).T
-    tip = np.stack([np.interp(time + release, recording.time, each) for each in columns], axis=1)
-    position, quaternion = np.zeros((count, 3)), np.zeros((count, 4))
-    for k, moved in enumerate(tip.reshape(count, 3, 3)):
-        places = at_rest + moved
-        turned, _ = Rotation.align_vectors(places - places.mean(axis=0), MARKERS - MARKERS.mean(axis=0))
-        quaternion[k] = turned.as_quat(scalar_first=True)
-        position[k] = places.mean(axis=0) - turned.apply(MARKERS.mean(axis=0))
-    position += np.asarray(motion.tip_position)[0]
-    measured = Measurements(
-        time=time,
-        tension=np.zeros((count, 1)),
-        fractions=np.ones(1),
-        position=position[:, None],
-        quaternion=quaternion[:, None],
-        measured=np.ones((count, 1), dtype=bool),
-        simulated=False,
-        source=recording.name,
-        initial_tension=np.asarray(motion.control)[0],
-    )
-    model = fit(rod, [measured], **options)
-    return model.residual if model.about.facts["residual"] else None
 
 
 #: Young's modulus published with the recordings (Pa); the other parameters are initial values

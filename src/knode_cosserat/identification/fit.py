@@ -122,8 +122,8 @@ def _fit_recordings(
             f"config.seed is {config.seed}; from recordings allowed is one seed: the spread of robots that "
             "agree with recordings is identify(...).ensemble"
         )
-    if not isinstance(robot, System) or is_traced(robot) or np.ndim(robot.length):
-        raise FitError(f"knowledge is a {type(robot).__name__}; allowed is one robot or another System")
+    if is_traced(robot) or np.ndim(robot.length):
+        raise FitError("knowledge is a batch or inside jit, grad or vmap; allowed is one robot")
     if not minutes > 0.0:
         raise FitError(f"minutes is {minutes}; allowed is a number above zero")
     shown = (lambda line: print(line, file=sys.stderr, flush=True)) if progress is True else log.info
@@ -153,9 +153,8 @@ def _fit_recordings(
         "config": config.to_dict(),
     }
     if held_out:
-        unseen = list(listed_rows(held_out))
+        unseen = [Measurements.of(it) for it in held_out]
         found = [evaluate(learned.robot, it, space=space).tip_rmse for it in unseen]
         facts["unseen_error"] = dict(zip(names_of(unseen), found, strict=True))
-    if learned.kept:
-        return KNODE(robot, learned.robot.residual, About(facts))
-    return KNODE(robot, Nothing(), About(facts))
+    residual = learned.robot.residual if isinstance(learned.robot, KNODE) and learned.kept else Nothing()
+    return KNODE(robot, residual, About(facts))

@@ -288,16 +288,16 @@ class _Learner:
         for _ in range(STEPS):
             gradient, matrix = equations.gradient.sum(axis=0) * by, equations.matrix.sum(axis=0)
             move = by * _linear(x / by, free, gradient, matrix * np.outer(by, by), model.bounds / by)
-            for part in PARTS:
-                tried = self.at(x + part * move)
+            for share in PARTS:
+                tried = self.at(x + share * move)
                 if tried is None:
                     continue
-                after, there = cost_of(tried, x + part * move)
+                after, there = cost_of(tried, x + share * move)
                 if after < cost:
                     break
             else:
                 return x
-            fall, x, cost, equations = cost - after, x + part * move, after, there
+            fall, x, cost, equations = cost - after, x + share * move, after, there
             if fall < FALL * cost:
                 break
         return x

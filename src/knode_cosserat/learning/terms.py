@@ -111,6 +111,11 @@ class Recontrolled(Wrapped):
     knowledge: System
     changes: tuple[Smooth, ...]
 
+    def __init__(self, knowledge: System, changes: tuple[Smooth, ...]):
+        self.knowledge = knowledge
+        self.changes = changes
+        self.nodes = knowledge.nodes
+
     def around(self, knowledge: System) -> Self:
         """Return another system under the same change of its controls."""
         return type(self)(knowledge, self.changes)
