@@ -107,6 +107,9 @@ def test_rows_are_left_out_together_as_long_as_the_controls_are_related():
     assert np.all(np.diff(blocks[0].rows) > 1)
     slow = dataclasses.replace(quick[0], control=np.repeat(np.linspace(0.0, 3.0, 24)[:, None], 4, axis=1))
     assert np.all(np.diff(blocks_of([slow])[0].rows) == 1) and len(blocks_of([slow])[0].rows) >= 4
+    # parts of a motion are spans of time
+    moving = dataclasses.replace(quick[0], static=False)
+    assert all(np.all(np.diff(it.rows) == 1) for it in blocks_of([moving])) and len(blocks_of([moving])) > 1
     # a release is one run
     still = dataclasses.replace(quick[0], control=np.zeros((24, 4)))
     assert len(blocks_of([still])) == 1 and len(blocks_of([still, still])) == 2
@@ -135,7 +138,7 @@ def test_bad_input():
         fit(ROBOT, [rows], kc.FitConfig(seed=(0, 1)))
     with pytest.raises(kc.learning.FitError, match=r"minutes is -1\.0; allowed is a number above zero"):
         fit(ROBOT, [rows], minutes=-1.0)
-    with pytest.raises(ValueError, match=r"data holds a float; allowed is"):
+    with pytest.raises(ValueError, match=r"data holds 3\.0; allowed is a list"):
         fit(ROBOT, [rows, 3.0])
     with pytest.raises(ValueError, match=r"data is a Measurements; allowed is .*did you mean \[data\]\?"):
         fit(ROBOT, rows)

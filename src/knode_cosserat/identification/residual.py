@@ -29,15 +29,13 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
 
 #: widths of priors that are tried, for learned numbers in their units
-TRIED = (0.1, 0.3, 1.0, 3.0, 10.0)
+TRIED = (0.1, 0.3, 1.0, 3.0)
 #: least expected reduction of the held-out cost by a part
 PROMISE = 4.0
 #: smallest remaining fraction of the cost in linearised predictions
 LEAST_LEFT = 1e-3
 #: blocks of rows that are left out in turn, if there are fewer recordings, and fewest rows of a block
 BLOCKS, FEWEST = 6, 3
-#: a motion remembers the controls for so many times the rows in which they change
-MEMORY = 3
 #: Gauss-Newton steps, parts of one that are tried, and the fall of the cost at the end
 STEPS, PARTS, FALL = 4, (1.0, 0.5, 0.25), 1e-3
 #: fractions of the residual that are tried
@@ -176,27 +174,29 @@ class Block(NamedTuple):
 def blocks_of(data: Sequence[Experiment]) -> list[Block]:
     """Return blocks of rows with data: whole recordings, or parts of these if they are few.
 
-    A part consists of runs of consecutive rows with related controls. A recording that is one run, such as a
-    motion after a release, stays whole: its rows tell little of each other's errors.
+    A run of consecutive rows with related controls is not divided. Parts of motions are runs that follow one
+    another, of equilibria any. A recording that is one run, such as a motion after a release, stays whole:
+    its rows tell little of each other's errors.
     """
     several = max(1, -(-BLOCKS // len(data)))
     blocks = []
     for k, it in enumerate(data):
         rows = 1 + np.flatnonzero(np.isfinite(it.data[1:]).any(axis=1))
         run = np.arange(len(rows)) // _related(it)
-        part = run % min(several, max(len(rows) // FEWEST, 1))
+        count = min(several, max(len(rows) // FEWEST, 1))
+        part = run % count if it.static else run * count // (run[-1] + 1)
         blocks += [Block(k, rows[part == number]) for number in np.unique(part)]
     return blocks
 
 
 def _related(data: Experiment) -> int:
-    """Return the number of rows in which controls go half the way to unrelated ones; of motions, more."""
+    """Return the number of rows in which controls go half the way to unrelated ones."""
     control = data.control
     unrelated = 2.0 * np.sum(np.var(control / np.maximum(np.std(control, axis=0), 1e-300), axis=0))
     moved = control / np.maximum(np.std(control, axis=0), 1e-300)
     for lag in range(1, len(control)):
         if np.sum((moved[lag:] - moved[:-lag]) ** 2, axis=1).mean() >= 0.5 * unrelated > 0.0:
-            return lag if data.static else MEMORY * lag
+            return lag
     return len(control)
 
 

@@ -44,7 +44,7 @@ CENTRES, LEAST_SHARE = 24, 1e-4
 #: widths of the Gaussian functions, in standard deviations of the controls
 REACHES = (3.0, 6.0)
 #: change of the controls, or of tendons' lengths, by learned numbers of one, in their standard deviations
-SHARE = 0.05
+SHARE = 0.15
 #: bending and forces per length by learned numbers of one, in 1/L and κ/L³
 BENT, FORCE = 0.1, 0.3
 #: damping ratio of the first mode by learned numbers of one
