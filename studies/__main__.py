@@ -349,8 +349,8 @@ def recordings(
         str,
         typer.Option(
             metavar="A,B,…",
-            help="Subset of: baseline (nominal model), paper-a, paper-b, best (identified model), network "
-            "(passive network on the nominal model), residual (passive network on the best model), "
+            help="Subset of: baseline (nominal model), paper-a, paper-b, best (identified model), residual "
+            "(a residual on the best model), "
             "calibrated (nominal model with five identified parameters).",
         ),
     ] = "baseline,paper-a,paper-b,best",

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from knode_cosserat.identification.evaluate import Evaluation, evaluate
-from knode_cosserat.identification.fit import with_residual
+from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
 from knode_cosserat.identification.result import Identified
@@ -95,11 +95,12 @@ def robot_facts(settings: Any) -> Product:
     seed = int(settings["seed"])
     truth, given, unseen, redrawn = _recorded(seed)
     found = identify(nominal_robot(), given)
-    learned = with_residual(nominal_robot(), given, found)
+    learned = fit(found, given)
+    residual = learned.about.facts
     outcomes = {}
     for name, each in zip(UNSEEN, unseen, strict=True):
         before, after = (evaluate(robot, each) for robot in (nominal_robot(), found.robot))
-        last = evaluate(learned.robot, each) if learned.kept else after
+        last = evaluate(learned, each) if residual["residual"] else after
         outcomes[name] = {
             "nominal": before.to_dict(),
             "identified": after.to_dict(),
@@ -113,7 +114,7 @@ def robot_facts(settings: Any) -> Product:
         "true_values": dict(truth.values),
         "identified": found.to_dict(),
         "covered": _covered(truth, found),
-        "residual": {"kept": learned.kept, "steps": list(learned.steps)},
+        "residual": {"kept": residual["residual"], "steps": residual["steps"]},
         "unseen": outcomes,
     }
     return Product(facts, {})

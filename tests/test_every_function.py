@@ -14,9 +14,9 @@ import knode_cosserat as kc
 from knode_cosserat.engine.program import EngineError
 from knode_cosserat.identification import evaluate
 from knode_cosserat.learning import Residual
-from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.residual import Nothing, network
 from knode_cosserat.learning.structured.residual import CURVED, LINEAR, Structured, expansion
+from knode_cosserat.learning.terms import terms
 from knode_cosserat.rods.parameters import value_at
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import cross, quaternion_rate, rotation_matrix
@@ -28,9 +28,6 @@ DT, STEPS = 0.05, 12
 #: the paper's network works in SI units, and nearly untrained it overturns a robot of some millinewtons
 NETWORK = kc.FitConfig(
     residual=kc.learning.NetworkOptions(hidden=2, standardised=True), segments=kc.learning.Training(epochs=2)
-)
-PASSIVE = kc.FitConfig(
-    residual=kc.learning.PassiveOptions(hidden=1), rollouts=kc.learning.RolloutTraining(updates=1)
 )
 
 
@@ -243,7 +240,6 @@ FUNCTIONS: dict[str, Callable[[Any, Made], Any]] = {
     "Stepper": stepped,
     "fit, structured": structured,
     "fit, network": lambda robot, it: fitted(robot, it, NETWORK),
-    "fit, passive": lambda robot, it: fitted(robot, it, PASSIVE),
     "identify, states": lambda robot, it: identified(robot, it, False),
     "identify, poses": lambda robot, it: identified(robot, it, True),
     "estimate_states": lambda robot, it: estimated(robot, it, "best"),
@@ -256,7 +252,6 @@ SLOW = {
     "stability",
     "equilibrium_path",
     "identify, poses",
-    "fit, passive",
     "fit, network",
     "predictive control",
 }
@@ -268,10 +263,6 @@ LONG_FOR_MODELS = {"estimate_states", "estimate_states, paper", "configuration",
 OWN = {"simulate", "equilibrium", "estimate_states", "fit, structured", "configuration", "evaluate"}
 #: functions that need a capability, and the words of the error that names it
 LACKING = {
-    **{
-        ("fit, passive", kind): (kc.learning.FitError, "without bending_stiffness")
-        for kind in ("own", "model of own", "tubes", "gripper")
-    },
     **{
         (name, kind): (kc.recordings.RecordingError, "has a length that controls change")
         for name in ("estimate_states", "estimate_states, paper")
@@ -291,9 +282,7 @@ def calls() -> Iterator[Any]:
     for kind in ROBOTS:
         for name in FUNCTIONS:
             often = (kind in OFTEN and name not in SLOW | LONG_FOR_MODELS) or (kind == "own" and name in OWN)
-            quick = ((name, kind) in LACKING and name == "fit, passive") or (
-                kind in OFTEN and name == "equilibrium"
-            )
+            quick = kind in OFTEN and name == "equilibrium"
             marks = [] if quick else [pytest.mark.slow if often else pytest.mark.campaign]
             yield pytest.param(name, kind, marks=marks, id=f"{name}-{kind}")
 
@@ -302,11 +291,8 @@ def calls() -> Iterator[Any]:
 def test_every_function_takes_every_robot(name, kind):
     if (name, kind) in LACKING:
         error, words = LACKING[name, kind]
-        call = FUNCTIONS[name]
-        if name == "fit, passive":  # rows that need no simulation
-            call = lambda robot, _: kc.fit(robot, [shown(kind)], PASSIVE)  # noqa: E731
         with pytest.raises(error, match=words):
-            call(ROBOTS[kind], None if name == "fit, passive" else made(kind))
+            FUNCTIONS[name](ROBOTS[kind], made(kind))
         return
     found = np.asarray(FUNCTIONS[name](ROBOTS[kind], made(kind)), dtype=float)
     assert found.size and np.all(np.isfinite(found))
@@ -383,7 +369,7 @@ class Pull(Residual):
 @functools.cache
 def residuals() -> dict[str, Residual]:
     rng = np.random.default_rng(5)
-    empty = passive(ROBOT, np.full((1, 4), 5.0))
+    empty = terms(ROBOT, rng.uniform(1.0, 5.0, (8, 4)))
     stress = {}
     for curved, forms in (("linear", LINEAR), ("curved", CURVED)):
         layout = kc.robots.Layout(*((name, 3, "", name) for name in ("v", "u", "v_t", "u_t")))
@@ -393,7 +379,7 @@ def residuals() -> dict[str, Residual]:
     return {
         "nothing": Nothing(),
         "network": MODEL.residual,
-        "passive": empty.with_coefficients(
+        "terms": empty.with_coefficients(
             {name: 0.1 * rng.normal(size=np.shape(part)) for name, part in empty.coefficients().items()}
         ).clamped(),
         **{name: Structured(np.array(0.02), each, None, None) for name, each in stress.items()},
@@ -413,8 +399,8 @@ def models() -> Iterator[Any]:
 @pytest.mark.parametrize(("name", "nominal"), list(models()))
 def test_the_parts_of_a_model_s_equations_agree(name, nominal):
     """`strains` and `rates` are `derivatives`; the law is zero there, with the derivative it states."""
-    if name == "passive" and nominal is CANE:
-        pytest.skip("a passive residual is of a rod with bending stiffness")
+    if name == "terms" and nominal is CANE:
+        pytest.skip("these are terms of a robot with four tendons")
     model = with_network(nominal, 3) if name == "network" else kc.KNODE(nominal, residuals()[name])
     rng = np.random.default_rng(7)
     y = np.concatenate([np.zeros(3), [1.0, 0.1, 0.2, 0.0], 0.1 * rng.normal(size=12)])

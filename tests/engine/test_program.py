@@ -16,8 +16,8 @@ import knode_cosserat as kc
 from examples.hanging_string import HangingString
 from knode_cosserat.engine.program import FOLDED, EngineError, Program
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.learning.passive import passive
 from knode_cosserat.learning.structured.residual import CURVED, Structured, expansion
+from knode_cosserat.learning.terms import terms
 from knode_cosserat.recordings.virtual import virtual_robot
 from knode_cosserat.rods.strands import strand_count, strand_of
 from knode_cosserat.rods.system import unknown_count
@@ -176,8 +176,9 @@ def with_curved_law():
     return KNODE(PAPER, Structured(np.array(0.02), law, None, None))
 
 
-def with_passive_residual():
-    empty, rng = passive(PAPER, np.full((1, 4), 5.0)), np.random.default_rng(0)
+def with_terms():
+    rng = np.random.default_rng(0)
+    empty = terms(PAPER, rng.uniform(1.0, 5.0, (8, 4)))
     numbers = {name: 0.1 * rng.normal(size=np.shape(part)) for name, part in empty.coefficients().items()}
     return KNODE(PAPER, empty.with_coefficients(numbers).clamped())
 
@@ -188,7 +189,7 @@ SYSTEMS = {name: functools.partial(kc.load_robot, name) for name in kc.catalog()
     "friction": with_friction,
     "reel and slack": with_reel,
     "curved law": with_curved_law,
-    "passive": with_passive_residual,
+    "terms": with_terms,
     "network": lambda: with_network(3),
     "large network": lambda: with_network(64, history=True),
     "committee": with_committee,

@@ -1,4 +1,4 @@
-"""Commands that learn: fit, from trajectories; identify, from recordings; evaluation on recordings."""
+"""Commands that learn: fit, from trajectories or recordings; identify; evaluation on recordings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,6 @@ from knode_cosserat.cli.arguments import (
     Report,
     Sampling,
     argument,
-    command_line,
     figures,
     is_recording,
     load_recordings,
@@ -41,7 +40,7 @@ class _Data(NamedTuple):
     """Training and validation data.
 
     Options:
-        trajectories (TRAJECTORY): Training trajectories (.nc) with full states.
+        trajectories (DATA): Training trajectories (.nc) with full states, or recordings.
         rows (--rows N≥1): Use the first N rows of each trajectory only; the paper uses 30.
         held_out (--held-out FILE): Validation trajectory for early stopping; may be repeated.
     """
@@ -103,35 +102,43 @@ class _FitFiles(NamedTuple):
     Options:
         out (--out PATH): Write the model to this file; with --seeds, write an ensemble to this folder.
         checkpoint (--checkpoint DIR): Save the training state in this folder, and resume from it.
+        minutes (--minutes MINUTES): From recordings: end after this time, without a residual if none is
+            found. Default: no limit.
         log (--log DIR): Write TensorBoard event files to this folder.
     """
 
     out: Path
     checkpoint: Path | None = None
+    minutes: float = math.inf
     log: Path | None = None
     figure: Annotated[Path | None, Picture] = None
 
 
 @app.command()
-def fit(nominal: Nominal, data: _Data, method: _FitMethod, files: _FitFiles, report: Report) -> None:
-    """Learn a residual model from trajectories.
+def fit(
+    nominal: Nominal, data: _Data, method: _FitMethod, files: _FitFiles, sampling: Sampling, report: Report
+) -> None:
+    """Learn a residual model from trajectories, or from recordings of an identified robot.
 
-    The residual is the difference between the robot's physics and the trajectories. Trajectories have full
-    states, from a simulation or from state estimation; use `identify` for recordings. The resulting model is
-    accepted wherever a robot is.
+    The residual is the difference between the robot's physics and the data. Trajectories have full states,
+    from a simulation or from state estimation. From recordings, of any drive and also of a tip alone, a
+    residual is learned on the robot as it is: `identify` it before. It is kept only if rows that were left
+    out are predicted better. The resulting model is accepted wherever a robot is.
 
     Examples:
         fit delrin-tendon-robot a.nc b.nc --set youngs_modulus=10e9 --out model
         fit my-robot.yaml a.nc b.nc --preset paper --seeds 0,1,2 --checkpoint saved --out model
+        fit found.yaml a.csv b.csv --config my-recording.yaml --minutes 10 --out model
     """
     robot, out, figure = nominal.robot, files.out, files.figure
     recordings = [path for path in data.trajectories if is_recording(str(path))]
     if recordings:
-        typed = command_line("identify", robot, *recordings, "--out", out.with_suffix(".yaml"))
+        _fit_recordings(nominal, data, method, files, sampling, report)
+        return
+    if sampling != Sampling() or files.minutes != math.inf:
         raise ValueError(
-            f"{recordings[0]}: this is a recording or table; fit needs trajectories (.nc) with full states. "
-            f"To identify the robot from recordings, type: {typed} (with --config recording.yaml if the "
-            "file does not state the meaning of its columns)"
+            "--config, --start, --seconds, --dt, --space and --minutes are for recordings; "
+            f"{data.trajectories[0]} is none"
         )
     several = isinstance(method.numbers(), tuple)
     if several and out.exists() and not out.is_dir():
@@ -191,6 +198,52 @@ def fit(nominal: Nominal, data: _Data, method: _FitMethod, files: _FitFiles, rep
         out=out,
         figure=figure,
     )  # fmt: skip
+
+
+def _fit_recordings(
+    nominal: Nominal, data: _Data, method: _FitMethod, files: _FitFiles, sampling: Sampling, report: Report
+) -> None:
+    """Learn a residual on an identified robot from recordings."""
+    given = {
+        "--rows": data.rows, "--held-out": data.held_out, "--seeds": method.seeds, "--epochs": method.epochs,
+        "--log": files.log, "--figure": files.figure,
+        "--preset": None if method.preset == "best" else method.preset,
+    }  # fmt: skip
+    for option, value in given.items():
+        if value is not None:
+            raise ValueError(f"{option} is for trajectories; {data.trajectories[0]} is a recording")
+    for path in data.trajectories:
+        if not is_recording(str(path)):
+            raise ValueError(f"{path}: this is no recording; allowed is one kind of data, recordings here")
+    require_writable(files.out, None, (files.checkpoint,))
+    import knode_cosserat as kc
+
+    system = nominal.load()
+    samples = [
+        recording.sampled(sampling.dt, sampling.start, sampling.end, mean=True)
+        for recording in load_recordings(data.trajectories, sampling.config)
+    ]
+    began = perf_counter()
+    progress = functools.partial(print, file=sys.stderr, flush=True) if report.shows_progress else False
+    model = kc.fit(
+        system,
+        samples,
+        method.config(),
+        space=sampling.space,
+        progress=progress,
+        checkpoint=files.checkpoint,
+        minutes=files.minutes,
+    )
+    model.save(files.out)
+    facts = model.about.facts
+    lines = [*facts["given"], *facts["steps"]]
+    lines.append("kept" if facts["residual"] else "the model is the robot as it was: no residual was kept")
+    write_output(
+        report.as_json,
+        {"robot": nominal.robot, **facts, "computing_time": round(perf_counter() - began, 1)},
+        lines,
+        out=files.out,
+    )
 
 
 # recordings

@@ -136,7 +136,7 @@ class ParameterSearch:
         self._least = {data: self._least_scale(data) for data in misfit.data}
 
     @functools.cached_property
-    def _identity(self) -> str:
+    def identity(self) -> str:
         """Return a hash of everything that a search depends on: model, recordings, settings, this package."""
         model = self.misfit.model
         words = [package_version(), repr(model.numbers), repr(model.names)]
@@ -262,9 +262,7 @@ class ParameterSearch:
         options = (subset.rows, subset.which and tuple(subset.which), effort, scale is None, equations)
         begins = (np.zeros(0) if it is None else it for it in (scale, near))
         solve = functools.partial(self._searched, x, free, subset, effort, scale, equations, near)
-        facts = self.journal.finished(
-            lambda: solve().facts(), self._identity, repr(options), x, free, *begins
-        )
+        facts = self.journal.finished(lambda: solve().facts(), self.identity, repr(options), x, free, *begins)
         point = SearchEnd.of(facts)
         if subset.which is None:
             self.journal.last = self, point

@@ -139,20 +139,6 @@ class NetworkOptions(_Options):
     unit_quaternions: Annotated[bool, FLAG] = False
 
 
-@dataclasses.dataclass(frozen=True)
-class PassiveOptions(_Options):
-    """A passive residual, with a linear path and a network (`learning.passive`).
-
-    It is trained through rollouts, and only needs measured poses.
-    """
-
-    kind: ClassVar[str] = "passive"
-    trainers: ClassVar[tuple[str, ...]] = ("rollouts",)
-
-    #: units of each of its two networks
-    hidden: Annotated[int, _whole(1, 1000)] = 8
-
-
 # training
 
 
@@ -224,8 +210,8 @@ class FitConfig(_Options):
     """
 
     residual: Annotated[
-        StructuredOptions | NetworkOptions | PassiveOptions,
-        _kind_of(StructuredOptions, NetworkOptions, PassiveOptions),
+        StructuredOptions | NetworkOptions,
+        _kind_of(StructuredOptions, NetworkOptions),
     ] = StructuredOptions()
     segments: Annotated[Training | None, part(Training)] = None
     rollouts: Annotated[RolloutTraining | None, part(RolloutTraining)] = None
@@ -285,11 +271,6 @@ class FitConfig(_Options):
             ),
             seed=seed,
         )
-
-    @classmethod
-    def network_recordings(cls, seed: int | tuple[int, ...] = 0, *, hidden: int = 8) -> Self:
-        """Return settings of a passive network, whose rollouts do not diverge, trained on measured poses."""
-        return cls(PassiveOptions(hidden), rollouts=RolloutTraining(learning_rate=0.02), seed=seed)
 
     @property
     def seeds(self) -> tuple[int, ...]:

@@ -27,9 +27,9 @@ from knode_cosserat._reprs import count_of, quantity, robot_text, wrap_lines
 from knode_cosserat.errors import KnodeCosseratError, first_line
 from knode_cosserat.io import container
 from knode_cosserat.io.container import ContainerError
-from knode_cosserat.learning.passive import NaturalUnits, Passive
 from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.residual import Expansion, Load, Structured, Term
+from knode_cosserat.learning.terms import Smooth, Terms, Units
 from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.system import System, is_traced, unknown_count
 from knode_cosserat.rods.trained_range import TrainedRange
@@ -177,12 +177,13 @@ CLASSES: dict[str, type] = {
     for cls in (
         Network,
         Nothing,
-        Passive,
-        NaturalUnits,
         Structured,
         Load,
         Expansion,
         Term,
+        Terms,
+        Smooth,
+        Units,
         TrainedRange,
     )
 }

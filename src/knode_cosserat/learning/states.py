@@ -17,10 +17,9 @@ import jax
 import numpy as np
 
 from knode_cosserat._files.writing import package_version
-from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions, PassiveOptions
+from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
-from knode_cosserat.learning.passive import passive, require_bending
 from knode_cosserat.learning.residual import Residual, network
 from knode_cosserat.learning.structured.fit import residuals_of
 from knode_cosserat.learning.training import rollouts
@@ -149,22 +148,12 @@ def _check(knowledge: Any, config: Any, held_out: Any, checkpoint_every: Any) ->
         raise FitError("knowledge is a batch or inside jit, grad or vmap; allowed is one robot")
     if not isinstance(config, FitConfig):
         raise FitError(f"config is a {type(config).__name__}; allowed is a FitConfig")
-    require_allowed(knowledge, config)
     if isinstance(checkpoint_every, bool) or not isinstance(checkpoint_every, int) or checkpoint_every < 1:
         raise FitError(f"checkpoint_every is {checkpoint_every!r}; allowed is a whole number from 1")
     for name in ("segments", "rollouts"):
         stage = getattr(config, name)
         if stage is not None and stage.stop_after is not None and not held_out:
             raise FitError(f"{name}.stop_after is {stage.stop_after}, but there are no held_out trajectories")
-
-
-def require_allowed(knowledge: System, config: FitConfig) -> None:
-    """Raise `FitError` unless the nominal model has what the config's residual needs."""
-    if isinstance(config.residual, PassiveOptions):
-        try:
-            require_bending(knowledge)
-        except TypeError as error:
-            raise FitError(str(error)) from None
 
 
 def _listed(name: str, trajectories: Any) -> list[Trajectory]:
@@ -196,9 +185,6 @@ def _initial(
         c0 = dataset.tips.c0[-1] if options.history else None
         networks = [network(strand, options, jax.random.key(seed), c0) for seed in config.seeds]
         return [standardised(net, strand, dataset) if options.standardised else net for net in networks]
-    if isinstance(options, PassiveOptions):
-        controls = np.concatenate([np.asarray(one.control) for one in trajectories])
-        return [passive(knowledge, controls, seed, options.hidden) for seed in config.seeds]
     return list(residuals_of(knowledge, trajectories, options, config.seeds))
 
 
