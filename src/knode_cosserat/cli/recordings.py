@@ -41,6 +41,7 @@ def inspect(
     ],
     config: Path | None = None,
     plot: Annotated[Path | None, Picture] = None,
+    out: Path | None = None,
     as_json: Json = False,
 ) -> None:
     """Report the quality of a recording.
@@ -53,20 +54,24 @@ def inspect(
     Options:
         config (--config YAML): Meaning of the recording's topics or columns. Default: the paper's robot for
             bags; titles and comments for tables; or a proposal.
+        out (--out YAML): Write the configuration to this file, for --config: the proposal, if there is one.
 
     Examples:
         inspect sine_1p0.bag
+        inspect log.csv --out recording.yaml
         inspect sine_1p0.bag --config my-robot.yaml --plot health.png
         inspect table.csv --json
         inspect motors.csv mocap.csv
     """
-    require_writable(figure=plot)
+    require_writable(out, plot)
     drawing = figures() if plot else None
     loaded, proposed = _loaded(recording, config)
     report = loaded.health()
     if drawing:
         drawing.health(loaded).savefig(plot)
-    written = {"plot": plot} if plot or as_json else {}
+    if out:
+        loaded.config.save(out)
+    written = {name: path for name, path in {"plot": plot, "out": out}.items() if path or as_json}
     named = " + ".join(map(str, recording))
     content = {"recording": named, **report.to_dict(), "columns": dict(loaded.uses)}
     lines = [*_lines(report), "", *_uses(loaded)]
