@@ -70,7 +70,7 @@ def inspect(
     if drawing:
         drawing.health(loaded).savefig(plot)
     if out:
-        loaded.config.save(out)
+        out.write_text(loaded.config.to_yaml(brief=True), encoding="utf-8")
     written = {name: path for name, path in {"plot": plot, "out": out}.items() if path or as_json}
     named = " + ".join(map(str, recording))
     content = {"recording": named, **report.to_dict(), "columns": dict(loaded.uses)}
