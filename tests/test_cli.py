@@ -345,6 +345,20 @@ def test_fit_tells_what_it_did(data, tmp_path):
     assert text.endswith(f"wrote {tmp_path / 'm'}\n")
 
 
+def test_fit_continues_from_an_identified_robot_until_the_time_is_over(tmp_path):
+    """A model is written in any case; without time the robot is as it was."""
+    cables = Path(__file__).parents[1] / "examples" / "three_cables"
+    found = told(
+        *("fit", cables / "identified.yaml", cables / "identify.csv", "--config", cables / "recording.yaml"),
+        *("--minutes", "1e-9", "--checkpoint", tmp_path / "work", "--out", tmp_path / "model"),
+    )
+    assert found["residual"] is False and found["complete"] is False
+    assert found["given"] == ["three cables, identify: 50 rows"]
+    assert found["steps"] == ["no residual: the time is over"]
+    model, robot = kc.load_model(tmp_path / "model"), kc.load_robot(cables / "identified.yaml")
+    assert float(model.length) == float(robot.length) and not model.coefficients()
+
+
 @pytest.mark.campaign
 def test_fit_trains_an_ensemble_of_networks_at_once(data, tmp_path):
     out = tmp_path / "models"

@@ -43,6 +43,7 @@ def seen(robot, seed, count=36, noise=NOISE):
     )
 
 
+@pytest.mark.slow
 def test_what_the_library_lacks_is_found_from_the_tip_alone(tmp_path):
     given, unseen = seen(TRUE, 0), seen(TRUE, 1)
     lines = []
@@ -64,6 +65,7 @@ def test_what_the_library_lacks_is_found_from_the_tip_alone(tmp_path):
         assert np.array_equal(again.coefficients()[name], value)
 
 
+@pytest.mark.slow
 def test_nothing_is_learned_from_noise():
     given = seen(ROBOT, 2, noise=5.0 * NOISE)
     model = fit(ROBOT, [given])

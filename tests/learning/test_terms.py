@@ -34,6 +34,7 @@ def equations(model, control, seed=1):
     return np.asarray(y_s), np.asarray(z)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", [ROBOT, REELS], ids=["tensions", "reels"])
 def test_numbers_that_are_zero_change_nothing(robot):
     controls = CONTROLS if robot is ROBOT else 1e-3 * CONTROLS
