@@ -6,6 +6,8 @@ import math
 import re
 from typing import NamedTuple
 
+from knode_cosserat.errors import KnodeCosseratError
+
 #: exponents of m, kg, s, A and rad
 Dimension = tuple[int, int, int, int, int]
 
@@ -17,8 +19,10 @@ class Unit(NamedTuple):
     dimension: Dimension
 
 
-class UnitError(ValueError):
+class UnitError(KnodeCosseratError, ValueError):
     """A unit that is not known, or of another kind; a phrase for the end of a message."""
+
+    code = "unit"
 
 
 #: prefixes, with their factors

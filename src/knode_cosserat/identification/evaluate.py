@@ -352,7 +352,7 @@ class _Poses(NamedTuple):
     @classmethod
     def of(cls, robot: System, moved: Trajectory, measured: Measurements) -> _Poses:
         """Return the poses of a motion at the places of a recording's bodies."""
-        y, fractions = np.asarray(moved.y), measured.fractions
+        y, fractions = np.asarray(moved.y), measured.fractions.tolist()
         position = np.asarray(seen_positions(robot, y, fractions, np.asarray(moved.z)))
         try:
             return cls(position, np.asarray(seen_quaternions(robot, y, fractions)))

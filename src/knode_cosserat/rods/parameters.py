@@ -85,8 +85,7 @@ def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, 
     return None
 
 
-class Doubt(NamedTuple):
-    """How well a ruler, data sheet or photograph usually states a parameter: standard deviations.
+    """Doubt of a parameter as a ruler, a data sheet or a photograph leaves it: standard deviations.
 
     Identification searches for a parameter with a doubt (`identification.part_effects`): `relative` is that
     of a common factor of all its numbers, `absolute` that of each number, in its unit. An optional parameter
