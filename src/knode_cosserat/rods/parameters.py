@@ -85,6 +85,7 @@ def in_other_unit(value: Any, unit: str, low: float, high: float) -> tuple[str, 
     return None
 
 
+class Doubt(NamedTuple):
     """Doubt of a parameter as a ruler, a data sheet or a photograph leaves it: standard deviations.
 
     Identification searches for a parameter with a doubt (`identification.part_effects`): `relative` is that
