@@ -249,7 +249,7 @@ def test_wrong_names_and_values(tmp_path):
         Recorder(tmp_path / "folder" / "run.bag")
     with pytest.raises(HardwareError, match="interval"):
         Recorder(tmp_path / "run.bag", interval=0.0)
-    with pytest.raises(RecordingError, match="motors"):
+    with pytest.raises(RecordingError, match="angle cannot be recorded"):
         Recorder(tmp_path / "run.bag", RecordingConfig.asl_trunk())
     with Recorder(tmp_path / "run.bag") as recorder:
         with pytest.raises(RecordingError, match="4 tendons"):

@@ -187,9 +187,13 @@ def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, fl
     scores = np.array([_likelihoods(first, motion, rows, width, delay, wanted) for delay in grid])
     if not len(grid) or scores[:, 0].max() < RELATED:
         raise RecordingError("controls and motion have no relation that tells")
-    static, dynamic = scores.T
-    best = int(np.argmax(scores.sum(axis=1)))
-    alike = (np.abs(grid - grid[best]) > APART) & (scores.sum(axis=1) > scores[best].sum() - DECIDED)
+    static, dynamic, count = scores.T
+    both = static + dynamic
+    best = int(np.argmax(both))
+    # a longer overlap is no better reason: the shorter one of two counts
+    mean = np.where(count > 0.0, both, 0.0) / np.maximum(count, 1.0)
+    better = (mean[best] - mean) * np.minimum(count, count[best])
+    alike = (np.abs(grid - grid[best]) > APART) & (count > 0.0) & (better < DECIDED)
     if alike.any():
         apart = np.min(np.abs(grid - grid[best])[alike])
         raise RecordingError(f"offsets that differ by {apart:.2f} s explain the motion as well as each other")
@@ -231,11 +235,14 @@ def _correlated(first: Signal, motion: _Motion, wanted: float) -> list[float]:
 
 def _likelihoods(
     first: Signal, motion: _Motion, rows: Sequence[np.ndarray], width: float, delay: float, wanted: float
-) -> tuple[float, float]:
-    """Return twice the log likelihood ratios of a delay, by the static and the dynamic model."""
+) -> tuple[float, float, float]:
+    """Return twice the log likelihood ratios of a delay, by the static and the dynamic model.
+
+    The third number is the count of independent rows.
+    """
     columns, known = _explaining(first, motion, width, delay, 0.0)
     if np.sum(known) * motion.dt < wanted:
-        return -math.inf, -math.inf
+        return -math.inf, -math.inf, 0.0
     independent = np.sum(known) * motion.dt / CORRELATED
     # smoothed rows are not needed more densely than they differ
     used = np.flatnonzero(known)[:: max(1, int(width / motion.dt))]
@@ -252,7 +259,8 @@ def _likelihoods(
     # the first components have most of the motion
     weights = np.sum(acceleration**2, axis=0)
     dynamic = weights @ np.log(np.maximum(before, 1e-300) / np.maximum(after, 1e-300)) / weights.sum()
-    return float(independent * np.log(power / max(least, 1e-300))), float(independent * dynamic)
+    static = np.log(power / max(least, 1e-300))
+    return float(independent * static), float(independent * dynamic), float(independent)
 
 
 def _residual(values: np.ndarray, basis: np.ndarray) -> np.ndarray:

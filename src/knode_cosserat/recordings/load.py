@@ -61,7 +61,7 @@ def load_recording(
     if isinstance(config, str | Path):
         config = RecordingConfig.load(config)
     if not isinstance(path, str | Path):
-        return _recording_of_files([Path(one) for one in path], config)
+        return _recording_of_files(_listed(path), config)
     path = Path(path)
     with naming(path):
         wanted = topics_read(config or RecordingConfig.paper_robot())
@@ -92,9 +92,19 @@ def proposed_config(path: str | Path | Sequence[str | Path]) -> RecordingConfig:
     """
     check_arguments(proposed_config, locals())
     if not isinstance(path, str | Path):
-        return config_of_files(_contents([Path(one) for one in path], None))
+        return config_of_files(_contents(_listed(path), None))
     with naming(path):
         return config_of_content(_whole(Path(path)))
+
+
+def _listed(paths: Sequence[str | Path]) -> list[Path]:
+    """Return the paths of several files. Raises `RecordingError` for anything else."""
+    for path in paths:
+        if not isinstance(path, str | Path):
+            raise RecordingError(f"path holds a {type(path).__name__}; allowed are paths of files")
+    if not len(paths):
+        raise RecordingError("path is an empty list; allowed is one file or more")
+    return [Path(path) for path in paths]
 
 
 def _whole(path: Path) -> Bag | Table:
@@ -106,8 +116,6 @@ def _whole(path: Path) -> Bag | Table:
 
 def _contents(paths: Sequence[Path], config: RecordingConfig | None) -> list[File]:
     """Return the content of several files. Raises `RecordingError`."""
-    if not paths:
-        raise RecordingError("path is an empty list; allowed is one file or more")
     files = []
     for path in paths:
         with naming(path):

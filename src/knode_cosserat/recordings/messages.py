@@ -163,7 +163,8 @@ def roles_of(config: RecordingConfig) -> dict[Any, Role]:
     """Return the role of each source of a configuration."""
     roles: dict[Any, Role] = dict.fromkeys((*config.markers, config.base), "pose")
     roles |= dict.fromkeys(config.sensors, "sensor")
-    roles |= {**dict.fromkeys(config.measured, "control"), config.command: "command"}
+    roles |= dict.fromkeys(config.measured, "control")
+    roles[config.command] = "command"
     return {source: role for source, role in roles.items() if source is not None}
 
 

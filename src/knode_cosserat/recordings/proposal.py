@@ -141,7 +141,9 @@ def config_of_files(files: Sequence[File]) -> RecordingConfig:
     bodies, settings, columns, sources = list[_ProposedBody](), dict[str, Any](), dict[str, Any](), []
     for file in files:
         found = _found(file.content, remarks)
-        timing = {key: found.columns.pop(key) for key in ("time", "time_unit") if key in found.columns}
+        timing: dict[str, Any] = {
+            key: found.columns.pop(key) for key in ("time", "time_unit") if key in found.columns
+        }
         if (table := found.settings.pop("table", None)) is not None:
             timing["rate"] = table.rate
         sources.append(FileSource(file.name, **timing))

@@ -113,10 +113,10 @@ class Table(NamedTuple):
         uses = {title: "time" if {title, title.rpartition("/")[2]} & stated else "" for title in columns}
         bodies = [source.topic for source in (*config.markers, config.base) if source is not None]
         words: dict[str, str] = {}
-        for source in (*config.measured, config.command):
-            if source is not None:
-                what = COMMAND if source is config.command else source.quantity
-                words[source.topic] = f"{what} {{}} [{source.unit}]"
+        for drive in (*config.measured, config.command):
+            if drive is not None:
+                what = COMMAND if drive is config.command else drive.quantity
+                words[drive.topic] = f"{what} {{}} [{drive.unit}]"
         for topic, titles in _titles_by_topic(config, columns).items():
             for k, title in enumerate(titles):
                 if title not in uses and title.isdecimal() and 1 <= int(title) <= len(columns):
@@ -331,11 +331,11 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str]) -> dict[str, l
         if sensor.columns is None:
             raise RecordingError(f"the columns of the sensor {sensor.topic} are missing; name them")
         titles[sensor.topic] = list(sensor.columns)
-    for source in (*config.measured, config.command):
-        if source is not None:
-            named = dict(mapped.controls).get(COMMAND if source is config.command else source.quantity)
-            count = len(source.order)
-            usual = control_titles(source.topic, source.unit or "", count)
+    for drive in (*config.measured, config.command):
+        if drive is not None:
+            named = dict(mapped.controls).get(COMMAND if drive is config.command else drive.quantity)
+            count = len(drive.order)
+            usual = control_titles(drive.topic, drive.unit or "", count)
             if templates.control is not None:
                 usual = [templates.control.replace(PLACE, str(k + 1)) for k in range(count)]
             if named is not None and len(named) != count:
@@ -343,7 +343,7 @@ def _titles_by_topic(config: RecordingConfig, columns: list[str]) -> dict[str, l
                     f"{len(named)} columns are mapped and order has {count} numbers; allowed is the "
                     "same number"
                 )
-            titles[source.topic] = list(named or usual)
+            titles[drive.topic] = list(named or usual)
     return titles
 
 

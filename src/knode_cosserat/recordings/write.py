@@ -48,14 +48,14 @@ def write_recording(
     """
     path = Path(path)
     write = writer_of(path)
-    sources = {marker.name: marker.topic for marker in config.markers}
+    topics = {marker.name: marker.topic for marker in config.markers}
     if config.base is not None:
-        sources["base"] = config.base.topic
-    if set(poses) != set(sources):
-        raise RecordingError(f"{path}: poses are given of {sorted(poses)}; required is {sorted(sources)}")
+        topics["base"] = config.base.topic
+    if set(poses) != set(topics):
+        raise RecordingError(f"{path}: poses are given of {sorted(poses)}; required is {sorted(topics)}")
     scale = config.position_factor
     streams = []
-    for name, topic in sources.items():
+    for name, topic in topics.items():
         pose = poses[name]
         parts = [np.asarray(pose.position) / scale]
         if pose.quaternion is not None:
