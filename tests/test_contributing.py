@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification import effects, reel_effects, rod_effects, tendon_effects
+from knode_cosserat.identification import (
+    effects,
+    part_effects,
+    reel_effects,
+    rod_effects,
+    soft_effects,
+    tendon_effects,
+)
 from knode_cosserat.identification.effects import PossibleEffect, along_axes, register
 
 ROOT = Path(__file__).parents[1]
@@ -26,7 +33,7 @@ def tilted(robot, values):
 
 
 #: they register themselves when they are imported, and that is to last
-REGISTERED = reel_effects, rod_effects, tendon_effects
+REGISTERED = part_effects, reel_effects, rod_effects, soft_effects, tendon_effects
 
 
 @pytest.fixture
@@ -40,7 +47,7 @@ def tilt(monkeypatch):
 
 
 def test_each_way_to_extend_the_package_has_an_example():
-    assert len(EXAMPLES) == 9
+    assert len(EXAMPLES) == 10
 
 
 @pytest.mark.parametrize(("code", "file"), EXAMPLES, ids=[file for _, file in EXAMPLES])
