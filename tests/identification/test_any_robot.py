@@ -135,6 +135,14 @@ def test_common_and_own_factors_multiply():
     assert_allclose(found, [10.0 * np.exp(0.1), 6.0 * np.exp(0.1 + 2.0 * 0.05)], rtol=1e-12)
 
 
+def test_effects_that_leave_a_range_together_end_at_its_limit():
+    model = library_model(TUBES, np.ones((2, 4)), (1.0,), static=True)
+    x = np.zeros(model.size)
+    names = ["tubes.youngs_modulus", "tubes.youngs_modulus, each"]
+    x[model.mask(names)] = 1e3
+    assert float(model.reduced(x, names).tubes[0].youngs_modulus) == 2e12
+
+
 def test_one_recording_of_equilibria_is_divided_into_parts_of_blocks():
     seen = dataclasses.replace(recorded(ARM, random_controls(ARM, 0.0, 2e4, 60)), time=np.arange(60.0))
     parts = in_parts([seen])
