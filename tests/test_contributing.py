@@ -13,7 +13,15 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
-from knode_cosserat.identification import effects, numbers_at, reel_effects, rod_effects, tendon_effects
+from knode_cosserat.identification import (
+    effects,
+    numbers_at,
+    part_effects,
+    reel_effects,
+    rod_effects,
+    soft_effects,
+    tendon_effects,
+)
 from knode_cosserat.identification.effects import PossibleEffect, along_axes, library_model, register
 from knode_cosserat.robots import Wrench, loads, parameter
 
@@ -45,7 +53,7 @@ def in_wind(robot):
 
 
 #: they register themselves when they are imported, and that is to last
-REGISTERED = reel_effects, rod_effects, tendon_effects
+REGISTERED = part_effects, reel_effects, rod_effects, soft_effects, tendon_effects
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from knode_cosserat.identification import IdentificationError, evaluate, identif
 from knode_cosserat.identification.effects import library_model
 from knode_cosserat.identification.experiments import PARTS, in_parts
 from knode_cosserat.recordings import Measurements
-from knode_cosserat.robots import Camera, Doubt, Insertion, Layout, ParameterError, parameter
+from knode_cosserat.robots import Camera, Doubt, Effect, Insertion, Layout, ParameterError, parameter
 from knode_cosserat.rods.chambers import Chambers
 from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.magnets import PointMagnet, UniformField
@@ -135,6 +135,14 @@ def test_common_and_own_factors_multiply():
     assert_allclose(found, [10.0 * np.exp(0.1), 6.0 * np.exp(0.1 + 2.0 * 0.05)], rtol=1e-12)
 
 
+def test_effects_that_leave_a_range_together_end_at_its_limit():
+    model = library_model(TUBES, np.ones((2, 4)), (1.0,), static=True)
+    x = np.zeros(model.size)
+    names = ["tubes.youngs_modulus", "tubes.youngs_modulus, each"]
+    x[model.mask(names)] = 1e3
+    assert float(model.reduced(x, names).tubes[0].youngs_modulus) == 2e12
+
+
 def test_one_recording_of_equilibria_is_divided_into_parts_of_blocks():
     seen = dataclasses.replace(recorded(ARM, random_controls(ARM, 0.0, 2e4, 60)), time=np.arange(60.0))
     parts = in_parts([seen])
@@ -202,6 +210,21 @@ def test_a_platform_and_an_assembly_are_found_from_equilibria():
     controls = random_controls(legs, -0.01, 0.01, 30)
     found = identify(legs, [recorded(true, controls)], ["camera.position", "platform_radius"])
     assert found["camera.position[0]"].value == pytest.approx(0.002, abs=2e-4)
+
+
+class Plate(Effect):
+    """A part of yours, whose thickness is known to 10 %, and whose angle to 0.05 rad."""
+
+    thickness: Any = parameter("m", "its thickness", low=1e-6, high=1.0, doubt=Doubt(0.1))
+    angle: Any = parameter("rad", "its angle", low=-4.0, high=4.0, default=0.0, doubt=Doubt(absolute=0.05))
+
+
+def test_a_users_part_brings_its_effects():
+    """Two of a kind have a common factor, and one each; a list of one part needs neither."""
+    one, two = ((Plate(thickness=0.001),) * count for count in (1, 2))
+    names = [library_model(ARM.replace(effects=it), np.ones((2, 0))).names for it in (one, two)]
+    assert {"effects.0.thickness", "effects.0.angle"} <= {*names[0]}
+    assert {f"effects.{it}" for it in ("thickness", "thickness, each", "angle", "angle, each")} <= {*names[1]}
 
 
 class Spring(kc.System):

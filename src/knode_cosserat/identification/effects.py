@@ -95,7 +95,10 @@ def library_model(
         float(np.nanmax(tension.sum(axis=1), initial=0.0)),
         tuple(float(at) for at in bodies if at > 0.0),
     )
-    effects = [it for it in effects_of(nominal, usual) if not (static and it.of_motion)]
+    named = {it.name for it in more}
+    effects = [
+        it for it in effects_of(nominal, usual) if not (static and it.of_motion) and it.name not in named
+    ]
     return ParameterModel(nominal, [*effects, *more])
 
 

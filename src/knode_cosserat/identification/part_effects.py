@@ -16,7 +16,15 @@ import numpy as np
 from knode_cosserat.estimation.parameters import Number, PossibleEffect
 from knode_cosserat.identification.effects import Usual, register
 from knode_cosserat.rods.camera import Camera
-from knode_cosserat.rods.parameters import Parameter, names_of, owner_at, parameters_of, slots_of, value_at
+from knode_cosserat.rods.parameters import (
+    Parameter,
+    names_of,
+    owner_at,
+    parameter_at,
+    parameters_of,
+    slots_of,
+    value_at,
+)
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot
 
@@ -157,6 +165,15 @@ def _present(robot: Any, path: str, of: str) -> Any:
     return getattr(owner_at(robot, path)[0], of) if of else 0.0
 
 
+def _within(robot: Any, path: str, value: Any) -> Any:
+    """Return a value within the range of its parameter, which several effects may leave together."""
+    stated = parameter_at(robot, path)
+    if stated is None or stated.shape == "matrix":
+        return value
+    # unlike a clip, with the whole derivative at an end of the range
+    return jnp.where(value < stated.low, stated.low, jnp.where(value > stated.high, stated.high, value))
+
+
 @dataclasses.dataclass(frozen=True)
 class Scale:
     """Multiplies parameters by one factor, or by a factor each; `of` as in `Doubt`."""
@@ -169,7 +186,9 @@ class Scale:
         """Return the robot with these factors."""
         factors = values * len(self.parameters) if self.common else values
         pairs = zip(self.parameters, factors, strict=True)
-        changes = {path: _present(robot, path, self.of) * factor for path, factor in pairs}
+        changes = {
+            path: _within(robot, path, _present(robot, path, self.of) * factor) for path, factor in pairs
+        }
         return robot.replace(**changes)
 
 
@@ -194,5 +213,5 @@ class Add:
             else:
                 more = values[first]
             first += 0 if self.common else self.sizes[k]
-            changes[path] = jnp.asarray(present) + more
+            changes[path] = _within(robot, path, jnp.asarray(present) + more)
         return robot.replace(**changes)

@@ -200,7 +200,8 @@ class OffsetPaths(NamedTuple):
         """Routings of the tendons."""
         angles = jnp.asarray(self.angles)
         if self.twist is not None:
-            turns, offsets = self.twist / (2.0 * np.pi), jnp.broadcast_to(self.offset, angles.shape)
+            offsets: Any = jnp.broadcast_to(self.offset, angles.shape)
+            turns = self.twist / (2.0 * np.pi)
             return tuple(Helical(offsets[k], angles[k], turns) for k in range(angles.shape[0]))
         x, y = self.offset * jnp.cos(angles), self.offset * jnp.sin(angles)
         return tuple(Straight(x[k], y[k]) for k in range(angles.shape[0]))
