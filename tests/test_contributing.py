@@ -89,7 +89,7 @@ def test_an_effect_finds_its_part_among_those_of_others(wind):
 
 
 def test_each_way_to_extend_the_package_has_an_example():
-    assert len(EXAMPLES) == 12
+    assert len(EXAMPLES) == 13
 
 
 @pytest.mark.parametrize(("code", "file"), EXAMPLES, ids=[file for _, file in EXAMPLES])
