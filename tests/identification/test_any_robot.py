@@ -116,6 +116,8 @@ def test_parts_state_their_doubts_in_units_and_ranges_of_their_own():
     tubes = library_model(TUBES, np.ones((2, 4)), (1.0,), static=True)
     common, own = (len(tubes.effect(f"tubes.curvature{it}").numbers) for it in ("", ", each"))
     assert (common, own) == (1, 2)
+    # all of a tube is curved by default: there is no length in doubt
+    assert not [name for name in tubes.names if name.startswith("tubes.curved")]
 
 
 def test_nominal_numbers_of_stated_effects_change_nothing():

@@ -76,8 +76,6 @@ def _stated(owner: Any, path: str, kind: str) -> Iterator[_Stated]:
         value, doubt = getattr(owner, name), parameter.doubt
         if doubt is None:
             continue
-        if value is None and not doubt.of and doubt.absolute and parameter.shape == "scalar":
-            value = 0.0
         if value is None and doubt.of:
             value = getattr(owner, doubt.of)
         if value is not None:
@@ -158,11 +156,11 @@ def _numbers(stated: _Stated, share: float, added: bool) -> list[Number]:
 
 
 def _present(robot: Any, path: str, of: str) -> Any:
-    """Return the value of a parameter, or that which it has by default: of a property, or zero."""
+    """Return the value of a parameter, or that which it has by default, of a property."""
     value = value_at(robot, path)
     if value is not None:
         return value
-    return getattr(owner_at(robot, path)[0], of) if of else 0.0
+    return getattr(owner_at(robot, path)[0], of)
 
 
 def _within(robot: Any, path: str, value: Any) -> Any:

@@ -93,7 +93,7 @@ class Chambers(Stretched, Effect):
         low=-10.0,
         high=10.0,
         default=None,
-        doubt=Doubt(absolute=1.0),
+        doubt=Doubt(absolute=1.0, of="no_change"),
     )
     area_by_pressure: Any = parameter(
         "1/Pa",
@@ -153,6 +153,11 @@ class Chambers(Stretched, Effect):
     def count(self) -> int:
         """Number of chambers."""
         return int(np.shape(self.angles)[-1])
+
+    @property
+    def no_change(self) -> float:
+        """Change of an area that stays."""
+        return 0.0
 
     @property
     def alike(self) -> Float[Any, " c"]:

@@ -90,9 +90,10 @@ class Doubt(NamedTuple):
 
     Identification searches for a parameter with a doubt (`identification.part_effects`): `relative` is that
     of a common factor of all its numbers, `absolute` that of each number, in its unit. An optional parameter
-    without a value has that of the property `of` of its owner, or else zero. A search begins at the number
-    `begin` of absolute deviations, where zero has no derivative. `basic` parameters are always searched for.
-    Numbers of a list, or of several parts, have an addend in `common`, unless another parameter states it.
+    without a value has that of the property `of` of its owner, or else is not in doubt. A search begins at
+    the number `begin` of absolute deviations, where zero has no derivative. `basic` parameters are always
+    searched for. Numbers of a list, or of several parts, have an addend in `common`, unless another parameter
+    states it.
     """
 
     relative: float = 0.0
