@@ -38,7 +38,7 @@ def bad_inputs():
         ((*full, "--set", "nodes=8", "--nodes", "9"), "nodes is given by --nodes too"),
         ((*full, "--set", "youngs_modulus=2.7"), "Did you mean 2700000000 (2.7 GPa)?"),
         ((*full, "--set", "length=635"), "between 0.001 and 20 m (got 635). Did you mean 0.635 (635 mm)?"),
-        ((*full, "--set", "radius=6 mm"), "(got '6 mm'). Did you mean 0.006?"),
+        ((*full, "--set", "radius=6 kg"), "(got '6 kg'): kg is no unit of a number in m"),
         ((*full, "--set", "gravity=0", "0", "-9810"), "Did you mean [0, 0, -9.81] ([0, 0, -9810] mm/s2)?"),
         ((*simulation, "--controls", "step:1e5", "--steps", "10"), "the step starts at 1.5 s, after the end"),
         ((*simulation, "--controls", "step:1e5", "--steps", "10"), "use 31 steps or more, or at=0"),

@@ -217,7 +217,7 @@ def test_commands_print_what_the_page_shows(page, folder):
             assert lasting(printed) == lasting(shell[k + 1][1])
 
 
-# README's table of figures
+# tables of figures
 
 
 def test_the_page_on_control_has_the_measured_figures():
@@ -239,5 +239,5 @@ def test_the_measured_figures_are_those_of_the_pages():
         json.loads((ROOT / "benchmarks" / name).read_text(encoding="utf-8"))
         for name in ("results.json", "matched.json")
     )
-    assert comparison(found, matched) in PAGES["README.md"]
+    assert comparison(found, matched) in PAGES["docs/performance.md"]
     assert table(found) in PAGES["docs/performance.md"]

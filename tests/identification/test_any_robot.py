@@ -308,7 +308,9 @@ def test_bad_input_is_refused_in_one_line():
         identify(ARM, [seen], ["camera.rotatoin"])
     with pytest.raises(ParameterError, match=r"area_factors has 2 numbers; allowed is one for each of 3"):
         Chambers(angles=THREE, offset=0.006, radius=0.003, area_factors=(1.0, 1.0))
-    with pytest.raises(ValueError, match=r"2 controls in a row; the robot has 3: pressure"):
+    with pytest.raises(
+        ValueError, match=r"the robot has the controls pressure \(3\); the recording has 2 controls"
+    ):
         identify(ARM, [dataclasses.replace(seen, control=seen.control[:, :2])], ["youngs_modulus"])
 
     class Bare(Spring):

@@ -145,5 +145,7 @@ def test_bad_input():
     with pytest.raises(ValueError, match=r"data is a Measurements; allowed is .*did you mean \[data\]\?"):
         fit(ROBOT, rows)
     three = dataclasses.replace(rows, control=rows.control[:, :3])
-    with pytest.raises(kc.learning.DataError, match="3 tensions in a row; the robot has 4"):
+    with pytest.raises(
+        kc.learning.DataError, match=r"the robot has the controls tension \(4\); the recording has 3 controls"
+    ):
         fit(ROBOT, [three])

@@ -130,7 +130,9 @@ def test_a_grid_is_too_coarse_or_fine_enough():
 def test_bad_input_says_what_is_wrong():
     rod = kc.robots.SlenderRod(length=0.5, radius=0.003, density=1000.0, youngs_modulus=1e9)
     seen = measured(kc.robots.RoutedTendonRobot.like(NOMINAL), tensions(1.0, 1.0), "own", noise=0.0)
-    with pytest.raises(DataError, match=r"own: 4 controls in a row; the robot has 0"):
+    with pytest.raises(
+        DataError, match=r"own: the robot has the controls none; the recording has 4 controls"
+    ):
         kc.identify(rod, [seen])
     with pytest.raises(ValueError, match=r"allowed is a list.*did you mean \[data\]"):
         kc.identify(NOMINAL, seen)

@@ -24,7 +24,7 @@ def test_floating_point_warnings_do_not_leave_a_fit(monkeypatch, operation, reco
 
     module = importlib.import_module("knode_cosserat.identification.fit")
     monkeypatch.setattr(module, "fit_states", diverges)
-    monkeypatch.setattr(module, "_measured", diverges)
+    monkeypatch.setattr(module, "learn_residual", diverges)
     data = kc.recordings.load_example() if recordings else synthetic()
     with warnings.catch_warnings():
         warnings.simplefilter("error")

@@ -188,7 +188,7 @@ def in_parts(rows: list[Measurements]) -> list[Measurements]:
             dataclasses.replace(it, time=it.time[on], values=it.values[on]) for it in whole.sensors
         )
         arrays: dict[str, Any] = {
-            it: getattr(whole, it)[on] for it in ("tension", "position", "quaternion", "measured")
+            it: getattr(whole, it)[on] for it in ("control", "position", "quaternion", "measured")
         }
         # rows of equilibria are evenly spaced by name only
         time = whole.time[: int(on.sum())]
