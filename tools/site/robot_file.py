@@ -49,6 +49,7 @@ FAMILIES = {
     "Reels": "Reels: `reels`",
     "TrainedRange": "Trained range: `trained`",
     "EarlyAnchors": "Early anchors: `anchors`",
+    "Camera": "Frame and marker of the measurements: `camera`",
 }
 
 

@@ -423,6 +423,7 @@ class ConcentricTubeRobot(SlenderRod):
 class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
     """Ends of a robot of tubes."""
 
+    system: ConcentricTubeRobot
     rest_is_guess = True
 
     def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
