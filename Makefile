@@ -27,6 +27,7 @@ demo: $(READY) ## simulate, learn, and predict a held-out recording; results in 
 
 pictures: $(READY) ## run all the examples, and draw their pictures for the documentation
 	$(BIN)/python -m tools.pictures
+	$(BIN)/python -m tools.four_robots
 
 notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipynb
 	$(BIN)/python -m tools.notebooks
