@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -33,7 +34,7 @@ def frames(motion: kc.Trajectory, row: int) -> tuple[np.ndarray, np.ndarray]:
     return 1e3 * np.asarray(motion.position[row]), rotation
 
 
-def line(axes: plt.Axes, points: np.ndarray, **style: object) -> None:
+def line(axes: Any, points: np.ndarray, **style: Any) -> None:
     """Draw a line through points (N, 3); z points down the robot that hangs."""
     axes.plot(*points.T, solid_capstyle="round", **style)
 
@@ -43,7 +44,7 @@ def beside(p: np.ndarray, R: np.ndarray, angle: float, offset: float) -> np.ndar
     return p + R @ (offset * np.array([np.cos(angle), np.sin(angle), 0.0]))
 
 
-def tendon_arm(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
+def tendon_arm(motion: Any, axes: Any, row: int) -> None:
     """Draw backbone, tendons coloured by tension, and ribs."""
     p, R = frames(motion, row)
     robot, tension = motion.system, np.asarray(motion.control[row])
@@ -58,7 +59,7 @@ def tendon_arm(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
         line(axes, np.array(ring), color=BODY, lw=1.5)
 
 
-def chamber_arm(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
+def chamber_arm(motion: Any, axes: Any, row: int) -> None:
     """Draw the arm, and its chambers as wide as their pressure is high."""
     p, R = frames(motion, row)
     part = motion.system.effects[0]
@@ -68,7 +69,7 @@ def chamber_arm(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
         line(axes, beside(p, R, angle, 1e3 * float(part.offset)), color=DRIVE, lw=0.8 + 4.0 * high, alpha=0.8)
 
 
-def tubes(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
+def tubes(motion: Any, axes: Any, row: int) -> None:
     """Draw each tube to its own end."""
     p, _ = frames(motion, row)
     robot, control = motion.system, np.asarray(motion.control[row])
@@ -84,7 +85,7 @@ def tubes(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
         )
 
 
-def gripper(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
+def gripper(motion: Any, axes: Any, row: int) -> None:
     """Draw the rods, and the palm between them."""
     curves = [1e3 * np.asarray(it) for it in kc.robots.Drawing.of(motion.system).curves(motion.y[row])]
     curves = [it for curve in curves for it in (curve if curve.ndim == 3 else [curve])]
@@ -95,7 +96,7 @@ def gripper(motion: kc.Trajectory, axes: plt.Axes, row: int) -> None:
         line(axes, curve, color=DRIVE, lw=2.2)
 
 
-def motions() -> list[tuple[str, object, kc.Trajectory, bool]]:
+def motions() -> list[tuple[str, Any, kc.Trajectory, bool]]:
     """Return a title, what draws it, equilibria, and whether z points down, for each robot."""
     turning = np.stack([np.cos(PHASE), np.sin(PHASE), -np.cos(PHASE), -np.sin(PHASE)], axis=1)
     pressed = np.stack([np.clip(np.cos(PHASE - angle), 0.0, 1.0) for angle in (0.0, 2.094, 4.189)], axis=1)
@@ -121,7 +122,7 @@ def main(out: Path = OUT) -> Path:
     for row in range(FRAMES):
         figure = plt.figure(figsize=(8.4, 2.6), dpi=84)
         for k, (title, draw, motion, hangs) in enumerate(robots):
-            axes = figure.add_axes((0.25 * k, 0.0, 0.25, 0.9), projection="3d")
+            axes: Any = figure.add_axes((0.25 * k, 0.0, 0.25, 0.9), projection="3d")
             draw(motion, axes, row)
             p = 1e3 * np.asarray(motion.position).reshape(-1, 3)
             middle, half = 0.5 * (p.min(0) + p.max(0)), 0.62 * np.ptp(p, axis=0).max()
