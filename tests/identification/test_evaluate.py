@@ -45,6 +45,8 @@ def test_the_angle_comes_before_the_papers_metric(found):
     assert tip < angle < paper
     assert f"orientations {np.degrees(found.rotation_rmse):.3g} degrees off" in words
     assert [*found.to_dict()] == ["tip_rmse", "rotation_rmse", "tip_dtw", "pose_mse"]
+    off = 1e3 * found.comparison.distance[:, -1]
+    assert f"mm (median {np.median(off):.2f}, largest {off.max():.2f})" in words
 
 
 def test_errors_are_those_of_the_rows(found, seen):

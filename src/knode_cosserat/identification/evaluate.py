@@ -171,7 +171,10 @@ class Evaluation:
             return f"no prediction: {self.failed}"
         parts = []
         if self.tip_rmse is not None:
-            parts.append(f"tip RMSE {1e3 * self.tip_rmse:.2f} mm")
+            off = 1e3 * (np.zeros(0) if self.comparison is None else self.comparison.distance[:, -1:])
+            known = off[np.isfinite(off)]
+            spread = f" (median {np.median(known):.2f}, largest {known.max():.2f})" if known.size else ""
+            parts.append(f"tip RMSE {1e3 * self.tip_rmse:.2f} mm{spread}")
         if self.rotation_rmse is not None:
             parts.append(f"orientations {np.degrees(self.rotation_rmse):.3g} degrees off")
         if self.pose_mse is not None:
