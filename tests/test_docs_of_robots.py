@@ -32,7 +32,9 @@ def test_the_file_with_two_sections_is_that_of_its_page():
 
 def test_every_kind_is_on_the_page():
     families = ends.End, loads.Load, surroundings.Obstacle, section.SectionChange, routing.Routing
-    kinds = {kind for family in families for kind in kinds_of(family)}
+    known = [(kind, cls) for family in families for kind, cls in kinds_of(family).items()]
+    # tests have parts of their own
+    kinds = {kind for kind, cls in known if cls.__module__.startswith("knode_cosserat")}
     assert not [kind for kind in {*kinds, *KINDS} - {"virtual-robot"} if f"`{kind}`" not in PAGE]
     assert not [name for name in kc.catalog() if f"`{name}`" not in PAGE]
 

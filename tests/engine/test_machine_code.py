@@ -42,7 +42,8 @@ def cache(tmp_path, monkeypatch):
 def taken_over(code, seconds=60.0):
     """Wait for the final code, and return true if it is used after the next call."""
     process, end = code._later, time.monotonic() + seconds
-    while process.returncode is None and time.monotonic() < end:
+    # it may have been found to have ended before
+    while process is not None and process.returncode is None and time.monotonic() < end:
         time.sleep(0.01)
     before = code._functions
     answer(code)

@@ -179,7 +179,7 @@ HEAD = (
         (
             "loads: [{kind: attached-mas}]",
             "loads.0.kind is 'attached-mas'; allowed is attached-mass, distributed-wrench, "
-            "fluid, magnet, point-magnet, point-wrench, tail; did you mean attached-mass?",
+            "fluid, magnet, point-magnet, point-wrench, tail.*; did you mean attached-mass?",
         ),
         ("loads: [{mass: 1}]", "loads.0 is {'mass': 1}; allowed is a mapping with a kind: attached-mass"),
         ("loads: {kind: attached-mass}", "loads is {'kind': 'attached-mass'}; allowed is a list of mappings"),
