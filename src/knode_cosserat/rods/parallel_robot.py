@@ -154,6 +154,16 @@ class ParallelRobot(Bundle):
         return _Leg(**{name: getattr(self, name) for name in LEG}, legs=self.strands, nodes=self.nodes)
 
     @property
+    def usual_shear_modulus(self) -> Any:
+        """Shear modulus (Pa) of the legs without the parameter (`SlenderRod.usual_shear_modulus`)."""
+        return self.strand.usual_shear_modulus
+
+    @property
+    def usual_shear_stiffness(self) -> Any:
+        """Stiffness (N) of the legs without the parameter (`SlenderRod.usual_shear_stiffness`)."""
+        return self.strand.usual_shear_stiffness
+
+    @property
     def control_layout(self) -> Layout:  # type: ignore[override]
         """Layout of the legs' control."""
         return Layout(("displacement", self.strands, "m", "displacement of each leg's base along z"))
