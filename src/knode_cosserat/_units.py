@@ -46,7 +46,8 @@ PREFIXED = {
     "Hz": Unit(1.0, (0, 0, -1, 0, 0)),
     "l": Unit(1e-3, (3, 0, 0, 0, 0)),
     "L": Unit(1e-3, (3, 0, 0, 0, 0)),
-    "gf": Unit(9.80665e-3, (1, 1, -2, 0, 0)),
+    # as in the recordings of the paper's robot
+    "gf": Unit(9.81 / 1000.0, (1, 1, -2, 0, 0)),
 }
 #: other units
 PLAIN = {
@@ -57,7 +58,7 @@ PLAIN = {
     "min": Unit(60.0, (0, 0, 1, 0, 0)),
     "in": Unit(0.0254, (1, 0, 0, 0, 0)),
     "inch": Unit(0.0254, (1, 0, 0, 0, 0)),
-    "psi": Unit(6894.757293168, (-1, 1, -2, 0, 0)),
+    "psi": Unit(6894.757293168361, (-1, 1, -2, 0, 0)),
     "%": Unit(0.01, (0, 0, 0, 0, 0)),
     "1": Unit(1.0, (0, 0, 0, 0, 0)),
 }
@@ -102,6 +103,17 @@ def _simple(symbol: str) -> Unit:
     raise UnitError(f"the unit {symbol!r} is not known")
 
 
+def factors_of(*units: str) -> dict[str, float]:
+    """Return the factors of units to SI units, by unit."""
+    return {unit: unit_of(unit).factor for unit in units}
+
+
+def _shortest(number: float) -> float:
+    """Return the shortest decimal number of those that only rounding distinguishes: 1.4 mm is 0.0014 m."""
+    shortest = float(f"{number:.15g}")
+    return shortest if math.isclose(shortest, number, rel_tol=4e-16) else number
+
+
 def in_unit(text: str, unit: str) -> float | None:
     """Return the number of a text such as `250 mm` in an SI unit; None if it is not a number with a unit.
 
@@ -115,7 +127,4 @@ def in_unit(text: str, unit: str) -> float | None:
     given, wanted = unit_of(symbols), unit_of(unit or "1")
     if given.dimension != wanted.dimension:
         raise UnitError(f"{symbols} is no unit of a number in {unit}" if unit else "this number has no unit")
-    number = float(match[1]) * given.factor / wanted.factor
-    # of numbers that only rounding distinguishes the shortest: 1.4 mm is 0.0014 m
-    shortest = float(f"{number:.15g}")
-    return shortest if math.isclose(shortest, number, rel_tol=4e-16) else number
+    return _shortest(float(match[1]) * given.factor / wanted.factor)

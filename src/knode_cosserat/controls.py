@@ -27,6 +27,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
+from knode_cosserat._units import factors_of
 from knode_cosserat.errors import KnodeCosseratError
 
 if TYPE_CHECKING:
@@ -47,7 +48,7 @@ __all__ = [
 ]
 
 #: factor from a unit that a file may use to newtons
-TENSION_UNITS = {"N": 1.0, "gf": 9.81 / 1000.0}
+TENSION_UNITS = factors_of("N", "gf")
 
 Array = Float[np.ndarray, "steps c"]
 Tensions = Float[np.ndarray, "steps tendons"]

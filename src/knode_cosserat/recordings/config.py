@@ -59,6 +59,7 @@ from knode_cosserat._settings import (
     parts,
     plain,
 )
+from knode_cosserat._units import factors_of
 from knode_cosserat.recordings.findings import RecordingError
 from knode_cosserat.recordings.quantities import QUANTITIES, UNITS, Quantity, of_unit, stated_unit
 
@@ -67,14 +68,14 @@ FORMAT = 1
 #: placeholder of the numbers in a command's text, or of the number or topic in a title
 PLACE = "{}"
 #: conversion factors to SI units
-POSITION_UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
-TIME_UNITS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+POSITION_UNITS = factors_of("m", "cm", "mm")
+TIME_UNITS = factors_of("s", "ms", "us", "ns")
 #: kinds of sensors beside motion capture: their units with factors to SI units, the default first
 SENSOR_UNITS: dict[str, dict[str, float]] = {
-    "orientation": {"rad": 1.0, "deg": math.pi / 180.0},
-    "bending_angle": {"rad": 1.0, "deg": math.pi / 180.0},
-    "curvature": {"1/m": 1.0, "1/mm": 1e3, "1/cm": 1e2},
-    "base_wrench": {"N": 1.0, "mN": 1e-3},
+    "orientation": factors_of("rad", "deg"),
+    "bending_angle": factors_of("rad", "deg"),
+    "curvature": factors_of("1/m", "1/mm", "1/cm"),
+    "base_wrench": factors_of("N", "mN"),
 }
 #: axes of motion capture that point up, with the rotation vector (rad) that turns them to z
 UP: dict[str, Vector] = {

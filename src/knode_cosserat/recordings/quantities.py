@@ -11,12 +11,9 @@ import re
 from collections.abc import Collection, Iterable, Mapping
 from typing import NamedTuple
 
-from knode_cosserat.controls import TENSION_UNITS
+from knode_cosserat._units import factors_of
 
-_ANGLES = {"rad": 1.0, "deg": math.pi / 180.0}
-#: one pound-force per square inch (Pa)
-PSI = 6894.757293168361
-_LENGTHS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3}
+_ANGLES, _LENGTHS = factors_of("rad", "deg"), factors_of("m", "cm", "mm")
 
 
 class Quantity(NamedTuple):
@@ -67,7 +64,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "tension",
             "tensions",
-            {**TENSION_UNITS, "mN": 1e-3, "kgf": 1e3 * TENSION_UNITS["gf"]},
+            factors_of("N", "gf", "mN", "kgf"),
             0.12,
             120.0,
             (("N", 120.0), ("gf", math.inf)),
@@ -107,7 +104,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "current",
             "currents",
-            {"A": 1.0, "mA": 1e-3},
+            factors_of("A", "mA"),
             1e-4,
             100.0,
             (("A", 30.0), ("mA", math.inf)),
@@ -119,15 +116,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "pressure",
             "pressures",
-            {
-                "Pa": 1.0,
-                "hPa": 1e2,
-                "kPa": 1e3,
-                "MPa": 1e6,
-                "mbar": 1e2,
-                "bar": 1e5,
-                "psi": PSI,
-            },
+            factors_of("Pa", "hPa", "kPa", "MPa", "mbar", "bar", "psi"),
             50.0,
             5e6,
             (("bar", 15.0), ("kPa", 1500.0), ("Pa", math.inf)),
@@ -139,7 +128,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "volume",
             "volumes",
-            {"m3": 1.0, "l": 1e-3, "ml": 1e-6, "ul": 1e-9},
+            factors_of("m3", "l", "ml", "ul"),
             1e-9,
             1e-1,
             (("m3", 1e-3), ("ml", math.inf)),
@@ -173,7 +162,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "field",
             "fields",
-            {"T": 1.0, "mT": 1e-3},
+            factors_of("T", "mT"),
             1e-6,
             20.0,
             (("T", 0.3), ("mT", math.inf)),
@@ -184,7 +173,7 @@ QUANTITIES: dict[str, Quantity] = {
         Quantity(
             "input",
             "inputs",
-            {"1": 1.0},
+            factors_of("1"),
             0.0,
             math.inf,
             (("1", math.inf),),

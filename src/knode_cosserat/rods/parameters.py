@@ -21,7 +21,7 @@ import numpy as np
 
 from knode_cosserat._files.yaml_text import UNKNOWN_HERE, did_you_mean, excerpt, flow
 from knode_cosserat._reprs import object_text
-from knode_cosserat._units import UnitError, in_unit
+from knode_cosserat._units import UnitError, factors_of, in_unit
 from knode_cosserat.errors import KnodeCosseratError
 
 #: smallest length of a direction or quaternion: the square of a much smaller length underflows
@@ -52,13 +52,13 @@ TYPICAL: dict[str, tuple[float, float]] = {
     "m/s2": (-30.0, 30.0),
     "rad": (-2 * np.pi, 2 * np.pi),
 }
-#: by unit: the size of other common units, the likeliest first
+#: by unit: other common units with their factors, the likeliest first
 _OTHER_UNITS: dict[str, dict[str, float]] = {
-    "m": {"mm": 1e-3, "um": 1e-6},
-    "Pa": {"GPa": 1e9, "MPa": 1e6, "kPa": 1e3},
-    "kg/m3": {"g/cm3": 1e3, "g/m3": 1e-3},
-    "m/s2": {"mm/s2": 1e-3},
-    "rad": {"degrees": np.pi / 180.0},
+    "m": factors_of("mm", "um"),
+    "Pa": factors_of("GPa", "MPa", "kPa"),
+    "kg/m3": factors_of("g/cm3", "g/m3"),
+    "m/s2": factors_of("mm/s2"),
+    "rad": factors_of("degrees"),
 }
 _SIZES = {"scalar": (), "vector": (3,), "direction": (3,), "quaternion": (4,), "matrix": (3, 3)}
 #: constraint of the schema on an array
