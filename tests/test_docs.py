@@ -28,7 +28,7 @@ LONG = "<!-- test: long -->"
 #: pages whose code takes long as a whole: recordings are made and learned from, or many programs compiled
 LONG_PAGES = (
     "README.md", "docs/control.md", "docs/optimal-design.md", "docs/environments.md", "docs/estimation.md",
-    "docs/hardware.md", "docs/kinematics.md", "docs/recordings.md", "docs/tutorials/fit.md",
+    "docs/hardware.md", "docs/kinematics.md", "docs/identification.md", "docs/tutorials/fit.md",
     "docs/tutorials/control.md", "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md",
     "docs/tutorials/simulate.md", "docs/two-sections.md", "docs/which-function.md",
     "docs/your-own-robot.md",
@@ -86,7 +86,7 @@ def prepare(page, folder):
     """The recordings that a page has the reader make, or bring."""
     if page == "docs/estimation.md":
         record_virtual("x.bag", "sine:1.0", seconds=6.0, seed=1)
-    if page == "docs/recordings.md":
+    if page in ("docs/identification.md", "docs/recordings.md"):
         signals = {
             "sine_1p0": "sine:1.0",
             "sine_3p0": "sine:3.0",
