@@ -27,6 +27,7 @@ HELD_OUT = Path(__file__).parent / "recordings" / "sine_2p0.csv"
 
 def simulate_the_papers_robot(out: Path) -> None:
     """Simulate the paper's robot from rest, its tendons on sines."""
+    announce("simulates; compiles machine code for this robot, once")
     robot = kc.load_robot("delrin-tendon-robot")
     tensions = kc.controls.sine(period=1.5, steps=100, dt=DT)
     truth = kc.simulate(robot, tensions, DT)
@@ -42,6 +43,7 @@ def simulate_the_papers_robot(out: Path) -> None:
 
 def learn_what_a_model_misses(out: Path) -> None:
     """Learn the hardest case of the paper's simulation study: a model of the wrong length and stiffness."""
+    announce("learns what a wrong model misses, and predicts")
     robot = kc.load_robot("delrin-tendon-robot")
     imperfect = robot.replace(length=0.4, youngs_modulus=10e9)
     training = [moved(robot, control, TRAINING_ROWS) for control in TRAINING]
@@ -58,9 +60,9 @@ def learn_what_a_model_misses(out: Path) -> None:
     }
     sines = {label: prediction["sine"] for label, prediction in predictions.items()}
     kc.figures.compare(truth["sine"], sines).savefig(out / "learning.png")
-    kc.viewer.export_scene(
-        {"robot": truth["sine"], **sines}, out / "scene.html", title="What the model missed"
-    )
+    motions = {"robot": truth["sine"], **sines}
+    kc.viewer.export_scene(motions, out / "scene.html", title="What the model missed")
+    kc.figures.animate(motions, out / "motion.gif", fps=10, dpi=100)
 
     errors = {
         label: [
@@ -87,11 +89,11 @@ def learn_what_a_model_misses(out: Path) -> None:
     print()
     print(f"   model:   {out / 'model'}")
     print(f"   picture: {out / 'learning.png'}")
-    print(f"   3-D:     {out / 'scene.html'} (open it in a browser)")
 
 
 def predict_a_held_out_recording(out: Path) -> None:
     """Calibrate the paper's robot from one recording of another robot, and predict a second recording."""
+    announce("reads a recording, calibrates, predicts another")
     training = load_example().sampled(DT).between(1.0, 7.0)
     held_out = kc.load_recording(HELD_OUT).sampled(DT).between(1.0, 11.0)
     nominal = kc.load_robot("delrin-tendon-robot")
@@ -106,7 +108,7 @@ def predict_a_held_out_recording(out: Path) -> None:
         out / "recording.png"
     )
 
-    print("3. Read two recordings (tensions and tip positions) of a stand-in robot, which was simulated with")
+    print("3. Read two recordings (tensions and tip positions) of a test robot, which was simulated with")
     print("   PyElastica and is not a physical one. It has friction, rib masses and routed tendons that the")
     print("   model does not have. Calibrated Young's modulus and damping of the model from 6 s of a sine")
     print("   of 1 s, and predicted 10 s of a sine of 2 s from its tensions alone.")
@@ -117,6 +119,11 @@ def predict_a_held_out_recording(out: Path) -> None:
     for label, prediction in predictions.items():
         error = float(rms_distance(np.asarray(prediction.tip_position), held_out.tip_position))
         print(f"   {label:32}{100 * error:14.1f}")
+
+
+def announce(task: str) -> None:
+    """Say what is done now, before it takes its time."""
+    print(f"… {task} …", flush=True)
 
 
 def moved(system: kc.System, control: str, rows: int) -> kc.Trajectory:
@@ -138,6 +145,10 @@ def main() -> None:
     learn_what_a_model_misses(out)
     print()
     predict_a_held_out_recording(out)
+    print()
+    print(f"The robot, the wrong model and the learned one in motion: {out / 'motion.gif'},")
+    print(f"and {out / 'scene.html'}, to turn and zoom in a browser.")
+    print("Next, a robot of your own:  .venv/bin/knode-cosserat init my-robot.yaml")
 
 
 if __name__ == "__main__":

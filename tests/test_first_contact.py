@@ -173,7 +173,7 @@ def test_the_doctor_says_what_is_wrong(monkeypatch):
     found = kc.diagnosis.doctor()
     assert not found.well and "ZeroDivisionError" in str(found)
     done = CliRunner().invoke(app, ["doctor"])
-    assert done.exit_code == 1 and "FAILED" in done.output
+    assert done.exit_code == 1 and "FAILED" in done.output and "mend: pip install" in done.output
 
 
 # the logger

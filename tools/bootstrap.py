@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 import venv
 
 MINIMUM = (3, 11)
@@ -55,13 +56,17 @@ if sys.version_info < MINIMUM:
     hand_over_to_a_newer_python()
 
 
-def run(*command: str | pathlib.Path) -> None:
-    """Run an installer; where it fails, blame the network in one line or else show what it said."""
+def run(*command: str | pathlib.Path, packages: int = 0) -> None:
+    """Run an installer; where it fails, blame the network in one line or else show what it said.
+
+    With a number of packages the progress is told.
+    """
     # Packages of another Python (a sourced ROS set-up, say) would pass for installed ones.
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
     # PIP_USER: set in many a personal configuration, and impossible inside a virtual environment.
     environment |= {"PIP_USER": "0", "PIP_NO_INPUT": "1", "PIP_DISABLE_PIP_VERSION_CHECK": "1"}
-    done = subprocess.run(
+    said = []
+    with subprocess.Popen(
         command,
         cwd=ROOT,
         env=environment,
@@ -70,15 +75,28 @@ def run(*command: str | pathlib.Path) -> None:
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
-        check=False,
-    )
-    if done.returncode == 0:
+    ) as installer:
+        found, told = 0, time.monotonic()
+        for line in installer.stdout or ():
+            said.append(line)
+            found += line.startswith("Collecting ")
+            # a terminal's line is rewritten; a log gets a line every ten seconds
+            installing = packages and line.startswith("Installing collected packages")
+            if installing or (packages and time.monotonic() - told > (0.2 if sys.stdout.isatty() else 10)):
+                state = "installing them" if installing else f"{found} of {packages} packages"
+                start, end = ("\r", "") if sys.stdout.isatty() else ("", "\n")
+                print(f"{start}  {state:<24}", end=end, flush=True)
+                told = time.monotonic()
+    if packages and sys.stdout.isatty():
+        print()
+    if installer.returncode == 0:
         return
+    output = "".join(said)
     # Out of retries: pip itself then only says that it found no matching distribution.
-    broken = re.search(r"Retry\(total=0,.*connection broken by '(.*)': ", done.stdout)
+    broken = re.search(r"Retry\(total=0,.*connection broken by '(.*)': ", output)
     if broken:
         sys.exit(f"error: the package index is out of reach: {broken[1]}")
-    sys.exit(f"{done.stdout}\nerror: this failed, its output is above: {' '.join(map(str, command))}")
+    sys.exit(f"{output}\nerror: this failed, its output is above: {' '.join(map(str, command))}")
 
 
 def make_venv(folder: pathlib.Path) -> pathlib.Path:
@@ -108,10 +126,14 @@ def set_up() -> None:
         installed.unlink(missing_ok=True)
         make_venv(VENV)
         # Wheels only: there may be no compiler here, and the hashes would not cover what a build downloads.
-        run(python, "-m", "pip", "install", "--only-binary=:all:", "--require-hashes", "-r", LOCK)
+        packages = sum("==" in line for line in LOCK.read_text().splitlines())
+        run(
+            python, "-m", "pip", "install", "--only-binary=:all:", "--require-hashes", "-r", LOCK,
+            packages=packages,
+        )  # fmt: skip
         installed.write_text(wanted)
-    packages = [word for folder in PACKAGES for word in ("--editable", folder)]
-    run(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", *packages)
+    editable = [word for folder in PACKAGES for word in ("--editable", folder)]
+    run(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", *editable)
 
 
 def lock(upgrade: bool) -> None:

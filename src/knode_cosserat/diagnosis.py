@@ -31,16 +31,22 @@ OPTIONAL = {
     "tensorboardX": "tensorboard",
     "distributed": "dask",
 }
+#: what mends an installation whose programs or results are wrong
+REINSTALL = (
+    "pip install --upgrade --force-reinstall knode-cosserat, in a new environment (python3 -m venv); "
+    "empty the cache's folder; if it stays, report this page"
+)
 #: largest relative error of the force at the base against the rod's weight
 WEIGHT_ERROR = 1e-9
 
 
 class Check(NamedTuple):
-    """One check: name, success, and observation."""
+    """One check: name, success, observation, and what mends a failure."""
 
     name: str
     well: bool
     seen: str
+    mend: str
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,10 +91,11 @@ class Diagnosis:
         ]
         if extras:
             lines.append(f"missing    {', '.join(missing)}: pip install 'knode-cosserat[{','.join(extras)}]'")
-        lines += [
-            f"{'ok' if check.well else 'FAILED':<10} {check.name}: {check.seen}" for check in self.checks
-        ]
-        lines.append("all checks passed" if self.well else "a check failed: see above")
+        for check in self.checks:
+            lines.append(f"{'ok' if check.well else 'FAILED':<10} {check.name}: {check.seen}")
+            if not check.well:
+                lines.append(f"{'':<10} mend: {check.mend}")
+        lines.append("all checks passed" if self.well else "a check failed: see its mend above")
         return "\n".join(lines)
 
 
@@ -102,7 +109,12 @@ def doctor() -> Diagnosis:
     versions |= {name: _version(name) for name in (*NEEDED, *OPTIONAL)}
     cache = Path(getattr(jax.config, "jax_compilation_cache_dir", None) or "")
     kind = jax.numpy.zeros(()).dtype
-    precision = Check("precision", kind == np.float64, f"numbers are {kind}; float64 is needed")
+    precision = Check(
+        "precision",
+        kind == np.float64,
+        f"numbers are {kind}; float64 is needed",
+        "unset JAX_ENABLE_X64, and do not set jax_enable_x64 to False after this package is imported",
+    )
     checks = [precision, _cache(cache), *_simulated()]
     # files of this package, and of JAX in a directory that the user set for it
     programs = sum(1 for end in (SUFFIX, "-cache") for _ in cache.glob(f"*{end}"))
@@ -130,8 +142,9 @@ def _cache(folder: Path) -> Check:
     while not place.exists() and place != place.parent:
         place = place.parent
     kept = bool(folder.name) and os.access(place, os.W_OK)
-    said = "cannot be written: set KNODE_COSSERAT_CACHE, or every run compiles anew"
-    return Check("cache", kept, f"{folder} {'can be written' if kept else said}")
+    said = "can be written" if kept else "cannot be written: every run compiles anew"
+    mend = "export KNODE_COSSERAT_CACHE=FOLDER, one that you may write to"
+    return Check("cache", kept, f"{folder} {said}", mend)
 
 
 def _simulated() -> list[Check]:
@@ -145,12 +158,15 @@ def _simulated() -> list[Check]:
             times.append(time.perf_counter() - began)
         carried = float(equilibrium(robot, np.zeros(4), with_stability=False).part("n")[0, 0, 2])
     except Exception as error:  # any failure is a result of the check
-        return [Check("simulation", False, f"{type(error).__name__}: {' '.join(str(error).split())}")]
+        said = f"{type(error).__name__}: {' '.join(str(error).split())}"
+        return [Check("simulation", False, said, REINSTALL)]
     solved = bool(moved.all_valid and np.max(moved.residual) <= 1e-8)
     weight = float(robot.mass_per_length * robot.length * robot.gravity[2])
     off = abs(carried / weight - 1.0)
     balance = f"the base carries {-carried:.6f} N, the rod's weight to {off:.0e}"
     return [
-        Check("simulation", solved, f"20 steps in {times[0]:.2f} s, and again in {1e3 * times[1]:.1f} ms"),
-        Check("balance", off <= WEIGHT_ERROR, balance),
+        Check(
+            "simulation", solved, f"20 steps in {times[0]:.2f} s, then in {1e3 * times[1]:.1f} ms", REINSTALL
+        ),
+        Check("balance", off <= WEIGHT_ERROR, balance, REINSTALL),
     ]
