@@ -56,10 +56,10 @@ if sys.version_info < MINIMUM:
     hand_over_to_a_newer_python()
 
 
-def run(*command: str | pathlib.Path, packages: int = 0) -> None:
+def run(*command: str | pathlib.Path, with_progress: bool = False) -> None:
     """Run an installer; where it fails, blame the network in one line or else show what it said.
 
-    With a number of packages the progress is told.
+    With progress it is told how many packages are there.
     """
     # Packages of another Python (a sourced ROS set-up, say) would pass for installed ones.
     environment = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "PYTHONHOME")}
@@ -76,18 +76,18 @@ def run(*command: str | pathlib.Path, packages: int = 0) -> None:
         stderr=subprocess.STDOUT,
         text=True,
     ) as installer:
-        found, told = 0, time.monotonic()
+        found, told, state = 0, time.monotonic(), "packages"
         for line in installer.stdout or ():
             said.append(line)
             found += line.startswith("Collecting ")
+            if line.startswith("Installing collected packages"):
+                state, told = "packages, installing them", 0.0
             # a terminal's line is rewritten; a log gets a line every ten seconds
-            installing = packages and line.startswith("Installing collected packages")
-            if installing or (packages and time.monotonic() - told > (0.2 if sys.stdout.isatty() else 10)):
-                state = "installing them" if installing else f"{found} of {packages} packages"
+            if with_progress and time.monotonic() - told > (0.2 if sys.stdout.isatty() else 10.0):
                 start, end = ("\r", "") if sys.stdout.isatty() else ("", "\n")
-                print(f"{start}  {state:<24}", end=end, flush=True)
+                print(f"{start}  {found} {state}", end=end, flush=True)
                 told = time.monotonic()
-    if packages and sys.stdout.isatty():
+    if with_progress and sys.stdout.isatty():
         print()
     if installer.returncode == 0:
         return
@@ -126,14 +126,11 @@ def set_up() -> None:
         installed.unlink(missing_ok=True)
         make_venv(VENV)
         # Wheels only: there may be no compiler here, and the hashes would not cover what a build downloads.
-        packages = sum("==" in line for line in LOCK.read_text().splitlines())
-        run(
-            python, "-m", "pip", "install", "--only-binary=:all:", "--require-hashes", "-r", LOCK,
-            packages=packages,
-        )  # fmt: skip
+        install = ("-m", "pip", "install", "--only-binary=:all:", "--require-hashes", "-r", LOCK)
+        run(python, *install, with_progress=True)
         installed.write_text(wanted)
-    editable = [word for folder in PACKAGES for word in ("--editable", folder)]
-    run(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", *editable)
+    packages = [word for folder in PACKAGES for word in ("--editable", folder)]
+    run(python, "-m", "pip", "install", "--no-deps", "--no-build-isolation", *packages)
 
 
 def lock(upgrade: bool) -> None:
