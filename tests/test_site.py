@@ -66,14 +66,14 @@ def test_the_reference_has_every_name_with_its_meaning():
 def test_every_public_name_is_on_one_page_of_the_api():
     shown = api.shown(DOCS / "api")
     assert sorted(shown) == sorted(api.rooms())
-    named = [line for room in shown for line in api.page(room).split("\n\n")]
-    assert len(named) == len(set(named)) == len(api.public())
+    assert set(api.pages(DOCS / "api")) == {f"{path}.md" for path in api.public()}
+    assert all("](knode_cosserat" in api.page(room) for room in shown)
 
 
 def test_main_functions_come_first_on_their_pages():
-    first = api.page("solvers", "trajectory").split("\n\n")[:2]
-    assert [line.rsplit(".", 1)[1] for line in first] == ["simulate", "equilibrium"]
-    assert api.page("identification").split("\n")[0].endswith(".fit")
+    first = api.ordered("solvers", "trajectory")[:2]
+    assert [path.rsplit(".", 1)[1] for path in first] == ["simulate", "equilibrium"]
+    assert api.page("identification").split("\n")[2].startswith("| [`fit`](knode_cosserat.")
 
 
 def test_the_changelog_is_a_page_with_released_versions():

@@ -68,9 +68,11 @@ def _is_one(entry: Any, names: list[str]) -> bool:
 
 
 def on_files(files: Any, config: Any) -> Any:
-    """The schema of robot files, at a place that does not change."""
+    """The schema of robot files, at a place that does not change, and a page for each public name."""
     text = json.dumps(kc.robots.robot_schema(), indent=2, ensure_ascii=False) + "\n"
     files.append(File.generated(config, "robot.schema.json", content=text))
+    for name, content in api.pages(Path(config.docs_dir, "api")).items():
+        files.append(File.generated(config, f"api/{name}", content=content))
     return files
 
 
