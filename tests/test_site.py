@@ -12,7 +12,7 @@ from knode_cosserat.robots import ends, loads, routing, section, surroundings
 from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.robot_file import KINDS
 from knode_cosserat.solvers import BDFAlpha
-from tools.site import api, changelog, examples, robot_file, source
+from tools.site import api, changelog, examples, source, tables
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -51,7 +51,7 @@ def test_every_source_on_a_page_is_there():
 
 
 def test_the_reference_has_every_name_with_its_meaning():
-    page = robot_file.page()
+    page = "\n".join(made() for name, made in tables.TABLES.items() if name.startswith("robot"))
     families = ends.End, loads.Load, surroundings.Obstacle, section.SectionChange, routing.Routing
     classes = [*KINDS.values(), *(cls for family in families for cls in kinds_of(family).values())]
     for cls in classes:
@@ -61,6 +61,14 @@ def test_the_reference_has_every_name_with_its_meaning():
         assert re.search(rf"^###? `{kind}`$", page, re.MULTILINE)
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     assert {line.replace("\\|", "").count("|") for line in rows} == {7}
+
+
+def test_the_tables_on_the_pages_are_those_of_the_code():
+    pages = [page for page in DOCS.rglob("*.md") if tables.TABLE.search(page.read_text(encoding="utf-8"))]
+    assert len(pages) == len(tables.TABLES)
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        assert tables.filled(text) == text, f"{page.name}: python -m tools.site.tables writes it"
 
 
 def test_every_public_name_is_on_one_page_of_the_api():

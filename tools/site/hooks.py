@@ -24,8 +24,6 @@ from tools.site import (
     equations,
     examples,
     notebooks,
-    quantities,
-    robot_file,
     source,
 )
 
@@ -42,8 +40,6 @@ MADE = {
     "contributing": contributing.page,
     "examples": examples.page,
     "notebook": notebooks.page,
-    "quantities": quantities.page,
-    "robot-file": robot_file.page,
 }
 
 

@@ -53,22 +53,33 @@ FAMILIES = {
 }
 
 
-def page() -> str:
-    """Return the reference: kinds of robots, then the families of their parts."""
+#: families on pages of their own; the others share one
+LOADS = ("Load", "Obstacle", "Effect")
+TENDONS = (
+    "Routing", "Reels", "TendonFriction", "Vibration", "RibSpacing", "Relaxation", "EarlyAnchors",
+    "LoadCells", "TrainedRange",
+)  # fmt: skip
+
+
+def robots() -> str:
+    """Return the kinds of robots with their entries."""
     rod = set(in_order(SlenderRod))
     of_a_rod = [cls for cls in KINDS.values() if issubclass(cls, SlenderRod) and rod <= set(in_order(cls))]
-    shared = [
-        "[Download the schema](robot.schema.json)",
+    texts = [
         "## Robots of one rod",
         "Entries of all of `" + "`, `".join(kind for kind, cls in KINDS.items() if cls in of_a_rod) + "`.",
         HEAD + "\n".join([*_rows(SlenderRod, rod), _nodes()]),
     ]
-    parts = []
     for kind, cls in KINDS.items():
         one = cls in of_a_rod
         rows = _rows(cls, None, without=rod) if one else [*_rows(cls, None), _nodes()]
         after = "No further entries." if one and not rows else HEAD + "\n".join(rows)
-        parts += [f"## `{kind}`", _first(cls), after]
+        texts += [f"## `{kind}`", _first(cls), after]
+    return "\n\n".join(texts)
+
+
+def parts(*named: str) -> str:
+    """Return some families of the parts that robots hold, or those without a page, with the kinds of each."""
     families: dict[str, type] = {}
     holders: list[type] = list(KINDS.values())
     for cls in holders:  # it grows: parts may hold parts
@@ -76,15 +87,20 @@ def page() -> str:
             if slot.family.__name__ not in families:
                 families[slot.family.__name__] = slot.family
                 holders += kinds_of(slot.family).values()
+    texts = []
+    elsewhere = {*LOADS, *TENDONS} - set(named)
     for name, family in families.items():
-        parts += [f"## {FAMILIES[name]}", _first(family)]
+        if (name not in named) if named else (name in elsewhere):
+            continue
+        texts += [f"## {FAMILIES[name]}", _first(family)]
         if family is SlenderRod:
-            parts.append("The kinds of robots of one rod, with their entries.")
+            texts.append("The kinds of robots of one rod, with [their entries](robot-kinds.md).")
             continue
         for kind, cls in kinds_of(family).items():
-            rows = _rows(cls, None)
-            parts += [f"### `{kind}`", _first(cls), HEAD + "\n".join(rows) if rows else "No parameters."]
-    return "\n\n".join([*shared, *parts])
+            if cls.__module__.startswith("knode_cosserat"):  # others are of whoever runs this
+                rows = _rows(cls, None)
+                texts += [f"### `{kind}`", _first(cls), HEAD + "\n".join(rows) if rows else "No parameters."]
+    return "\n\n".join(texts)
 
 
 def _first(cls: type) -> str:
