@@ -160,6 +160,8 @@ class Parameter:
             low, high = TYPICAL.get(self.unit, (np.inf, -np.inf))
             meant = in_other_unit(array, self.unit, max(low, self.low), min(high, self.high))
             hint = f". Did you mean {numbers_text(meant[1])} ({text} {meant[0]})?" if meant else ""
+            # a length in place of a part of the length, say
+            hint = hint if self.unit else f": {self.meaning}"
         raise ParameterError(f"{name} must be {allowed} (got {text}){hint}")
 
     def _contains(self, array: np.ndarray) -> bool:
@@ -193,7 +195,8 @@ class Parameter:
         try:
             number = in_unit(value, self.unit) if isinstance(value, str) else None
         except UnitError as error:
-            raise ParameterError(f"{name} must be {self.allowed} (got {excerpt(value)}): {error}") from None
+            said = "" if self.unit else f", {self.meaning}"
+            raise ParameterError(f"{name} must be {self.allowed} (got {excerpt(value)}): {error}{said}") from None
         return value if number is None else number
 
     def read(self, name: str, value: Any) -> Any:
