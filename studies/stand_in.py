@@ -37,8 +37,8 @@ from studies.elastica.plant import ElasticaPlant, Recorded, record_elastica, sin
 from studies.elastica.rod import ElasticaRod, Imperfections
 
 #: name of the robot in the study's tables, and the reason for a study without it
-ROBOT = "PyElastica stand-in, identified"
-MISSING = "PyElastica stand-in: left out, because it needs: pip install '.[studies]'"
+ROBOT = "PyElastica test robot, identified"
+MISSING = "PyElastica test robot: left out, because it needs: pip install '.[studies]'"
 #: true over nominal Young's modulus, and the true damping (N m² s; nominal is 0.03)
 SOFTER, DAMPING = 0.8, 0.01
 #: effects that are identified, beside stiffness and damping
