@@ -203,7 +203,7 @@ def costs_table(cost: Mapping[str, Any]) -> str:
 
 
 def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
-    """Return the tracking errors of all controllers on the slow and the fast circle; the worst robot of a kind."""
+    """Return the tracking errors of all controllers on both circles; the worst robot of a kind."""
     from studies.report import markdown_table
 
     def kind(robot: str) -> str:

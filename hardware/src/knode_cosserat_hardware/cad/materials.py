@@ -49,8 +49,8 @@ def bill_of_materials(robot: str | Path) -> tuple[Item, ...]:
 
 def materials_table(items: Sequence[Item]) -> str:
     """Return a bill of materials as a table in Markdown."""
-    rows = [f"| {item.part} | {item.count} | {item.specification} | {item.source} |" for item in items]
-    return "\n".join(["| part | count | specification | source |", "| --- | ---: | --- | --- |", *rows])
+    rows = [f"| {item.part} | {item.count} | {item.specification} |" for item in items]
+    return "\n".join(["| part | count | specification |", "| --- | ---: | --- |", *rows])
 
 
 def _values(part: PartDimensions) -> dict[str, Any]:
