@@ -106,7 +106,7 @@ def predict_a_held_out_recording(out: Path) -> None:
         out / "recording.png"
     )
 
-    print("3. Read two recordings (tensions and tip positions) of a stand-in robot, which was simulated with")
+    print("3. Read two recordings (tensions and tip positions) of a test robot, which was simulated with")
     print("   PyElastica and is not a physical one. It has friction, rib masses and routed tendons that the")
     print("   model does not have. Calibrated Young's modulus and damping of the model from 6 s of a sine")
     print("   of 1 s, and predicted 10 s of a sine of 2 s from its tensions alone.")
