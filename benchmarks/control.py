@@ -185,22 +185,25 @@ def _asked(worker: Any, line: str) -> Any:
 
 
 def table(found: Mapping[str, Any]) -> str:
-    """Return the tables in Markdown."""
+    """Return the tables of docs/control.md in Markdown."""
+    return "\n\n".join([tracking_table(found["tracking"]), checks_table(found["checks"])])
+
+
+def costs_table(cost: Mapping[str, Any]) -> str:
+    """Return the times of a prediction over the horizon, with and without derivatives."""
     from studies.report import markdown_table
 
-    cost = found["costs"]
     rows = [
         (f"simulation of {cost['periods']} periods", cost["simulated"]),
         (f"with {cost['columns']} derivatives by the plan, `jax.jacfwd`", cost["by_jax"]),
         (f"with {cost['columns'] + 1} derivatives, tangents of the steps", cost["by_tangents"]),
         (f"with {cost['columns'] + cost['state_columns']} derivatives, as in the loop", cost["with_state"]),
     ]
-    costs_table = markdown_table(["prediction", "ms"], [[name, f"{value:.1f}"] for name, value in rows])
-    return "\n\n".join([tracking_table(found["tracking"]), checks_table(found["checks"]), costs_table])
+    return markdown_table(["prediction", "ms"], [[name, f"{value:.1f}"] for name, value in rows])
 
 
 def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
-    """Return the tracking errors of all controllers; the worst of robots of one kind."""
+    """Return the tracking errors of all controllers on both circles; the worst robot of a kind."""
     from studies.report import markdown_table
 
     def kind(robot: str) -> str:
@@ -208,29 +211,33 @@ def tracking_table(cells: Sequence[Mapping[str, Any]]) -> str:
             return "stiffness wrong by 30 %"
         return "unknown 10 or 50 g at the tip" if robot.startswith("unknown") else robot
 
-    paths = list(dict.fromkeys(cell["reference"] for cell in cells))
+    def worst(name: str, robot: str, path: str) -> str:
+        own = (
+            cell["rmse_percent"]
+            for cell in cells
+            if (cell["controller"], kind(cell["robot"]), cell["reference"]) == (name, robot, path)
+        )
+        largest = max(own, default=None)
+        return "–" if largest is None else f"{largest:.2g}"
+
+    paths = [path for path in dict.fromkeys(cell["reference"] for cell in cells) if path.startswith("circle")]
+    robots = list(dict.fromkeys(kind(cell["robot"]) for cell in cells))
     rows = []
-    for robot in dict.fromkeys(kind(cell["robot"]) for cell in cells):
-        for name in dict.fromkeys(cell["controller"] for cell in cells):
-            own = [cell for cell in cells if kind(cell["robot"]) == robot and cell["controller"] == name]
-            worst = [
-                max((cell["rmse_percent"] for cell in own if cell["reference"] == path), default=None)
-                for path in paths
-            ]
-            if own:
-                rows.append([robot, name, *("–" if w is None else f"{w:.2g}" for w in worst)])
-    return markdown_table(["robot", "controller", *paths], rows)
+    for name in dict.fromkeys(cell["controller"] for cell in cells):
+        errors = ([worst(name, robot, path) for path in paths] for robot in robots)
+        rows.append([name, *("–" if set(own) == {"–"} else ", ".join(own) for own in errors)])
+    return markdown_table(["controller", *robots], rows)
 
 
 def checks_table(checks: Sequence[Mapping[str, Any]]) -> str:
-    """Return the checks with their limits."""
+    """Return the checks with their limits; values beyond them are bold."""
     from studies.report import markdown_table
 
-    rows = [
-        [each["check"], f"{each['value']:.2g}", f"{each['limit']:g}", "met" if each["ok"] else "**missed**"]
-        for each in checks
-    ]
-    return markdown_table(["check", "value", "limit", "result"], rows)
+    rows = []
+    for each in checks:
+        value = f"{each['value']:.2g}"
+        rows.append([each["check"], value if each["ok"] else f"**{value}**", f"{each['limit']:g}"])
+    return markdown_table(["check", "value", "limit"], rows)
 
 
 def main() -> None:
@@ -264,7 +271,7 @@ def main() -> None:
         "tracking": read["tracking"],
     }
     given.out.write_text(json.dumps(found, indent=1) + "\n")
-    print(f"{found['machine']}\n\n{table(found)}\n\nwritten: {given.out}")
+    print(f"{found['machine']}\n\n{table(found)}\n\n{costs_table(timed)}\n\nwritten: {given.out}")
 
 
 if __name__ == "__main__":

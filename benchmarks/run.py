@@ -224,9 +224,9 @@ def learning_rows(found: dict[str, Any]) -> list[tuple[str, str, str]]:
     steps = found["learned_steps"]
     ratios = [taken / steps["physics"] for name, taken in steps.items() if name not in ("physics", "paper")]
     return [
-        ("fit, paper preset, 1,000 epochs", f"{paper['one']:.2f} s", "<= 2 s"),
+        ("fit, configuration paper, 1,000 epochs", f"{paper['one']:.2f} s", "<= 2 s"),
         ("the same, five seeds against one", f"{paper['ratio']:.1f}x", "<= 2.5x"),
-        ("fit, best preset", f"{1e3 * best['one']:.0f} ms", "<= 5 s"),
+        ("fit, configuration best", f"{1e3 * best['one']:.0f} ms", "<= 5 s"),
         ("the same, five seeds against one", f"{best['ratio']:.1f}x", "<= 2.5x"),
         ("a step with the 512-wide network", f"{1e3 * steps['paper']:.2f} ms", "<= 0.15 ms"),
         (

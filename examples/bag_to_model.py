@@ -1,6 +1,6 @@
 """From recorded bags to a model that predicts: record, read, identify, test on a held-out recording.
 
-A virtual robot is recorded, with friction, ribs, a lag and noisy sensors that the model does not have.
+A simulated robot is recorded, with friction, ribs, a lag and noisy sensors that the model does not have.
 `knode-cosserat record-virtual` makes the same bags; with your own bags, start at `load_recording`.
 """
 
@@ -24,10 +24,10 @@ def main(out: str = "bag_to_model.png", seconds: float = 4.0) -> tuple[float, fl
     seen, unseen = (recording.sampled(0.0125, mean=True) for recording in recordings)
 
     # realistic tendons, which bend the rod; without names, friction is found too, which takes longer
-    knowledge = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
-    found = kc.identify(knowledge, [seen], parameters=NAMES)
+    nominal = kc.robots.RoutedTendonRobot.like(kc.load_robot("delrin-tendon-robot"))
+    found = kc.identify(nominal, [seen], parameters=NAMES)
     print(found)
-    before, after = (kc.simulate(each, unseen.control[:-1], 0.0125) for each in (knowledge, found.robot))
+    before, after = (kc.simulate(each, unseen.control[:-1], 0.0125) for each in (nominal, found.robot))
     kc.figures.prediction_against_measurement(after, unseen).savefig(out)
     errors = tuple(
         float(((each.tip_position - unseen.tip_position) ** 2).sum(axis=1).mean() ** 0.5)

@@ -50,7 +50,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
     moved = kc.simulate(real, tension[1:], FINE, space="lobatto4", initial=still)[::2]
     rng = np.random.default_rng(list(signal.encode()))
     config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
-    config = config.replace(simulated=True, description=f"{path.stem}: a virtual robot")
+    config = config.replace(simulated=True, description=f"{path.stem}: a simulated robot")
     seen = np.asarray(moved.tip_position) + config.origin + rng.normal(0.0, 2e-4, (len(moved.time), 3))
     turned = np.asarray(moved.quaternion)[:, -1] + rng.normal(0.0, 1e-3, (len(moved.time), 4))
     pulled = ControlRows(time[::4], (tension[::4] + rng.normal(0.0, 0.03, tension[::4].shape)).round(2))
@@ -60,7 +60,7 @@ def record(path: Path, signal: str, seconds: float) -> None:
 def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     """Record, identify, and predict a held-out recording; return the tip's errors (m) before and after."""
     out.mkdir(parents=True, exist_ok=True)
-    knowledge = kc.load_robot(HERE / "your_own_robot.yaml")
+    nominal = kc.load_robot(HERE / "your_own_robot.yaml")
     config = kc.recordings.RecordingConfig.load(HERE / "your_own_recording.yaml")
     for name, signal in SIGNALS.items():
         record(out / f"{name}.csv", signal, seconds)
@@ -68,11 +68,11 @@ def main(out: Path, seconds: float = 8.0) -> tuple[float, float]:
     unseen = recordings.pop("unseen").sampled(DT, mean=True)
     first = recordings["sine-1"]
     figures.health(first).savefig(out / "health.png", dpi=130)
-    found = kc.identify(knowledge, list(recordings.values()), progress=print)
+    found = kc.identify(nominal, list(recordings.values()), progress=print)
     print(found)
     kc.save_robot(found.robot, out / "found.yaml")
     errors = []
-    for label, robot in (("before", knowledge), ("after", found.robot)):
+    for label, robot in (("before", nominal), ("after", found.robot)):
         prediction = kc.identification.predict(robot, unseen)
         figures.prediction_against_measurement(prediction, unseen).savefig(out / f"{label}.png", dpi=130)
         errors.append(float(rms_distance(np.asarray(prediction.tip_position), unseen.tip_position)))

@@ -255,8 +255,8 @@ def imperfections(
 ) -> Study:
     """Measure errors for robots that differ from the model.
 
-    The robots differ by more than a parameter. Each model is learned with the preset best. It is trained on
-    two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with twice the tension.
+    The robots differ by more than a parameter. Each model is learned with the training configuration best,
+    from two sines of 30 rows. It predicts 30 s of held-out controls, and of controls with twice the tension.
     Writes imperfections.md, .json and a figure. Resumes an earlier run in the same folder.
     """
     from studies.imperfections import IMPERFECTIONS, rerun
@@ -293,7 +293,7 @@ def data(
 def estimation(out: Out) -> Study:
     """Measure the error of state estimation.
 
-    Compares the paper's method and the best one. Records the virtual robot (simulated, so its true states are
+    Compares the paper's method and the best one. Records the test robot (simulated, so its true states are
     known). Writes the errors of all quantities (estimation.md, .json), a figure, and the bags.
     """
     from studies.estimation import rerun
@@ -474,7 +474,7 @@ def virtual_robots(
     robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots: seeds 0 to N - 1.")] = 20,
     **how: Any,
 ) -> Study:
-    """Identify virtual robots with random, known imperfections.
+    """Identify test robots with random, known imperfections.
 
     Each robot is recorded with noise, identified from three recordings, and evaluated on two others. Writes
     the improvement over the nominal robot, missed and false effects, and the coverage of confidence intervals

@@ -176,9 +176,9 @@ def tracking(settings: Any) -> Product:
 
 
 def on_stand_in(settings: Any) -> Product:
-    """Return the tracking errors of all controllers on the PyElastica stand-in, with its identified model."""
+    """Return the tracking errors of all controllers on the PyElastica test robot, with its model."""
     names, paths = [ADAPTIVE, *CONTROLLERS], references()
-    # a loop around the stand-in takes almost as long as the robot would
+    # a loop around the test robot takes almost as long as the robot would
     few = {name: [] if name in SLOW else list(paths)[:2] for name in CONTROLLERS} if settings["quick"] else {}
     given = {"robot": NOMINAL, "controllers": names, "adaptive": ADAPTIVE, "few": few}
     return Product(stand_in.tracked(given, paths, DT, LIMITS, SECONDS, _rmse), {})

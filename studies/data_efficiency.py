@@ -1,7 +1,7 @@
 """Study of data efficiency: the cells of the paper's table from 5 to 30 rows, of one sine and of two.
 
-Methods with a nominal model are the best preset and the paper's. Methods without one are networks of the same
-size and linear prediction. The latter do not depend on the imperfection and have the same result for each.
+Methods with a nominal model are the best training configuration and the paper's. Methods without one are
+networks of the same size and linear prediction: they have the same result for each imperfection.
 """
 
 from __future__ import annotations

@@ -76,7 +76,7 @@ def rerun(out: Path, quick: bool = False, **how: Any) -> Report:
 
     Args:
         out: the folder; an earlier run in it is continued.
-        quick: shorter trainings and sweeps, and no stand-in.
+        quick: shorter trainings and sweeps, and no test robot.
         how: as `runner.run` has it.
 
     Raises:
@@ -112,7 +112,7 @@ def checks(facts: Mapping[str, Any]) -> list[dict[str, Any]]:
     if "stand-in" in facts:
         # a published figure: any loss is allowed
         gap = facts["stand-in"]["gap"]
-        made.append(check_row("policy on the stand-in: lost part of its score", gap, 1.0))
+        made.append(check_row("policy on the test robot: lost part of its score", gap, 1.0))
     return made
 
 
@@ -252,13 +252,13 @@ def saved(policy: Policy) -> bytes:
 
 
 def real(settings: Any) -> Product:
-    """Train a policy for randomised robots, and report what it loses on the stand-in for a real one."""
+    """Train a policy for randomised robots, and report what it loses on the test robot."""
     randomisation = Randomisation(
         {"youngs_modulus": Factor(0.7, 1.3), "bending_damping": Factor(0.2, 2.0)}, delay=(0, 2), noise=5e-4
     )
     nominal = load_robot("delrin-tendon-robot")
     assert isinstance(nominal, TendonRod)
-    # the tendons of the stand-in are routed ones, not those of the model of the paper
+    # the tendons of the test robot are routed ones, not those of the model of the paper
     environment = make("follow", RoutedTendonRobot.like(nominal), randomisation=randomisation)
     rod = stand_in.true_rod(nominal)
     training = PolicyTraining(environment)

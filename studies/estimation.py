@@ -1,4 +1,4 @@
-"""Study of state estimation: both methods on recordings of the virtual robot, whose states are known."""
+"""Study of state estimation: both methods on recordings of the test robot, whose states are known."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SIGNALS = {"sine": "sine:1.0", "random": "random:0", "step": "step:4.4"}
 SECONDS, NODES = 12.0, 10
 METHODS: tuple[Method, ...] = ("paper", "best")
 #: names of the robots whose balance and constitutive law give n, m and v
-TRUE, CRUDE = "the robot's own", "the paper's knowledge"
+TRUE, CRUDE = "the robot's own", "the paper's nominal model"
 #: title, factor and unit of each quantity in a table
 QUANTITIES = {
     "p": ("position", 1e3, "mm"),
@@ -46,7 +46,7 @@ DRAWN = (1.0, 4.0)
 
 
 def rerun(out: Path, signals: Mapping[str, str] = SIGNALS, seed: int = 0) -> Report:
-    """Record the virtual robot, estimate its states by both methods, and write errors and a figure.
+    """Record the test robot, estimate its states by both methods, and write errors and a figure.
 
     Args:
         out: the folder; the bags are kept there.

@@ -347,7 +347,7 @@ def _rmse_before(log: LoopLog | None, time: float) -> float:
     return float(np.sqrt(np.mean(apart**2))) if len(apart) and np.isfinite(apart).all() else 1e9
 
 
-#: tip RMSE of the PyElastica stand-in in the study `control` (% of length), and the allowed multiple of it
+#: tip RMSE of the PyElastica test robot in the study `control` (% of length), and the allowed multiple of it
 STAND_IN, FACTOR = 0.18, 1.5
 #: jobs that measure a speed
 ALONE = ("repeat", "dds")

@@ -251,7 +251,7 @@ def ratios(cells: Cells, measure: str) -> dict[tuple[str, ...], float | None]:
 def missed(cells: Cells) -> list[tuple[str, ...]]:
     """Return the imperfections and controls in which the learned model misses its target.
 
-    The target is an error of at most `LEFT` times the baseline's in the paper's two metrics; at twice the
+    The target is an error of at most `LEFT` times the baseline's in tip DTW and pose MSE; at twice the
     tension it is at most the baseline's error.
     """
     found = {measure: ratios(cells, measure) for measure in PAPER_MEASURES}

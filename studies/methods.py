@@ -50,7 +50,7 @@ def paper(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> Le
 
 
 def best(imperfect: System, training: Trajectories, seeds: Sequence[int]) -> LearnedSystems:
-    """Return the best preset's model; seeds resample the data's rows, because the fit is deterministic."""
+    """Return the best training configuration's model; seeds resample the rows, since the fit has none."""
     return fitted(imperfect, training, FitConfig(StructuredOptions(resample=True), seed=tuple(seeds)))
 
 

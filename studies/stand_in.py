@@ -1,4 +1,4 @@
-"""Closed loops around a stand-in for a real robot, simulated by PyElastica: recordings, model, controllers.
+"""Closed loops around a test robot that PyElastica simulates: recordings, model, controllers.
 
 The true robot differs from its data sheet: it is softer and less damped, its tendons rub, its motors lag, and
 its sensors are noisy. The model is identified from three recordings; the lag from commanded and measured
@@ -37,8 +37,8 @@ from studies.elastica.plant import ElasticaPlant, Recorded, record_elastica, sin
 from studies.elastica.rod import ElasticaRod, Imperfections
 
 #: name of the robot in the study's tables, and the reason for a study without it
-ROBOT = "PyElastica stand-in, identified"
-MISSING = "PyElastica stand-in: left out, because it needs: pip install '.[studies]'"
+ROBOT = "PyElastica test robot, identified"
+MISSING = "PyElastica test robot: left out, because it needs: pip install '.[studies]'"
 #: true over nominal Young's modulus, and the true damping (N m² s; nominal is 0.03)
 SOFTER, DAMPING = 0.8, 0.01
 #: effects that are identified, beside stiffness and damping
@@ -65,7 +65,7 @@ def is_available() -> bool:
 
 
 def true_rod(nominal: TendonRod) -> ElasticaRod:
-    """Return the stand-in for a real robot."""
+    """Return the test robot."""
     softer = nominal.replace(youngs_modulus=SOFTER * float(nominal.youngs_modulus), bending_damping=DAMPING)
     return ElasticaRod(softer, Imperfections())
 
@@ -172,7 +172,7 @@ def _held(log: LoopLog) -> Any:
 
 
 def checks(cells: Sequence[Mapping[str, Any]], controller: str) -> list[tuple[str, float, float]]:
-    """Return the study's checks of a controller (name, value, limit); none if the stand-in was left out."""
+    """Return the study's checks of a controller (name, value, limit); none if the test robot was left out."""
     own = [cell for cell in cells if cell["robot"] == ROBOT and cell["controller"] == controller]
     moving = [cell["rmse_percent"] for cell in own if cell["reference"] != "steps"]
     steady = [cell["offset_percent"] for cell in own if cell["reference"] == "steps"]

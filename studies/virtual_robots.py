@@ -1,4 +1,4 @@
-"""Study of identification on virtual robots with random imperfections, whose truth is known.
+"""Study of identification on test robots with random imperfections, whose truth is known.
 
 Each robot is recorded as the paper's was, with noisy sensors, lost frames and motors with a lag. It is
 identified from three recordings, a residual is learned on it, and both predict two other recordings.
@@ -64,7 +64,7 @@ def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> li
 
 
 class _Recorded(NamedTuple):
-    """A virtual robot, its training and held-out recordings, and the number of draws before it."""
+    """A test robot, its training and held-out recordings, and the number of draws before it."""
 
     truth: Imperfect
     given: list[Measurements]
@@ -175,7 +175,7 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
     ]
     told = summary(facts)
     lines = [
-        "# Virtual robots with random imperfections",
+        "# Test robots with random imperfections",
         "Simulated recordings with noise. Improvement: mean part by which DTW of the tip and pose MSE are "
         "less than the nominal robot's, on recordings that were not learned from. Orientations: root mean "
         "square angle between predicted and measured ones.",

@@ -340,8 +340,9 @@ def test_fit_tells_what_it_did(data, tmp_path):
     text = succeeded(
         "fit", ROBOT, data / "a.nc", "--set", "length=0.4", "--rows", 12, "--out", tmp_path / "m"
     )
-    assert f"learned a residual model of {ROBOT} from 1 trajectory (12 rows): preset best" in text
-    assert "+0.5875 of the knowledge's length" in text
+    assert f"learned a residual model of {ROBOT} from 1 trajectory (12 rows): training" in text
+    assert ": training configuration best, " in text
+    assert "+0.5875 of the nominal length" in text
     assert text.endswith(f"wrote {tmp_path / 'm'}\n")
 
 
@@ -406,7 +407,7 @@ def test_a_model_is_taken_where_a_robot_is(data, fitted, tmp_path):
     facts = told("info", model)
     assert facts["kind"] == "KNODE"
     assert facts["parameters"]["length"]["value"] == 0.4
-    assert "+0.5875 of the knowledge's length" in succeeded("info", model)
+    assert "+0.5875 of the nominal length" in succeeded("info", model)
     assert facts["found"] == fitted["models"][0]["found"]
     succeeded("plot", out, "--out", tmp_path / "a.png")
 

@@ -106,7 +106,7 @@ def test_trajectories_that_cannot_be_compared_give_one_line(tmp_path, truth):
     )
     result = run("fit", ROBOT, truth, tmp_path / "short.nc", "--set", "nodes=8", "--out", tmp_path / "m")
     assert result.exit_code == 2
-    assert result.stderr.startswith(f"error: {truth} has 10 nodes of 19 numbers; the knowledge has 8")
+    assert result.stderr.startswith(f"error: {truth} has 10 nodes of 19 numbers; the nominal model has 8")
     result = run("info", truth)
     assert result.exit_code == 2
     assert "this is a trajectory" in result.stderr

@@ -103,7 +103,7 @@ def bad_inputs():
         (("fit", ROBOT, "broken.nc", "--out", "m", "--seeds", "1,1"), "several different ones"),
         (("fit", ROBOT, "broken.nc", "--out", "m", "--seed", "1", "--seeds", "1,2"), "give one of them"),
         (("fit", ROBOT, "broken.nc", "--out", "m", "--seed", "-1"), "whole number from 0"),
-        (("fit", ROBOT, "broken.nc", "--out", "m", "--epochs", "5"), "the preset best has none"),
+        (("fit", ROBOT, "broken.nc", "--out", "m", "--epochs", "5"), "training configuration best has none"),
         (("fit", ROBOT, "broken.nc", "--out", "m", "--preset", "paper", "--epochs", "0"), "epochs is 0"),
         (("fit", "nobot", "broken.nc", "--out", "m"), "nobot"),
         (("fit", "broken.model", "broken.nc", "--out", "m"), "broken.model"),

@@ -16,7 +16,7 @@ import knode_cosserat as kc
 def write_table(path, measured, source, simulated_with):
     said = "recorded on a physical robot"
     if simulated_with:
-        said = f"a recording of a SIMULATED stand-in robot ({simulated_with}), not of a physical one"
+        said = f"a recording of a SIMULATED test robot ({simulated_with}), not of a physical one"
     comments = [
         f"source: {source}, exported by tools/export_recording.py",
         f"simulated: {'true' if simulated_with else 'false'}",

@@ -42,7 +42,7 @@ print(
 # %% [markdown]
 # ## An imperfect model
 #
-# The same robot with almost twice the stiffness. The paper's two metrics measure its error, and the
+# The same robot with almost twice the stiffness. Tip DTW and pose MSE measure its error, and the
 # figure shows it over time.
 
 # %%

@@ -13,14 +13,14 @@ import knode_cosserat as kc
 
 DT = 0.05
 robot = kc.load_robot("delrin-tendon-robot")  # stands for the real robot
-knowledge = robot.replace(length=0.4, youngs_modulus=10e9)  # what we believe: too short, and too stiff
+nominal = robot.replace(length=0.4, youngs_modulus=10e9)  # what we believe: too short, and too stiff
 
 # %% [markdown]
 # Two short training motions. For a real robot these are [estimated from a recording](recording_to_control.ipynb).
 
 # %%
 data = [kc.simulate(robot, kc.controls.sine(period, rows, DT), DT) for period in (0.5, 1.0)]
-model = kc.fit(knowledge, data)
+model = kc.fit(nominal, data)
 
 # %% [markdown]
 # ## Learned terms
@@ -41,7 +41,7 @@ print(f"length: {0.4 * (1 + kc.learning.explain(model)[0].coefficient):.6f} m, a
 
 # %%
 unseen = kc.controls.random(steps, low=4.0, high=9.0, seed=1, hold=8)
-truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, knowledge, model))
+truth, before, after = (kc.simulate(each, unseen, DT) for each in (robot, nominal, model))
 for label, found in (("before", before), ("after", after)):
     rmse, mse = kc.metrics.tip_rmse(found, truth), kc.metrics.pose_mse(found, truth)
     print(f"{label:7} tip RMSE {rmse:.1e} m, pose MSE {mse:.1e}e-3")

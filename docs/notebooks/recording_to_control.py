@@ -32,7 +32,7 @@ print("bodies:", ", ".join(body.name for body in recording.bodies), "| simulated
 # ## Estimate the states
 #
 # Motion capture measures a few poses. Velocities, loads and curvature along the rod are estimated; here the tip's
-# velocity beside the true velocity of the virtual robot.
+# velocity beside the true velocity of the simulated robot.
 
 # %%
 crude = kc.load_robot("delrin-tendon-robot")
@@ -46,9 +46,9 @@ kc.figures.states({"truth": truths["sine:1.5"], "estimated": states}, ("q", "w")
 # tests the result. (Without names of parameters, `kc.identify` finds friction as well, and takes longer.)
 
 # %%
-knowledge = kc.robots.RoutedTendonRobot.like(crude)
+nominal = kc.robots.RoutedTendonRobot.like(crude)
 measured = recording.sampled(0.025, mean=True)
-found = kc.identify(knowledge, [measured], parameters=["youngs_modulus", "bending_damping"])
+found = kc.identify(nominal, [measured], parameters=["youngs_modulus", "bending_damping"])
 print(found)
 
 # %% [markdown]
@@ -56,7 +56,7 @@ print(found)
 # narrow. The test is the prediction of the held-out recording:
 
 # %%
-before, after = (kc.simulate(each, unseen.control[:-1], 0.025) for each in (knowledge, found.robot))
+before, after = (kc.simulate(each, unseen.control[:-1], 0.025) for each in (nominal, found.robot))
 for label, each in (("before", before), ("after", after)):
     off = np.sqrt(np.mean(np.sum((each.tip_position - unseen.tip_position) ** 2, axis=1)))
     print(f"{label:7} tip RMSE {100 * off:.2f} cm on the unseen recording")

@@ -1,7 +1,7 @@
 """Distances between a predicted and a reference trajectory, and errors of estimated states.
 
 The distances use NumPy and SciPy on plain arrays. They compare simulated, predicted or recorded data with
-positions and quaternions. The two metrics of the paper's result tables are `tip_dtw` and `pose_mse`; the
+positions and quaternions. The metrics of the paper's result tables are `tip_dtw` and `pose_mse`; the
 paper is Jiahao et al., "Knowledge-based Neural Ordinary Differential Equations for Cosserat Rod-based Soft
 Robots".
 

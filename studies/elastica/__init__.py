@@ -1,1 +1,1 @@
-"""Robots that PyElastica simulates: a stand-in for a real robot."""
+"""Test robots that PyElastica simulates, in the place of a real robot."""

@@ -1,4 +1,4 @@
-"""Time loop of the PyElastica stand-in, compiled by Numba; PyElastica's functions evaluate the rod.
+"""Time loop of the PyElastica test robot, compiled by Numba; PyElastica's functions evaluate the rod.
 
 PyElastica's own time loop calls some twenty Python functions in each step of some microseconds, and takes
 longer for them than for the rod. This loop does the same (`PositionVerlet`, a rod clamped at one end), with

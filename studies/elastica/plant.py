@@ -1,4 +1,4 @@
-"""Stand-in for a real robot: a plant whose motion PyElastica simulates, with friction, lag and noise.
+"""Test robot: a plant whose motion PyElastica simulates, with friction, lag and noise.
 
 Its equations are those of PyElastica's explicit rod, not those of this package. Its tendons rub in their
 holes by the distance that they slide, its motors lag, and its sensors are noisy.
@@ -47,7 +47,7 @@ class ElasticaPlant(Plant):
         """
         if not isinstance(sensor.output, BodyPositions | BodyPoses):
             raise ValueError(
-                f"the sensor measures {type(sensor.output).__name__}; the stand-in has positions and poses "
+                f"the sensor measures {type(sensor.output).__name__}; the test robot has positions and poses "
                 "of bodies: TipPosition, TipPose, BodyPositions, BodyPoses"
             )
         self.rod, self.dt, self.sensor = rod, float(dt), sensor

@@ -84,7 +84,7 @@ class ElasticaRod:
         try:
             from studies.elastica import kernel
         except ImportError:
-            raise ImportError("the stand-in robot needs PyElastica: pip install '.[studies]'") from None
+            raise ImportError("the test robot needs PyElastica: pip install '.[studies]'") from None
         if elements < 3:
             raise ValueError(f"elements is {elements}; allowed is 3 or more")
         _check(robot)
@@ -177,7 +177,7 @@ class ElasticaRod:
         command = np.maximum(np.array(command, dtype=float), 0.0)
         self._kernel.advance(self._rod, self._tendons, self._constants(seconds / steps, drag), command, steps)
         if not np.all(np.isfinite(self._rod.position)):
-            raise RuntimeError("the stand-in's motion is not finite: a time step was not stable")
+            raise RuntimeError("the test robot's motion is not finite: a time step was not stable")
 
     @property
     def tension(self) -> Float[np.ndarray, " c"]:
@@ -215,15 +215,15 @@ def _check(robot: Any) -> None:
     parts |= {name: getattr(robot, name, None) for name in absent}
     for name, part in parts.items():
         if part is not None and part != ():
-            raise ParameterError(f"robot has {name}; the stand-in is a uniform rod with straight tendons")
+            raise ParameterError(f"robot has {name}; the test robot is a uniform rod with straight tendons")
     base: Any = robot.base_end
     pose = (getattr(base, "position", None), getattr(base, "orientation", None))
     if not isinstance(base, Clamped) or robot.tip_end.held or any(each is not None for each in pose):
-        raise ParameterError("the stand-in has a clamped base at the origin, and a free tip")
+        raise ParameterError("the test robot has a clamped base at the origin, and a free tip")
     if not all(isinstance(each, AttachedMass) for each in robot.loads):
-        raise ParameterError("robot has other loads than masses; the stand-in has masses only")
+        raise ParameterError("robot has other loads than masses; the test robot has masses only")
     if float(robot.tendon_offset) <= 0.0:
-        raise ParameterError("tendon_offset is 0; the stand-in's tendons run beside the rod")
+        raise ParameterError("tendon_offset is 0; the test robot's tendons run beside the rod")
 
 
 def _masses(robot: TendonRod, imperfections: Imperfections) -> list[tuple[float, float]]:
@@ -240,7 +240,7 @@ def _isotropic(name: str, value: Any) -> float:
     """
     matrix = np.asarray(value, dtype=float) * np.eye(3)
     if not np.allclose(matrix, matrix[0, 0] * np.eye(3)):
-        raise ParameterError(f"{name} differs by direction; the stand-in's is one number")
+        raise ParameterError(f"{name} differs by direction; the test robot's is one number")
     return float(matrix[0, 0])
 
 

@@ -162,7 +162,7 @@ def test_a_simulated_recording_is_called_one(trajectory, recording):
         axes = figures.prediction_against_measurement(trajectory, recording).axes[0]
         return [text.get_text() for text in axes.get_legend().get_texts()]
 
-    assert labels(recording)[0] == "measured on a simulated stand-in robot"
+    assert labels(recording)[0] == "measured on a simulated robot"
     assert labels(dataclasses.replace(recording, simulated=False))[0] == "measured on a robot"
 
 

@@ -36,15 +36,15 @@ def test_it_draws_what_is_added_to_what_the_knowledge_has(states):
     of = panels["u [1/m]"]
     c0 = 1.0 / (kc.solvers.SDIRK2().ends[0] * DT)
     expected = 0.75 * stiffness / (stiffness + c0 * float(ROBOT.bending_damping[0, 0]))
-    assert np.max(of["added"]) / np.max(of["knowledge"]) == pytest.approx(expected, rel=5e-3)
+    assert np.max(of["added"]) / np.max(of["nominal model"]) == pytest.approx(expected, rel=5e-3)
     # they change only as far as they depend on the strains
     for loads in ("n_s [N/m]", "m_s [N]"):
-        assert np.max(panels[loads]["added"]) < 1e-4 * np.max(panels[loads]["knowledge"])
+        assert np.max(panels[loads]["added"]) < 1e-4 * np.max(panels[loads]["nominal model"])
     first, second = figure.axes[0].get_lines()
     assert matplotlib.colors.to_hex(first.get_color()) != matplotlib.colors.to_hex(second.get_color())
 
 
 def test_states_of_another_robot_are_refused(states):
     model = kc.fit(ROBOT.replace(youngs_modulus=10e9), [states])
-    with pytest.raises(DataError, match=r"20 nodes .* the knowledge has 10"):
+    with pytest.raises(DataError, match=r"20 nodes .* the nominal model has 10"):
         kc.figures.residual(model, kc.simulate(ROBOT.replace(nodes=20), kc.controls.sine(0.5, 5, DT), DT))

@@ -19,7 +19,6 @@ from knode_cosserat.rods.robot_file import format_robot
 from knode_cosserat_hardware import Dimensions, HardwareDescription, Limits
 from knode_cosserat_hardware.cad import PartError, bill_of_materials, export_parts, load_dimensions
 from knode_cosserat_hardware.cad.dimensions import BOARD_LIMIT, capacity, part_dimensions
-from knode_cosserat_hardware.cad.materials import materials_table
 from tests.commands import run, succeeded, told
 
 ROOT = Path(__file__).parents[2]
@@ -177,11 +176,6 @@ def test_the_bill_of_materials_counts_what_the_robot_has():
     for name in ("rib", "spool", "gear motor", "strain gauge", "amplifier", "tendon", "motor bracket"):
         assert counts[name] == 4
     assert counts["dual H-bridge"] == 2 and counts["rod"] == counts["base"] == counts["motor plate"] == 1
-
-
-def test_the_page_has_the_bill_of_materials():
-    page = (ROOT / "docs" / "build-the-robot.md").read_text(encoding="utf-8")
-    assert materials_table(bill_of_materials("delrin-routed-tendon-robot")) in page
 
 
 def test_the_command_prints_the_bill_of_materials():

@@ -53,7 +53,7 @@ def test_the_papers_robot_is_as_the_specification_has_it():
     assert (paper.tension.topic, paper.tension.unit, paper.tension.order) == ("/tension", "gf", (4, 1, 2, 3))
     assert (paper.command.order, paper.command.latency) == ((4, 1, 2, 3), 0.06)
     assert paper.controls == "measured"
-    # it may be the stand-in, which has the same topics
+    # it may be a test robot, which has the same topics
     assert paper.simulated is None
     assert paper.count == 4
 

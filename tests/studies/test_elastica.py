@@ -1,4 +1,4 @@
-"""The PyElastica stand-in: an independent implementation, and a robot with friction, lag and noise."""
+"""The PyElastica test robot: an independent implementation, and a robot with friction, lag and noise."""
 
 import dataclasses
 
@@ -62,9 +62,9 @@ def test_a_planning_controller_predicts_with_the_lag():
     assert errors[True] < 2e-3 and errors[False] > 5.0 * errors[True]
 
 
-# the stand-in; compiling takes some 40 s, once for all processes
+# the test robot; compiling takes some 40 s, once for all processes
 
-elastica = pytest.importorskip("elastica", reason="the stand-in robot needs the extra studies")
+elastica = pytest.importorskip("elastica", reason="the test robot needs the extra studies")
 from studies.elastica.plant import ElasticaPlant, record_elastica  # noqa: E402
 from studies.elastica.rod import PERFECT, ElasticaRod, Imperfections  # noqa: E402
 
@@ -210,7 +210,7 @@ def test_errors_say_what_is_allowed(make, told):
 
 
 def test_a_sensor_that_the_stand_in_has_not_is_refused(rubbing):
-    with pytest.raises(ValueError, match="the sensor measures Curvatures; the stand-in has positions"):
+    with pytest.raises(ValueError, match="the sensor measures Curvatures; the test robot has positions"):
         ElasticaPlant(rubbing, 0.05, Sensor(Curvatures((0.5,))))
 
 

@@ -54,11 +54,11 @@ class _FitMethod(NamedTuple):
     """Method of learning.
 
     Options:
-        preset (--preset): best: structured residual by sparse regression. paper: the paper's network and
-            training. network: a network without the paper's constraints.
+        preset (--preset): Training configuration. best: structured residual by sparse regression. paper:
+            the paper's network and training. network: a network without the paper's constraints.
         seed (--seed N): Random seed. Default: 0.
         seeds (--seeds N,N,…): Several random seeds: train one model for each.
-        epochs (--epochs N): Training epochs of a network. Default: the preset's.
+        epochs (--epochs N): Training epochs of a network. Default: the configuration's.
     """
 
     preset: Literal["best", "paper", "network"] = "best"
@@ -85,8 +85,8 @@ class _FitMethod(NamedTuple):
         if self.preset == "best":
             if self.epochs is not None:
                 raise ValueError(
-                    "--epochs is for networks; the preset best has none. Use --preset paper or --preset "
-                    "network"
+                    "--epochs is for networks; the training configuration best has none. Use --preset paper "
+                    "or --preset network"
                 )
             return FitConfig(StructuredOptions(resample=isinstance(seed, tuple)), seed=seed)
         config = FitConfig.paper(seed) if self.preset == "paper" else FitConfig.network(seed)
@@ -180,7 +180,7 @@ def fit(
     subject = "1 trajectory" if len(training) == 1 else f"{len(training)} trajectories"
     lines = [
         f"learned a residual model of {robot} from {subject} ({count} rows): "
-        f"preset {method.preset}, {seconds:.2f} s"
+        f"training configuration {method.preset}, {seconds:.2f} s"
     ]
     models = []
     for model in result if several else [result]:

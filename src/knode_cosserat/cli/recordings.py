@@ -179,11 +179,11 @@ def _number_text(value: Any, factor: float, form: str) -> str:
     return "-" if value is None else format(factor * value, form)
 
 
-# a virtual robot
+# a test robot
 
 
 class _MotionOptions(NamedTuple):
-    """Motion of a virtual robot, and its noise.
+    """Motion of a test robot, and its noise.
 
     Options:
         signal (CONTROLS): Commanded tensions: sine:PERIOD (s), step:HEIGHT (N, after 2 s) or random:SEED,
@@ -223,7 +223,7 @@ def record_virtual(
             "instead; equal seeds give equal robots.",
             min=0,
             max=2**32 - 1,
-            show_default="the virtual robot",
+            show_default="the test robot",
         ),
     ] = None,
     as_json: Json = False,

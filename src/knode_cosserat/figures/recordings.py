@@ -65,7 +65,7 @@ def prediction_against_measurement(prediction: Tips, recording: Measurements) ->
         )
     distance = np.linalg.norm(predicted - measured, axis=-1)
     dtw, rmse = dtw_distance(predicted, measured), float(rms_distance(predicted, measured))
-    robot = "simulated stand-in robot" if recording.simulated else "robot"
+    robot = "simulated robot" if recording.simulated else "robot"
     time = recording.time
     with new_figure(TWO_COLUMNS, 4.4) as figure:
         figure.suptitle(

@@ -50,7 +50,7 @@ def residual(model: KNODE, trajectory: Trajectory) -> Figure:
         for axis, (field, part, label) in zip(axes, rows, strict=True):
             layout = (y_layout, z_layout)[part]
             own, whole = (layout.get(parts[part], field.name) for parts in (nominal, corrected))
-            for values, colour, name in ((own, "0.6", "knowledge"), (whole - own, PALETTE[0], "added")):
+            for values, colour, name in ((own, "0.6", "nominal model"), (whole - own, PALETTE[0], "added")):
                 size = np.linalg.norm(values, axis=-1).max(axis=1)
                 axis.plot(time, size, color=colour, label=name)
             axis.set_ylabel(label)

@@ -20,7 +20,7 @@ from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 SHARE = 1.0 / 3.0
 #: sizes of an effect's numbers, in standard deviations of their priors
 SIZES = (0.5, 1.5)
-#: data sheet of virtual robots; their training recordings, by name, and the end of the part used (s)
+#: data sheet of test robots; their training recordings, by name, and the end of the part used (s)
 NOMINAL = "delrin-tendon-robot"
 TRAINING = {"sine_1p0": "sine:1.0", "sine_3p0": "sine:3.0", "rand_0": "random:0"}
 END = 7.5
@@ -81,14 +81,14 @@ def imperfect_robot(
 
 
 def nominal_robot() -> TendonRod:
-    """Return the robot of the data sheet of all virtual robots."""
+    """Return the robot of the data sheet of all test robots."""
     robot = load_robot(NOMINAL)
     assert isinstance(robot, TendonRod)
     return robot
 
 
 def drawn_robot(seed: int) -> Imperfect:
-    """Return the virtual robot of a seed: the paper's robot with random imperfections."""
+    """Return the test robot of a seed: the paper's robot with random imperfections."""
     tension = np.concatenate([commands(signal, END).values for signal in TRAINING.values()])
     bodies = [marker.fraction for marker in RecordingConfig.paper_robot().markers]
     return imperfect_robot(nominal_robot(), tension, seed, bodies)

@@ -197,7 +197,7 @@ class RolloutTraining(_Options):
 
 @dataclasses.dataclass(frozen=True)
 class FitConfig(_Options):
-    """Settings of `fit`. `FitConfig()` is the best preset.
+    """Settings of `fit`. `FitConfig()` is the best training configuration.
 
     Attributes:
         residual: kind of residual and its options.

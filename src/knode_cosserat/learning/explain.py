@@ -55,7 +55,7 @@ def explain(model: KNODE) -> list[ExplainedTerm]:
         raise TypeError(f"a {type(residual).__name__} has no terms to read; allowed is a structured residual")
     terms = []
     if float(residual.stretch) != 0.0:
-        terms.append(ExplainedTerm("length", "", "of the knowledge's length", float(residual.stretch), "1"))
+        terms.append(ExplainedTerm("length", "", "of the nominal length", float(residual.stretch), "1"))
     aspect, y_layout = Observed.of(knowledge), knowledge.y_layout
     terms += _terms("stress", knowledge.z_layout, residual.stress, aspect.law_layout)
     fields = Layout(*(field for field in y_layout.fields if field.name in aspect.base_law))

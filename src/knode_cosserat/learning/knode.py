@@ -309,7 +309,7 @@ def _knowledge(described: dict[str, Any], nominal: System | None) -> System:
         raise ContainerError("its 'knowledge' has neither a robot nor traits")
     if nominal is None:
         raise ContainerError(
-            f"its knowledge is a {name[:60]}, which no robot file describes: "
+            f"its nominal model is a {name[:60]}, which no robot file describes: "
             "give it, load_model(path, knowledge=…)"
         )
     _require_same(nominal, name, described["traits"])
@@ -319,7 +319,7 @@ def _knowledge(described: dict[str, Any], nominal: System | None) -> System:
 def _require_same(nominal: System, name: str, traits: dict[str, Any]) -> None:
     if type(nominal).__name__ != name:
         raise ContainerError(
-            f"the knowledge given is a {type(nominal).__name__}; the model was saved with a {name[:60]}"
+            f"the nominal model given is a {type(nominal).__name__}; the model was saved with a {name[:60]}"
         )
 
     def short(value: Any) -> str:
@@ -332,7 +332,7 @@ def _require_same(nominal: System, name: str, traits: dict[str, Any]) -> None:
         arrays = isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
         if not (np.array_equal(one, other) if arrays else repr(one) == repr(other)):  # type: ignore[arg-type]
             raise ContainerError(
-                f"the knowledge given has other {trait[:60]} than the one that the model was saved with: "
+                f"the nominal model given has other {trait[:60]} than the one that the model was saved with: "
                 f"{short(one)}, not {short(other)}"
             )
 
@@ -352,10 +352,10 @@ def _require_fit(model: KNODE) -> None:
         shapes = [part.shape for part in results]
     except Exception as error:  # a residual may raise any error if arrays do not fit
         reason = re.sub(r"<function \S+ at 0x[0-9a-f]+>", "the equations", first_line(error))
-        raise ContainerError(f"residual and knowledge do not fit together: {reason}") from None
+        raise ContainerError(f"residual and nominal model do not fit together: {reason}") from None
     expected = [(ny,), (nz,), (unknown_count(model),)]
     if shapes != expected or length.shape != () or length.dtype.kind not in "fiu" or not np.isfinite(length):
         raise ContainerError(
-            f"residual and knowledge do not fit together: y_s, z, tip have shapes {shapes}; allowed is "
+            f"residual and nominal model do not fit together: y_s, z, tip have shapes {shapes}; allowed is "
             f"{expected}, and a length that is a number, not {length.tolist()}"
         )

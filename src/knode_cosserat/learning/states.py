@@ -37,7 +37,7 @@ from knode_cosserat.trajectory import Trajectory
 
 log = logging.getLogger(__name__)
 
-#: the best preset
+#: the default training configuration
 BEST = FitConfig()
 #: part of the nominal model's error below which a gain is reported as little
 LITTLE = 0.2
@@ -84,7 +84,7 @@ def fit_states(
         Ctrl-C is a `KeyboardInterrupt`, whose `best` is the model so far; its facts have "interrupted".
 
     Raises:
-        DataError: trajectories that do not fit the knowledge or each other, are too short or not finite.
+        DataError: trajectories that do not fit the nominal model or each other, are too short or not finite.
         FitError: training cannot start or continue; the last good checkpoint is kept.
         CheckpointError: a checkpoint belongs to another fit, or is damaged.
         WatchError: metrics are requested and tensorboardX is not installed.

@@ -71,7 +71,7 @@ def load_recording(
 def load_example() -> Recording:
     """Return the package's example: sinusoidal tensions of period 1 s, 16 s long, 20 rows per second.
 
-    The robot was simulated with PyElastica as a stand-in for the paper's robot; it is not a physical one.
+    The robot was simulated with PyElastica in place of the paper's robot; it is not a physical one.
     """
     file = importlib.resources.files("knode_cosserat.recordings") / "data" / EXAMPLE
     with naming(EXAMPLE):

@@ -1,4 +1,4 @@
-"""Recordings of a virtual robot in the paper's format, to test the whole pipeline without a robot.
+"""Recordings of a test robot in the paper's format, to test the whole pipeline without a robot.
 
 Commands, in whole grams-force, reach the tendons through motors with a lag. The robot (`VirtualRobot`) is
 simulated with finer steps and more nodes than models have. Motion capture tracks bodies with arbitrary axes,
@@ -83,7 +83,7 @@ def record_virtual(
     sensors: Sensors = Sensors(),
     robot: TendonRod | None = None,
 ) -> Trajectory:
-    """Record a virtual robot: write its sensor data and return its true motion.
+    """Record a test robot: write its sensor data and return its true motion.
 
     Args:
         path: a bag (.bag, .mcap, .db3) or table (.csv, .parquet) for the paper's configuration.
@@ -115,9 +115,7 @@ def record_virtual(
     sent = commands(signal, seconds)
     truth = driven(sent, sensors.lag, virtual_robot() if robot is None else robot)
     poses, tension = simulated_sensors(truth, sent, seed, sensors)
-    config = RecordingConfig.paper_robot().replace(
-        simulated=True, description=f"a virtual robot, simulated: {signal}"
-    )
+    config = RecordingConfig.paper_robot().replace(simulated=True, description=f"a simulated robot: {signal}")
     write_recording(path, config, poses, tension, sent)
     return truth
 

@@ -261,7 +261,7 @@ RIBS = tuple((k + 1) / 9 for k in range(9))
 
 
 class _VirtualTendons(PulledTendons):
-    """Tendons of a virtual robot: their controls, and the masses of the ribs in which they run."""
+    """Tendons of a test robot: their controls, and the masses of the ribs in which they run."""
 
     def load(self, point: RodPoint) -> Wrench:
         """Return weight less inertia of the ribs per length, each spread along the rod."""

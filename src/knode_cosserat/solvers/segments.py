@@ -199,7 +199,7 @@ def samples(
     `model` that is close to the real robot.
 
     Raises:
-        DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
+        DataError: a trajectory does not fit the nominal model or the others, is too short or not finite.
     """
     _check(knowledge, trajectories)
     ends = _checked_nodes(knowledge, nodes)
@@ -407,13 +407,13 @@ def _check(knowledge: System, trajectories: Sequence[Trajectory]) -> None:
         if shape[1:] != wanted:
             raise DataError(
                 f"{name} has {shape[1]} nodes of {shape[2]} numbers; "
-                f"the knowledge has {wanted[0]} of {wanted[1]}"
+                f"the nominal model has {wanted[0]} of {wanted[1]}"
             )
         controls = np.shape(trajectory.control)[-1]
         if controls != knowledge.control_layout.size:
             names = ", ".join(field.name for field in knowledge.control_layout.fields)
             raise DataError(
-                f"{name} has {controls} controls a row; the knowledge has "
+                f"{name} has {controls} controls a row; the nominal model has "
                 f"{knowledge.control_layout.size} ({names})"
             )
         for what in ("y", "z", "control"):

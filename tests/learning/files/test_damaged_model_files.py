@@ -217,7 +217,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         {"output_scale": None},
         {"c0": np.zeros(())},
     ):
-        with fails("model: residual and knowledge do not fit together: "):
+        with fails("model: residual and nominal model do not fit together: "):
             KNODE(ROBOT, dataclasses.replace(net, **change)).save(tmp_path / "model")
     assert os.listdir(tmp_path) == []
     six_tendons = ROBOT.replace(tendon_angles=np.arange(6.0))
@@ -225,7 +225,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
     assert decoded(text).control_layout.size == 6
 
     fewer = {"residual.input_weights": np.zeros((4, 21))}
-    with fails("model: residual and knowledge do not fit together: "):
+    with fails("model: residual and nominal model do not fit together: "):
         decoded_model(forged(BYTES, arrays=fewer), "model")
     with fails("model: its residual is a Load; allowed is a Residual"):
         decoded_model(
@@ -246,7 +246,7 @@ def test_shapes_that_do_not_fit_together(tmp_path):
         header["about"] = {}
 
     assert decoded(forged(BYTES, impossible, {"about.loss": 0.1})).length == 0.635 * 1.1
-    with fails("model: residual and knowledge do not fit together: length must be between"):
+    with fails("model: residual and nominal model do not fit together: length must be between"):
         decoded_model(forged(BYTES, impossible, {"about.loss": -2.0}), "model")
 
 

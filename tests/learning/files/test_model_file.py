@@ -138,14 +138,14 @@ def test_a_users_knowledge_is_asked_for(tmp_path):
     model = KNODE(STRING, network(STRING))
     path = tmp_path / "model"
     model.save(path)
-    with fails("model: its knowledge is a HangingString", "load_model(path, knowledge=…)"):
+    with fails("model: its nominal model is a HangingString", "load_model(path, knowledge=…)"):
         load_model(path)
     assert_same(load_model(path, knowledge=STRING), model)
-    with fails("the knowledge given is a TendonRobot; the model was saved with a HangingString"):
+    with fails("the nominal model given is a TendonRobot; the model was saved with a HangingString"):
         load_model(path, knowledge=ROBOT)
-    with fails("the knowledge given has other nodes", "9, not 5"):
+    with fails("the nominal model given has other nodes", "9, not 5"):
         load_model(path, knowledge=STRING.replace(nodes=9))
-    with fails("the knowledge given has other density", "0.2, not 0.1"):
+    with fails("the nominal model given has other density", "0.2, not 0.1"):
         load_model(path, knowledge=STRING.replace(density=0.2))
 
 
@@ -154,7 +154,7 @@ def test_a_users_knowledge_of_another_layout_is_turned_down(tmp_path, monkeypatc
     KNODE(STRING, network(STRING)).save(path)
     longer = kc.robots.Layout(*HangingString.y_layout.fields, ("angle", 1, "rad", "angle"))
     monkeypatch.setattr(HangingString, "y_layout", longer)
-    with fails("the knowledge given has other y", "angle", "not"):
+    with fails("the nominal model given has other y", "angle", "not"):
         load_model(path, knowledge=STRING)
 
 
@@ -164,7 +164,7 @@ def test_knowledge_that_is_given_though_the_file_has_it(tmp_path):
     assert_same(load_model(path, knowledge=ROBOT), MODELS["network"])
     with fails("other youngs_modulus", "not 3333333333.3"):
         load_model(path, knowledge=ROBOT.replace(youngs_modulus=1e9))
-    with fails("the knowledge given is a HangingString"):
+    with fails("the nominal model given is a HangingString"):
         load_model(path, knowledge=STRING)
 
 

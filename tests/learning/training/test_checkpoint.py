@@ -212,7 +212,7 @@ def test_another_fit_is_refused(bars, kept):
             (WRONG, bars, dataclasses.replace(CONFIG, segments=other)),
             "segments.learning_rate is 0.01 there and 0.02",
         ),
-        ((BAR, bars, CONFIG), "another knowledge"),
+        ((BAR, bars, CONFIG), "another nominal model"),
         ((WRONG, bars[:1], CONFIG), "other trajectories"),
         ((WRONG, [bars[0][:-1], bars[1]], CONFIG), "other trajectories"),
     ):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -45,12 +44,6 @@ def bill_of_materials(robot: str | Path) -> tuple[Item, ...]:
     with Path(__file__).with_suffix(".csv").open(encoding="utf-8", newline="") as file:
         rows = [[cell.format_map(values) for cell in row] for row in list(csv.reader(file))[1:]]
     return tuple(Item(part, int(count), specification, source) for part, count, specification, source in rows)
-
-
-def materials_table(items: Sequence[Item]) -> str:
-    """Return a bill of materials as a table in Markdown."""
-    rows = [f"| {item.part} | {item.count} | {item.specification} | {item.source} |" for item in items]
-    return "\n".join(["| part | count | specification | source |", "| --- | ---: | --- | --- |", *rows])
 
 
 def _values(part: PartDimensions) -> dict[str, Any]:

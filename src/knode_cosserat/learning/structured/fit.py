@@ -89,7 +89,7 @@ def residuals_of(
     evaluated by the fitted model if the trajectories were simulated.
 
     Raises:
-        DataError: a trajectory does not fit the knowledge or the others, is too short or not finite.
+        DataError: a trajectory does not fit the nominal model or the others, is too short or not finite.
     """
     rounds = 0 if rows_are_states(knowledge, trajectories) else ROUNDS
     data = strand_samples(knowledge, samples(knowledge, trajectories))

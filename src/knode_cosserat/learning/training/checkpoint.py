@@ -63,7 +63,7 @@ class Identity:
         if changed:
             return f"of other settings: {changed}"
         for name, words in (
-            ("knowledge", "another knowledge"),
+            ("knowledge", "another nominal model"),
             ("trajectories", "other trajectories"),
             ("held_out", "other held-out trajectories"),
         ):

@@ -189,7 +189,7 @@ def corrected(net: Network, known: _NominalPredictions) -> tuple[Float[Any, "y S
     """Return the predictions of all samples by nominal model and network, as `segments.predict_segment`.
 
     Hidden units first and the biases as an additional column was the fastest layout tried (0.61 s for 1000
-    epochs of the paper's preset on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
+    epochs of the paper's configuration on one core, 0.54 s with `_product`; samples first 0.69 to 1.0 s).
     """
     first = jnp.concatenate([net.input_weights, net.input_biases[:, None]], axis=1)
     second = _product(net.output_weights, elu(first @ known.inputs)) + net.output_biases[:, None]
