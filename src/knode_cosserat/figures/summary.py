@@ -15,7 +15,6 @@ from knode_cosserat.figures.drawing import (
     curves_of,
     draw_tensions,
     draw_tips,
-    legend_above,
     one_of,
     tips_of,
 )
@@ -49,13 +48,14 @@ def summary(motion: Trajectory, reference: Trajectory | None = None) -> Figure:
     errors = _errors(motion, reference)
     with new_figure(TWO_COLUMNS, 6.4) as figure:
         above, below = figure.subfigures(2, 1, height_ratios=(1.7, 1.0))
-        left, right = above.subfigures(1, 2, width_ratios=(1.15, 1.0))
+        left, right = above.subfigures(1, 2, width_ratios=(1.15, 1.0), wspace=0.06)
         draw_motion(left, motion, 8, checked_view(None, size))
         column = right.subplots(size, 1, sharex=True)
         draw_tips(column, {"": (time, tip)})
         right.align_ylabels()
         controls, error, energy = below.subplots(1, 3)
         draw_tensions(controls, motion)
+        _legend(controls)
         for k, (label, values) in enumerate(errors.items()):
             seen = np.where(values > 0.0, values, np.nan)
             error.plot(time, 1e3 * seen, label=label, color=PALETTE[k], marker="o" * (len(time) == 1))
@@ -63,7 +63,7 @@ def summary(motion: Trajectory, reference: Trajectory | None = None) -> Figure:
         if any(np.any(values > 0.0) for values in errors.values()):
             error.set_yscale("log")
         if errors:
-            legend_above(error)
+            _legend(error)
         else:
             error.text(0.5, 0.5, "not estimated", ha="center", transform=error.transAxes)
         _mark_rows(error, motion)
@@ -72,12 +72,19 @@ def summary(motion: Trajectory, reference: Trajectory | None = None) -> Figure:
             energy.plot(time, values, label=label, color=PALETTE[k], marker="o" * (len(time) == 1))
         energy.set(xlabel="time [s]", ylabel="energy [J]")
         if energies:
-            legend_above(energy)
+            _legend(energy)
         elif len(time) > 1:
             speed = np.linalg.norm(np.gradient(tip, time, axis=0), axis=1)
             energy.plot(time, speed, color=PALETTE[0])
             energy.set_ylabel("speed of the tip [m/s]")
     return figure
+
+
+def _legend(axes: Any) -> None:
+    """Add a legend of two columns above narrow axes."""
+    if axes.get_legend_handles_labels()[1]:
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0)}
+        axes.legend(ncols=2, columnspacing=1.0, handlelength=1.2, **place)
 
 
 def _errors(motion: Trajectory, reference: Trajectory | None) -> dict[str, NDArray[np.float64]]:
@@ -91,7 +98,7 @@ def _errors(motion: Trajectory, reference: Trajectory | None) -> dict[str, NDArr
             raise ValueError(
                 f"the reference has {len(true)} rows and the motion {len(tip)}; both must have the same times"
             )
-        found["tip, from the reference"] = np.linalg.norm(tip - true, axis=1)
+        found["to reference"] = np.linalg.norm(tip - true, axis=1)
     return found
 
 
