@@ -54,11 +54,11 @@ class Pictured:
         points = np.concatenate(far)
         radius = max(float(np.max(shape.radius)) for shape in self.shapes if shape.kind in ("rod", "tube"))
         low, high = points.min(axis=0) - radius, points.max(axis=0) + radius
-        middle, half = 0.5 * (low + high), 0.56 * np.ptp(np.stack([low, high]), axis=0).max()
+        middle, half = 0.5 * (low + high), 0.53 * np.ptp(np.stack([low, high]), axis=0).max()
         hangs = float(np.asarray(motion.system.gravity)[2]) > 0.0
         limits = [(m - half, m + half) for m in middle]
         self.view.axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2][:: -1 if hangs else 1])
-        self.view.axes.set_box_aspect((1, 1, 1), zoom=1.3)
+        self.view.axes.set_box_aspect((1, 1, 1), zoom=1.45)
         self.view.axes.set_axis_off()
 
     def draw(self, row: int) -> None:
@@ -118,9 +118,10 @@ def write(motions: dict[str, kc.Trajectory], out: Path, size: float = 2.5, dpi: 
 def main() -> None:
     """Draw the pictures that are named, or all of them and the one of README."""
     wanted, codes = sys.argv[1:], sections()
-    motions = {name: motion_of(code) for name, code in codes.items() if not wanted or name in wanted}
-    for name, motion in motions.items():
-        write({name: motion}, PICTURES / f"{name}.gif")
+    motions = {}
+    for name in [name for name in codes if not wanted or name in wanted]:
+        motions[name] = motion_of(codes[name])
+        write({name: motions[name]}, PICTURES / f"{name}.gif")
     if set(FOUR) <= set(motions):
         write(
             {title: motions[name] for name, title in FOUR.items()},

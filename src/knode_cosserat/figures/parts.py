@@ -85,7 +85,7 @@ def _colour(shape: Shape, row: int, colour: Any, open_rod: bool) -> Any:
         full = np.array(to_rgb(PALE_ROD))
     if shape.kind == "guide":
         return (*full, 0.35)
-    if np.ndim(shape.value) == 1 and shape.kind in ("chamber", "tendon"):
+    if np.ndim(shape.value) == 1 and look.is_ramp:
         most = float(np.max(np.abs(shape.value))) or 1.0
         level = abs(float(shape.value[row])) / most
         full = level * full + (1.0 - level) * np.array(to_rgb(IDLE))

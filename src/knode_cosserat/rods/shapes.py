@@ -21,6 +21,8 @@ class Look(NamedTuple):
     opacity: float = 1.0
     #: what a checkbox of the viewer names it; "" is always drawn
     group: str = "parts"
+    #: True if the value colours it, from pale to its colour
+    is_ramp: bool = False
 
 
 #: looks by kind, in the order in which they are drawn
@@ -31,8 +33,9 @@ LOOKS = {
     "guide": Look(None, 0.28, "ribs"),
     "disk": Look("#8A94A6", 0.8, "ribs"),
     "mass": Look("#8A94A6", 0.95, "ribs"),
-    "chamber": Look("#D55E00"),
-    "tendon": Look("#D1495B", group="tendons"),
+    "stretch": Look("#D55E00", is_ramp=True),
+    "chamber": Look("#D55E00", is_ramp=True),
+    "tendon": Look("#D1495B", group="tendons", is_ramp=True),
     "magnet": Look("#C8102E"),
     "field": Look("#6A3D9A"),
     "force": Look("#009E73"),

@@ -275,7 +275,8 @@ class PulledTendons(Contribution):
 
     def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
         """Return the tendons along their routes, and thin guides at the nodes of a robot without ribs."""
-        radius, found = float(rod.section.radius), []
+        # thin beside a thick body
+        radius, found = min(0.22 * float(rod.section.radius), 0.004 * float(rod.length)), []
         (field,) = self.control_fields
         routes = tendon_routes(rod, at)
         for k, (end, route) in enumerate(zip(rod.tendon_ends, routes, strict=True)):
@@ -283,7 +284,7 @@ class PulledTendons(Contribution):
             value = control[:, k] if field.size == self.count else None
             found.append(
                 Shape(
-                    "tendon", f"tendon {k + 1}", at[:count], route[:count], 0.22 * radius,
+                    "tendon", f"tendon {k + 1}", at[:count], route[:count], radius,
                     value=value, unit=field.unit,
                 )
             )  # fmt: skip

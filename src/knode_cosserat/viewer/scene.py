@@ -419,7 +419,7 @@ def described(k: int, shape: Shape) -> dict[str, Any]:
     return {
         "kind": shape.kind, "name": shape.name, "array": f"shape{k}", "radii": _short(radii),
         "colour": look.colour, "opacity": look.opacity, "group": look.group, "shade": shape.shade,
-        "unit": shape.unit, "ramp": shape.kind in ("chamber", "tendon") and shape.value is not None,
+        "unit": shape.unit, "ramp": look.is_ramp and shape.value is not None,
     }  # fmt: skip
 
 

@@ -169,7 +169,7 @@ export class RobotModel {
     const { nodes, drawing } = this.track;
     const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.6, transparent: true });
     this.tendonMaterial = material;
-    const radius = Math.max(0.22 * Math.max(...drawing.radii), 0.0014 * this.size);
+    const radius = Math.max(Math.min(0.22 * Math.max(...drawing.radii), 0.004 * drawing.length), 0.0014 * this.size);
     this.tendons = routes.map((route, k) => {
       const count = Math.max(2, Math.round(ends[k] * (nodes - 1)) + 1);
       const tube = new Tube(count, material, { parts: 3, sides: 8, coloured: true });
