@@ -175,8 +175,8 @@ def test_tubes_are_drawn_to_their_own_ends(page):
     arclength = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
     for end, tube in zip(ends, robot.tubes, strict=True):
         nearest = np.argmin(np.linalg.norm(position - end, axis=1))
-        # chords are shorter than the arc
-        assert arclength[nearest] == pytest.approx(0.3 * tube.end, rel=2e-3)
+        # a chord of 0.3 rad, the largest here, is shorter than its arc by 0.3²/24
+        assert arclength[nearest] == pytest.approx(0.3 * tube.end, rel=4e-3)
     assert radii[0] < radii[1] < radii[2] and browser.errors() == []
 
 

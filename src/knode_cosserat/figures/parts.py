@@ -48,7 +48,10 @@ def move_parts(view: View, artists: list[Any], shapes: list[Shape], row: int) ->
         # one line without seams, unless its width changes
         one = np.ndim(radii) == 0 or np.ptp(radii) == 0.0
         radii = np.max(radii) if one else radii
-        artist.set_segments([ends] if one else np.stack([ends[:-1], ends[1:]], axis=1))
+        # pieces of different widths overlap, so that no seam is seen
+        pieces = np.stack([ends[:-1], ends[1:] + 0.4 * (ends[1:] - ends[:-1])], axis=1)
+        pieces[-1, 1] = ends[-1]
+        artist.set_segments([ends] if one else pieces)
         artist.metres = radii
         artist.set_color(_colour(shape, row, artist.colour, "chamber" in inside))
 

@@ -205,7 +205,7 @@ class Sliding(Driven):
         """Return the rail that the end slides along."""
         place, radius = self.joint(rod)
         half = 0.2 * float(rod.length) * np.eye(3)[AXES.index(self.along)]
-        return (bar("joint", "rail", place, half, 0.5 * radius, turns=False),)
+        return (bar("joint", "rail", place, half, 0.15 * radius, turns=False),)
 
     def __check_init__(self) -> None:
         if self.body:

@@ -27,7 +27,7 @@ class Look(NamedTuple):
 
 #: looks by kind, in the order in which they are drawn
 LOOKS = {
-    "fluid": Look("#9CC9E8", 0.25),
+    "fluid": Look("#7FB9E0", 0.45),
     "rod": Look(None, group=""),
     "tube": Look(None, group=""),
     "guide": Look(None, 0.28, "ribs"),
