@@ -90,12 +90,12 @@ class Fluid(_Immersed):
         """Return the layer of fluid that moves with the rod, and an arrow along the stream."""
         radius, length = float(rod.section.radius), float(rod.length)
         sleeve = np.sqrt(1.0 + float(self.added_mass)) * radius
-        about = {"value": float(self.density), "unit": "kg/m3"}
+        about: dict[str, Any] = {"value": float(self.density), "unit": "kg/m3"}
         found = [Shape("fluid", "fluid", at, np.zeros((len(at), 3)), sleeve, **about)]
         stream = np.asarray(self.stream, dtype=float)
         if speed := float(np.linalg.norm(stream)):
             ends = (-0.35 * length * stream / speed, -0.1 * length * stream / speed)
-            more = {"turns": False, "value": speed, "unit": "m/s"}
+            more: dict[str, Any] = {"turns": False, "value": speed, "unit": "m/s"}
             found.append(arrow("fluid", "stream", 0.5, *ends, 0.012 * length, **more))
         return tuple(found)
 

@@ -136,8 +136,8 @@ class DipoleField(MagneticField):
             return ()
         half = 0.5 * FIELD_ARROW * float(rod.length) * moment / size.max()
         radius = 0.03 * float(rod.length)
-        ends = np.broadcast_arrays(position - half, position + half)
-        return (arrow("field", "dipole", None, *ends, radius, value=size[..., 0].max(), unit="A m2"),)
+        about: dict[str, Any] = {"value": size[..., 0].max(), "unit": "A m2"}
+        return (arrow("field", "dipole", None, position - half, position + half, radius, **about),)
 
     def _state(self, control: Any) -> tuple[Any, Any]:
         """Return position and moment (…, 3) under controls (…, k)."""

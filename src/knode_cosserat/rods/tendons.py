@@ -290,8 +290,8 @@ class PulledTendons(Contribution):
             )  # fmt: skip
         if any(isinstance(load, AttachedMass) for load in rod.loads):
             return tuple(found)
-        count = min(len(at), GUIDES)
-        guides = (disk("guide", "guide", k / (count - 1), rim(rod)) for k in range(1, count))
+        count, size = min(len(at), GUIDES), rim(rod) or radius
+        guides = (disk("guide", "guide", k / (count - 1), size) for k in range(1, count))
         return (*found, *guides)
 
 
