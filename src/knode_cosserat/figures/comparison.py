@@ -75,7 +75,7 @@ def draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Traj
 
 def farthest_row(reference: Trajectory, prediction: Trajectory) -> int:
     """Return the row of the largest distance of the tips; 0 if there is none, or other rows."""
-    true, tip = tips_of(reference), tips_of(prediction)
+    true, tip = tips_of(one_of(reference)), tips_of(one_of(prediction))
     if tip.shape != true.shape:
         return 0
     return int(np.argmax(np.nan_to_num(np.linalg.norm(tip - true, axis=1))))

@@ -44,7 +44,7 @@ def move_parts(view: View, artists: list[Any], shapes: list[Shape], row: int) ->
     inside = {shape.kind for shape in shapes}
     for artist, shape in zip(artists, shapes, strict=True):
         points, radii = _line(shape, row)
-        ends = np.stack(view.of(points), axis=-1)
+        ends = np.moveaxis(view.of(points), 0, -1)
         # one line without seams, unless its width changes
         one = np.ndim(radii) == 0 or np.ptp(radii) == 0.0
         radii = np.max(radii) if one else radii

@@ -399,14 +399,19 @@ def _workspace_values(
     samples: Workspace, colour: str | ArrayLike, label: str
 ) -> tuple[NDArray[np.float64], str]:
     """Return the values (B,) that colour a workspace, and the title of their bar."""
-    strains = {field.name: field.unit for field in samples.system.z_layout.fields}
     if not isinstance(colour, str):
-        values = np.asarray(colour, dtype=float)
+        try:
+            values = np.asarray(colour, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"colour is a {type(colour).__name__}; allowed is a name, or one number for each sample"
+            ) from None
         if values.shape != samples.result.shape:
             raise ValueError(
                 f"colour has shape {values.shape}; allowed is {samples.result.shape}, one a sample"
             )
         return values, label
+    strains = {field.name: field.unit for field in samples.system.z_layout.fields}
     if colour == "controls":
         units = {field.unit for field in samples.system.control_layout.fields}
         unit = f" [{units.pop()}]" if len(units) == 1 else ""
