@@ -69,6 +69,11 @@ def test_a_field_keeps_its_direction_while_the_magnets_turn_with_the_rod():
         return (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
 
     np.testing.assert_allclose(direction(field), [0.0, 1.0, 0.0], atol=1e-12)
+    # the live page begins without a field
+    assert [shape.kind for shape in parts("magnetic-catheter", np.zeros(3))[1][1:]] == [
+        "field",
+        *3 * ["magnet"],
+    ]
     for magnet in magnets:
         np.testing.assert_allclose(direction(magnet), [1.0, 0.0, 0.0], atol=1e-12)
 

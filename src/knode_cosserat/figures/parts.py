@@ -51,7 +51,7 @@ def move_parts(view: View, artists: list[Any], shapes: list[Shape], row: int) ->
         # pieces of different widths overlap, so that no seam is seen
         pieces = np.stack([ends[:-1], ends[1:] + 0.4 * (ends[1:] - ends[:-1])], axis=1)
         pieces[-1, 1] = ends[-1]
-        artist.set_segments([ends] if one else pieces)
+        artist.set_segments([ends] if one else pieces if np.ptp(ends, axis=0).any() else [])
         artist.metres = radii
         artist.set_color(_colour(shape, row, artist.colour, "chamber" in inside))
 

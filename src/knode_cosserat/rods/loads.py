@@ -165,9 +165,9 @@ class PointWrench(_Prescribed, PointLoad):
         force, length = np.asarray(self.force, dtype=float), float(rod.length)
         size = float(np.linalg.norm(force))
         scale = control[:, 0] if self.controlled else np.ones(len(control))
-        if not size or not (most := float(np.abs(scale).max())):
+        if not size:
             return ()
-        tail = -0.2 * length * scale[:, None] / most * force / size
+        tail = -0.2 * length * scale[:, None] / (float(np.abs(scale).max()) or 1.0) * force / size
         more: dict[str, Any] = {"turns": self.follows, "value": scale * size, "unit": "N"}
         return (arrow("force", "force", self.at, tail, np.zeros(3), 0.008 * length, **more),)
 

@@ -78,9 +78,9 @@ class UniformField(MagneticField):
         flux = np.asarray(self.flux_density, dtype=float) + (control if self.controlled else 0.0)
         flux = np.broadcast_to(flux, (len(control), 3))
         size = np.linalg.norm(flux, axis=-1)
-        if not size.max():
+        if not self.controlled and not size.max():
             return ()
-        head = FIELD_ARROW * float(rod.length) * flux / size.max()
+        head = FIELD_ARROW * float(rod.length) * flux / (size.max() or 1.0)
         radius = 0.012 * float(rod.length)
         more: dict[str, Any] = {"turns": False, "value": size, "unit": "T"}
         return (arrow("field", "field", 1.0, np.zeros(3), head, radius, **more),)
@@ -132,9 +132,9 @@ class DipoleField(MagneticField):
         """Return an arrow at the dipole along its moment."""
         position, moment = (np.asarray(each) for each in self._state(control))
         size = np.linalg.norm(moment, axis=-1, keepdims=True)
-        if not size.max():
+        if not self.controlled and not size.max():
             return ()
-        half = 0.5 * FIELD_ARROW * float(rod.length) * moment / size.max()
+        half = 0.5 * FIELD_ARROW * float(rod.length) * moment / (size.max() or 1.0)
         radius = 0.03 * float(rod.length)
         about: dict[str, Any] = {"value": size[..., 0].max(), "unit": "A m2"}
         return (arrow("field", "dipole", None, position - half, position + half, radius, **about),)

@@ -181,6 +181,7 @@ class Contribution:
     def shapes(self, rod: Any, at: Float[Any, " n"], control: Float[Any, "rows k"]) -> tuple[Shape, ...]:
         """Return the part's shapes for figures and viewer, under its control in each row; by default none.
 
+        Their number and sizes must not depend on the control's values: the live page fills them step by step.
         `at` are the nodes, as fractions of the grid.
         """
         return ()

@@ -154,6 +154,8 @@ export class RobotModel {
         for (let n = 0; n < shape.count; n++) colour.toArray(shape.colours, 3 * n);
       }
       shape.tube.update(shape.points, shape.radii, shape.ramp ? shape.colours : null);
+      // an arrow without length
+      if (shape.kind === "field" || shape.kind === "force") shape.tube.mesh.scale.setScalar(this.values[shape.index] ? 1 : 1e-9);
       shape.material.opacity = shape.opacity * (moment.solved && !moment.coarse ? 1 : FADED);
     }
   }
