@@ -29,9 +29,9 @@ LONG = "<!-- test: long -->"
 LONG_PAGES = (
     "README.md", "docs/control.md", "docs/optimal-design.md", "docs/environments.md", "docs/estimation.md",
     "docs/gallery.md", "docs/hardware.md", "docs/kinematics.md", "docs/recordings.md",
-    "docs/tutorials/fit.md", "docs/tutorials/control.md", "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md",
-    "docs/tutorials/simulate.md", "docs/two-sections.md", "docs/which-function.md",
-    "docs/your-own-robot.md",
+    "docs/tutorials/fit.md", "docs/tutorials/control.md", "docs/tutorials/gradients.md",
+    "docs/tutorials/several-rods.md", "docs/tutorials/simulate.md", "docs/two-sections.md",
+    "docs/which-function.md", "docs/your-own-robot.md",
 )  # fmt: skip
 #: of these, pages that CI runs too
 SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/tutorials/simulate.md", "docs/which-function.md")
