@@ -25,9 +25,9 @@ $(READY): requirements.lock pyproject.toml hardware/pyproject.toml tools/bootstr
 demo: $(READY) ## simulate, learn, and predict a held-out recording; results in demo/
 	$(BIN)/python examples/demo.py --out demo/
 
-pictures: $(READY) ## run all the examples, and draw their pictures for the documentation
+pictures: $(READY) ## run all the examples and the gallery, and draw their pictures for the documentation
 	$(BIN)/python -m tools.pictures
-	$(BIN)/python -m tools.four_robots
+	$(BIN)/python -m tools.gallery
 
 notebooks: $(READY) ## run the notebooks' texts, and write docs/notebooks/*.ipynb
 	$(BIN)/python -m tools.notebooks

@@ -28,10 +28,10 @@ LONG = "<!-- test: long -->"
 #: pages whose code takes long as a whole: recordings are made and learned from, or many programs compiled
 LONG_PAGES = (
     "README.md", "docs/control.md", "docs/optimal-design.md", "docs/environments.md", "docs/estimation.md",
-    "docs/hardware.md", "docs/kinematics.md", "docs/identification.md", "docs/tutorials/fit.md",
-    "docs/tutorials/control.md", "docs/tutorials/gradients.md", "docs/tutorials/several-rods.md",
-    "docs/tutorials/simulate.md", "docs/two-sections.md", "docs/which-function.md",
-    "docs/your-own-robot.md",
+    "docs/gallery.md", "docs/hardware.md", "docs/kinematics.md", "docs/identification.md",
+    "docs/tutorials/fit.md", "docs/tutorials/control.md", "docs/tutorials/gradients.md",
+    "docs/tutorials/several-rods.md", "docs/tutorials/simulate.md", "docs/two-sections.md",
+    "docs/which-function.md", "docs/your-own-robot.md",
 )  # fmt: skip
 #: of these, pages that CI runs too
 SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/tutorials/simulate.md", "docs/which-function.md")

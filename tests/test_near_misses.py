@@ -176,6 +176,7 @@ FUNCTIONS: dict[Any, dict[str, str]] = {
     kc.figures.overview: {"trajectory": "trajectory"},
     kc.figures.shape: {"trajectory": "trajectory"},
     kc.figures.spread: {"batch": "trajectory"},
+    kc.figures.summary: {"motion": "trajectory"},
     kc.figures.tensions: {"trajectory": "trajectory"},
     kc.figures.states: {"trajectories": "shown"},
     kc.figures.tips: {"trajectories": "motions"},

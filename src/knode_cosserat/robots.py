@@ -1,7 +1,7 @@
 """Robots: their classes and files, and the parts, parameters and layouts of one's own.
 
 Parts are in modules: `chambers`, `ends`, `fluids`, `loads`, `magnets`, `routing`, `section`, `surroundings`,
-`tendons`, `tubes`; the forms of a material's law are in `law`.
+`tendons`, `tubes`; the forms of a material's law are in `law`, and drawings of parts in `shapes`.
 """
 
 from knode_cosserat.rods import (
@@ -13,6 +13,7 @@ from knode_cosserat.rods import (
     magnets,
     routing,
     section,
+    shapes,
     surroundings,
     tendons,
     tubes,
@@ -67,6 +68,7 @@ __all__ = [
     "robot_schema",
     "routing",
     "section",
+    "shapes",
     "surroundings",
     "tendons",
     "tubes",

@@ -83,6 +83,7 @@ def test_what_lives_in_a_plane_moves_too(tmp_path, trajectory):
         hanging,
         time=np.array([0.0, 0.2]),
         y=np.repeat(np.asarray(hanging.y), 2, axis=0),
+        control=np.repeat(np.asarray(hanging.control), 2, axis=0),
         result=np.zeros(2, dtype=int),
     )
     assert len(list(frames_of(kc.figures.animate(two, tmp_path / "string.gif")))) == 6

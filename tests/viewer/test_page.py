@@ -5,6 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
+import knode_cosserat as kc
 from knode_cosserat.viewer import export_scene
 
 
@@ -155,6 +156,28 @@ def test_the_distance_of_the_tips_is_that_of_the_states(page, truth, prediction)
     np.testing.assert_allclose(browser.run("viewer.panels.errors[0].values"), wanted, rtol=1e-4)
     said = browser.run("document.getElementById('error-now').textContent")
     assert said.startswith("to truth: ") and float(said.split()[2]) == pytest.approx(wanted[40], rel=1e-3)
+
+
+def test_a_comparison_opens_where_the_tips_differ_most(page, truth, prediction):
+    browser = page(truth=truth, prediction=prediction)
+    away = np.linalg.norm(np.asarray(truth.tip_position) - np.asarray(prediction.tip_position), axis=1)
+    assert browser.run("viewer.time") == pytest.approx(float(truth.time[np.argmax(away)]))
+    assert page(truth=truth).run("viewer.time") == pytest.approx(float(truth.time[0]))
+
+
+def test_tubes_are_drawn_to_their_own_ends(page):
+    robot = kc.load_robot("three-tube-robot")
+    motion = kc.equilibrium(robot, np.zeros(6))
+    browser = page(tubes=motion)
+    ends = np.array(browser.run("viewer.robots[0].shapes.map((s) => Array.from(s.points.slice(-3)))"))
+    radii = browser.run("viewer.robots[0].shapes.map((s) => s.radii[0])")
+    position = np.asarray(motion.position)[0]
+    arclength = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1)))
+    for end, tube in zip(ends, robot.tubes, strict=True):
+        nearest = np.argmin(np.linalg.norm(position - end, axis=1))
+        # a chord of 0.3 rad, the largest here, is shorter than its arc by 0.3²/24
+        assert arclength[nearest] == pytest.approx(0.3 * tube.end, rel=4e-3)
+    assert radii[0] < radii[1] < radii[2] and browser.errors() == []
 
 
 def test_any_state_of_any_node_is_plotted(page, truth):

@@ -16,6 +16,7 @@ from knode_cosserat.figures.comparison import compare
 from knode_cosserat.figures.page import evaluation_page
 from knode_cosserat.figures.recordings import health, prediction_against_measurement
 from knode_cosserat.figures.residuals import residual
+from knode_cosserat.figures.summary import summary
 from knode_cosserat.figures.trajectories import (
     closed_loop,
     curves,
@@ -33,6 +34,6 @@ from knode_cosserat.figures.trajectories import (
 
 __all__ = [
     "animate", "closed_loop", "compare", "curves", "error", "evaluation_page", "health", "overview", "path",
-    "prediction_against_measurement", "residual", "shape", "spread", "states", "tensions", "tips",
-    "vibration", "workspace",
+    "prediction_against_measurement", "residual", "shape", "spread", "states", "summary", "tensions",
+    "tips", "vibration", "workspace",
 ]  # fmt: skip

@@ -27,7 +27,9 @@ from knode_cosserat.figures.drawing import (
     legend_above,
     valid_rows,
 )
+from knode_cosserat.figures.parts import draw_parts, move_parts, shapes_at
 from knode_cosserat.figures.style import PALETTE, style, width_of
+from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -42,9 +44,10 @@ MOST_FRAMES = 5000
 
 
 class _Moved(NamedTuple):
-    """Lines of a robot (frames, points, d), its tip path, and the number of path rows at each frame."""
+    """Lines of a robot (frames, points, d), its parts, its tip path, and the path's rows at each frame."""
 
     curves: list[NDArray[np.float64]]
+    shapes: list[Shape]
     path: NDArray[np.float64]
     until: NDArray[np.intp]
 
@@ -129,13 +132,24 @@ def _moved(trajectory: Trajectory, seconds: NDArray[np.float64]) -> _Moved:
     at = np.clip(seconds, time[0], time[-1])
     row = np.clip(np.searchsorted(time, at + 1e-9, side="right") - 1, 0, len(time) - 2)
     part = ((at - time[row]) / (time[row + 1] - time[row]))[:, None, None]
-    # exactly at a row the next row is not needed and may be unsolved
-    between = [
-        np.where(part < 1e-6, curve[row], (1.0 - part) * curve[row] + part * curve[row + 1])
-        for curve in curves
-    ]
+
+    def at_frames(points: Any) -> Any:
+        # exactly at a row the next row is not needed and may be unsolved
+        return np.where(part < 1e-6, points[row], (1.0 - part) * points[row] + part * points[row + 1])
+
     path = np.asarray(trajectory.tip_position, dtype=float)
-    return _Moved(between, path, np.searchsorted(np.asarray(trajectory.time), seconds + 1e-9, side="right"))
+    shapes = [
+        shape._replace(
+            offset=at_frames(shape.offset),
+            value=shape.value if np.ndim(shape.value) == 0 else np.asarray(shape.value)[row],
+        )
+        for shape in shapes_at(trajectory, np.arange(len(trajectory.time)))
+        if len(trajectory.time) > 1
+    ]
+    between = [at_frames(curve) for curve in curves]
+    return _Moved(
+        between, shapes, path, np.searchsorted(np.asarray(trajectory.time), seconds + 1e-9, side="right")
+    )
 
 
 def _frames(
@@ -171,8 +185,8 @@ def _frames(
     return _drawn(canvas, seen, list(zip(lines, moved, strict=True)), clock, seconds)
 
 
-def _lines(seen: View, label: str, robot: _Moved, i: int, count: int) -> tuple[list[Any], Any]:
-    """Return the artists of a robot's lines, and of its tip path."""
+def _lines(seen: View, label: str, robot: _Moved, i: int, count: int) -> tuple[list[Any], list[Any], Any]:
+    """Return the artists of a robot's lines, of its parts, and of its tip path."""
     under = i == 0 and count > 1
     colour = "#AAAAAA" if under else PALETTE[max(0, i - 1) % len(PALETTE)]
     width = 4.0 if under else 1.8
@@ -188,11 +202,19 @@ def _lines(seen: View, label: str, robot: _Moved, i: int, count: int) -> tuple[l
         )[0]
         for k in range(len(robot.curves))
     ]
-    return rods, seen.axes.plot(*nothing, color=colour, linewidth=0.45 * width, alpha=0.7, animated=True)[0]
+    parts = draw_parts(seen, robot.shapes, colour)
+    for artist in parts:
+        artist.set_animated(True)
+    path = seen.axes.plot(*nothing, color=colour, linewidth=0.45 * width, alpha=0.7, animated=True)[0]
+    return rods, parts, path
 
 
 def _drawn(
-    canvas: Any, seen: View, robots: list[tuple[tuple[list[Any], Any], _Moved]], clock: Any, seconds: Any
+    canvas: Any,
+    seen: View,
+    robots: list[tuple[tuple[list[Any], list[Any], Any], _Moved]],
+    clock: Any,
+    seconds: Any,
 ) -> Iterator[Image]:
     from PIL import Image
 
@@ -204,10 +226,16 @@ def _drawn(
 
     for k, second in enumerate(seconds):
         canvas.restore_region(background)
-        for (rods, path), robot in robots:
+        for (rods, parts, path), robot in robots:
             put(path, robot.path[: robot.until[k]])
             for rod, curve in zip(rods, robot.curves, strict=True):
                 put(rod, curve[k])
+            if parts and np.isfinite(robot.curves[0][k]).all():
+                move_parts(seen, parts, robot.shapes, k)
+                for artist in sorted(parts, key=lambda one: one.zorder):
+                    if not seen.flat:
+                        artist.do_3d_projection()
+                    seen.axes.draw_artist(artist)
         clock.set_text(f"{second:.2f} s")
         canvas.figure.draw_artist(clock)
         yield Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())

@@ -37,6 +37,8 @@ def looks_of(labels: Iterable[str]) -> dict[str, dict[str, Any]]:
 def compare(reference: Trajectory, predictions: Mapping[str, Trajectory], count: int = 6) -> Figure:
     """Return one figure of the shapes and tips of several predictions, drawn over the reference.
 
+    The shapes are `count`, evenly in time, and that at the largest distance of each prediction's tip.
+
     Raises:
         ImportError: matplotlib is not installed.
         ValueError: there is nothing to draw, or a batch is given.
@@ -56,9 +58,10 @@ def compare(reference: Trajectory, predictions: Mapping[str, Trajectory], count:
 
 
 def draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Trajectory], count: int) -> None:
-    """Draw `count` shapes and the tip paths of a reference and of predictions."""
+    """Draw `count` shapes, those at the largest distances, and tip paths of reference and predictions."""
     true = np.asarray(one_of(reference).position)
-    rows = np.unique(np.linspace(0, len(true) - 1, count).round().astype(int))
+    rows = np.linspace(0, len(true) - 1, count).round().astype(int)
+    rows = np.unique(np.append(rows, [farthest_row(reference, each) for each in predictions.values()]))
     for row in rows:
         axes.plot(*true[row].T, **REFERENCE, solid_capstyle="round")
     axes.plot(*true[:, -1].T, **{**REFERENCE, "linewidth": 2.0}, label="reference")
@@ -68,6 +71,14 @@ def draw_shapes(axes: Any, reference: Trajectory, predictions: Mapping[str, Traj
             axes.plot(*points[row].T, **look)
         axes.plot(*points[:, -1].T, **{**look, "linewidth": 0.9}, label=label)
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+
+
+def farthest_row(reference: Trajectory, prediction: Trajectory) -> int:
+    """Return the row of the largest distance of the tips; 0 if there is none, or other rows."""
+    true, tip = tips_of(one_of(reference)), tips_of(one_of(prediction))
+    if tip.shape != true.shape:
+        return 0
+    return int(np.argmax(np.nan_to_num(np.linalg.norm(tip - true, axis=1))))
 
 
 def show_all(axes: Any, trajectories: Sequence[Trajectory], zoom: float) -> None:

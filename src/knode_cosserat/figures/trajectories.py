@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.figures.comparison import REFERENCE
@@ -29,6 +29,7 @@ from knode_cosserat.figures.drawing import (
     tips_of,
     valid_rows,
 )
+from knode_cosserat.figures.parts import draw_parts, move_parts, shapes_at
 from knode_cosserat.figures.style import (
     PALETTE,
     TIME_COLOURS,
@@ -37,6 +38,7 @@ from knode_cosserat.figures.style import (
     require_matplotlib,
     width_of,
 )
+from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -57,6 +59,7 @@ MOST_POINTS = 100_000
 def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, columns: int = 1) -> Figure:
     """Return a figure of the robot at `count` evenly spaced times, coloured by time, and its tip path.
 
+    Its parts, such as tubes, chambers, tendons and magnets, are drawn at the last of these times.
     The view is in space ("xyz"), or along an axis: "xy", "xz", "yz". Views along an axis show obstacles too.
     """
     check_arguments(shape, locals())
@@ -66,11 +69,12 @@ def shape(trajectory: Trajectory, *, count: int = 12, view: str | None = None, c
     width = width_of(columns)
     height = flat_height(points, view, width, 1.2 if len(trajectory.time) > 1 else 0.6)
     with new_figure(width, height if len(view) == 2 else 0.85 * width) as figure:
-        _draw_shape(figure, trajectory, count, view)
+        draw_motion(figure, trajectory, count, view)
     return figure
 
 
-def _draw_shape(figure: Any, trajectory: Trajectory, count: int, view: str) -> None:
+def draw_motion(figure: Any, trajectory: Trajectory, count: int, view: str) -> None:
+    """Draw shapes at evenly spaced times, the parts at the last of them, and the path of the tip."""
     from matplotlib.cm import ScalarMappable
     from matplotlib.colors import Normalize
 
@@ -84,6 +88,9 @@ def _draw_shape(figure: Any, trajectory: Trajectory, count: int, view: str) -> N
             seen.axes.plot(
                 *seen.of(curve[row]), color=colours.to_rgba(time[row]), linewidth=1.6, solid_capstyle="round"
             )
+    parts = shapes_at(trajectory, shown)
+    artists = draw_parts(seen, parts, colours.to_rgba(time[shown[-1]]))
+    move_parts(seen, artists, parts, len(shown) - 1)
     label = "path of the tip" if len(time) > 1 else None
     seen.axes.plot(*seen.of(path), color="#777777", linewidth=0.8, label=label)
     bases = np.stack([curve[shown[0], 0] for curve in curves[: max(1, len(curves) - 1)]])
@@ -241,7 +248,7 @@ def overview(trajectory: Trajectory, count: int = 12) -> Figure:
     curves = curves_of(one_of(trajectory))
     with new_figure(TWO_COLUMNS, 4.2) as figure:
         left, right = figure.subfigures(1, 2, width_ratios=(1.1, 1.0))
-        _draw_shape(left, trajectory, count, checked_view(None, curves[0].shape[-1]))
+        draw_motion(left, trajectory, count, checked_view(None, curves[0].shape[-1]))
         size = curves[0].shape[-1]
         axes = right.subplots(size + 1, 1, sharex=True, height_ratios=(*[1.0] * size, 1.5))
         draw_tips(axes[:size], {"": (trajectory.time, tips_of(trajectory))})
@@ -351,28 +358,83 @@ def vibration(modes: Modes, *, count: int = 6, columns: int = 2) -> Figure:
     return figure
 
 
-def workspace(samples: Workspace) -> Figure:
-    """Return a figure of a workspace from the side and from above, coloured by the sum of the controls.
+def workspace(samples: Workspace, colour: str | ArrayLike = "controls", *, label: str = "") -> Figure:
+    """Return a figure of a workspace: its volume in space, and its points from the side and from above.
+
+    Args:
+        samples: workspace, of `kc.statics.workspace`.
+        colour: "controls" (their sum), "reach" (distance from the base), the name of a strain (its largest
+            change from rest along the rod), or values (B,), one for each sample, such as a stiffness, or 1
+            where an equilibrium is stable and 0 elsewhere. NaN is not drawn.
+        label: title of the colour bar of values.
 
     Raises:
-        ValueError: no sample is solved, or positions do not have three coordinates.
+        ValueError: no sample is solved, positions do not have three coordinates, or an unknown colour.
     """
     check_arguments(workspace, locals())
     require_matplotlib()
-    if samples.position.shape[1] != 3 or not samples.valid.any():
+    values, label = _workspace_values(samples, colour, label)
+    drawn = samples.valid & np.isfinite(values)
+    if samples.position.shape[1] != 3 or not drawn.any():
         raise ValueError("there is no solved sample with three coordinates to draw")
-    shown = np.flatnonzero(samples.valid)[:MOST_POINTS]
-    x, y, z = samples.position[shown].T
-    total = samples.controls[shown].sum(axis=1)
-    with new_figure(TWO_COLUMNS, 3.2) as figure:
-        for k, (across, up, names) in enumerate(((x, z, "xz"), (x, y, "xy"))):
-            axes = figure.add_subplot(1, 2, k + 1)
-            points = axes.scatter(across, up, c=total, s=1, cmap=TIME_COLOURS, rasterized=True, linewidths=0)
-            axes.set(xlabel=f"{names[0]} [m]", ylabel=f"{names[1]} [m]", aspect="equal")
+    shown = np.flatnonzero(drawn)[:MOST_POINTS]
+    points, values = samples.position[shown], values[shown]
+    look: dict[str, Any] = {"c": values, "s": 1, "cmap": TIME_COLOURS, "linewidths": 0, "rasterized": True}
+    look |= {"vmin": values.min(), "vmax": values.max()}
+    with new_figure(TWO_COLUMNS, 2.9) as figure:
+        grid = figure.add_gridspec(1, 3, width_ratios=(1.2, 1.0, 1.0))
+        for k, view in enumerate(("xyz", "xz", "xy")):
+            seen = View(figure, grid[0, k], view)
+            dots = seen.axes.scatter(*seen.of(points), **look)
+            if seen.flat:
+                seen.axes.set_aspect("equal")
+            else:
+                _draw_hull(seen.axes, points)
+                seen.frame(points, zoom=0.8)
+        figure.colorbar(dots, ax=figure.axes, label=label, shrink=0.8)
+    return figure
+
+
+def _workspace_values(
+    samples: Workspace, colour: str | ArrayLike, label: str
+) -> tuple[NDArray[np.float64], str]:
+    """Return the values (B,) that colour a workspace, and the title of their bar."""
+    if not isinstance(colour, str):
+        try:
+            values = np.asarray(colour, dtype=float)
+        except (TypeError, ValueError):
+            raise ValueError(
+                f"colour is a {type(colour).__name__}; allowed is a name, or one number for each sample"
+            ) from None
+        if values.shape != samples.result.shape:
+            raise ValueError(
+                f"colour has shape {values.shape}; allowed is {samples.result.shape}, one a sample"
+            )
+        return values, label
+    strains = {field.name: field.unit for field in samples.system.z_layout.fields}
+    if colour == "controls":
         units = {field.unit for field in samples.system.control_layout.fields}
         unit = f" [{units.pop()}]" if len(units) == 1 else ""
-        figure.colorbar(points, ax=figure.axes, label=f"sum of the controls{unit}")
-    return figure
+        return samples.controls.sum(axis=1), f"sum of the controls{unit}"
+    if colour == "reach":
+        base = np.asarray(Drawing.of(samples.system).positions(np.asarray(samples.system.rest(0.0)[0])))
+        return np.linalg.norm(samples.position - base, axis=1), "distance from the base [m]"
+    if colour not in strains:
+        names = ", ".join(("controls", "reach", *strains))
+        raise ValueError(f"colour is {colour!r}; allowed is {names}, or an array of values")
+    return samples.peak(colour), f"largest change of {colour} [{strains[colour]}]"
+
+
+def _draw_hull(axes: Any, points: NDArray[np.float64]) -> None:
+    """Draw the convex hull of points, and title it with its volume; points in a plane have none."""
+    from scipy.spatial import ConvexHull, QhullError
+
+    try:
+        hull = ConvexHull(points)
+    except QhullError:
+        return
+    axes.plot_trisurf(*points.T, triangles=hull.simplices, color="#8899AA", alpha=0.12, linewidth=0)
+    axes.set_title(f"convex hull {1e6 * hull.volume:.3g} cm³", pad=0.0)
 
 
 def closed_loop(log: LoopLog) -> Figure:

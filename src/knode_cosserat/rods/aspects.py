@@ -16,6 +16,7 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parts import RodPoint
+from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.rotation import dot, rotation_matrix
 
 
@@ -102,6 +103,20 @@ class Drawing(_Aspect):
     def curves(self, y: Any) -> list[Any]:
         """Return lines (…, points, 3) in m for drawing the states y (…, N, y) of one robot."""
         return [np.asarray(self.positions(y))]
+
+    def parts(self, at: Any, control: Any) -> list[Shape]:
+        """Return the shapes beside one rod with nodes at fractions (N,), for controls (T, c); here none."""
+        return []
+
+    def shapes(self, y: Any, control: Any) -> list[Shape]:
+        """Return the shapes of rods and parts, with positions (T, n, 3), for states (T, N, y)."""
+        y = np.asarray(y, dtype=float)
+        shapes = self.parts(np.linspace(0.0, 1.0, y.shape[1]), control)
+        if not shapes:
+            return []
+        rotation = jax.vmap(jax.vmap(rotation_matrix))(jnp.asarray(self.quaternions(y)))
+        place = (np.asarray(self.positions(y)), np.asarray(rotation))
+        return [shape.placed(*place) for shape in shapes]
 
     def _named(self, y: Any, name: str, meaning: str) -> Any:
         layout = self.system.y_layout

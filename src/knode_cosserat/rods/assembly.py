@@ -30,6 +30,7 @@ from knode_cosserat.rods.loads import BodyInertia, Motion
 from knode_cosserat.rods.parameters import Doubt, ParameterError, parameter, slot, text
 from knode_cosserat.rods.parts import Part, RodPoint, Wrench
 from knode_cosserat.rods.rod import Y_LAYOUT, SlenderRod
+from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.rods.surroundings import ContactLaw, velocity_at
 from knode_cosserat.rods.system import Discontinuities, Scales, System, is_traced
 from knode_cosserat.rotation import cross, quaternion_of, quaternion_product
@@ -494,6 +495,15 @@ class _AssemblyDrawing(Drawing, of=Assembly):
                         star += [places[rod.name][..., node, :], centre]
             curves.append(np.stack(star, axis=-2))
         return [*places.values(), *curves]
+
+    def shapes(self, y: Any, control: Any) -> list[Shape]:
+        """Return the shapes of all rods."""
+        states, controls = self.system.states(np.asarray(y))[0], self.system.controls(control)
+        return [
+            shape._replace(name=f"{own.name} {shape.name}")
+            for own, rod, *row in zip(self.system.rods, self.system.members, states, controls, strict=True)
+            for shape in Drawing.of(rod).shapes(*row)
+        ]
 
 
 class _AssemblyObserved(Observed, of=Assembly):

@@ -33,6 +33,7 @@ from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import Doubt, ParameterError, as_number, choice, known_size, parameter
 from knode_cosserat.rods.parts import Effect, RodPoint, Stretched
 from knode_cosserat.rods.routing import OffsetPaths, path_lengths
+from knode_cosserat.rods.shapes import Shape, nodes_between
 from knode_cosserat.rods.tendon_law import Stretching, Tendons, stretches
 
 #: standard pressure of the atmosphere (Pa)
@@ -191,6 +192,18 @@ class Chambers(Stretched, Effect):
             return float(0.2 * np.mean(self.rest_area) * rod.length)
         lever, area = max(float(self.offset), 1e-6), float(np.mean(self.rest_area))
         return min(float(rod.Kbt[0, 0] / (rod.length * area * lever)), field.high)
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return a line of each chamber's radius along its centres, coloured by its control."""
+        at, paths, (field,) = nodes_between(at, self.begin, self.end), self.paths(rod), self.control_fields
+        centres = np.stack([np.asarray(paths.routes(s * rod.length)[0]) for s in at], axis=1)
+        radii = np.sqrt(np.broadcast_to(self.rest_area, self.count) / np.pi)
+        return tuple(
+            Shape(
+                "chamber", f"chamber {k + 1}", at, centres[k], radii[k], value=control[:, k], unit=field.unit
+            )
+            for k in range(self.count)
+        )  # fmt: skip
 
     def _name(self, rod: Any, field: str) -> str:
         """Return the name of one of the part's fields, which other chambers of the rod may have too."""

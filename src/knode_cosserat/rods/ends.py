@@ -17,6 +17,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, text
 from knode_cosserat.rods.parts import Part
+from knode_cosserat.rods.shapes import Shape, ball, bar
 from knode_cosserat.rotation import conjugate, dot, quaternion_of, quaternion_product, rotation_matrix
 
 #: motions of an end that a control may drive: along a global axis, or about one
@@ -84,6 +85,10 @@ class End(Part):
         h = rest.h if self.orientation is None else self.orientation
         return Pose(jnp.asarray(p), jnp.asarray(h) / jnp.sqrt(jnp.sum(jnp.asarray(h) ** 2)))
 
+    def joint(self, rod: Any) -> tuple[float, float]:
+        """Return the end's place as a fraction of the length, and the radius (m) of its joint's drawing."""
+        return float(rod.tip_end is self), max(2.2 * float(rod.section.radius), 0.012 * float(rod.length))
+
     @abc.abstractmethod
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions, from poses, and n and m less the loads at the tip."""
@@ -123,6 +128,10 @@ class Pinned(End):
     unknowns: ClassVar[tuple[str, ...]] = ("h", "n")
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_POSITION, _MOMENT)
 
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the ball of the joint."""
+        return (ball("joint", "ball joint", *self.joint(rod)),)
+
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the position error, and the residual of zero moment."""
         return jnp.concatenate([y.p - held.p, -m])
@@ -142,6 +151,12 @@ class Universal(Pinned):
         ("turn", 1, "rad", "rotation of the hinges out of their right angle"),
         ("m", 2, "N m", "moment at the tip about the hinges"),
     )
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the cross of the two hinges."""
+        place, radius = self.joint(rod)
+        axes = 2.0 * radius * np.eye(3)[:2]
+        return tuple(bar("joint", "hinge", place, axis, 0.5 * radius) for axis in axes)
 
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the position error, e₁·d₂, and the residual of zero moment about both."""
@@ -185,6 +200,12 @@ class Sliding(Driven):
     )
 
     along: str = choice("the global axis that it slides along", AXES[:3], "z")
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the rail that the end slides along."""
+        place, radius = self.joint(rod)
+        half = 0.2 * float(rod.length) * np.eye(3)[AXES.index(self.along)]
+        return (bar("joint", "rail", place, half, 0.15 * radius, turns=False),)
 
     def __check_init__(self) -> None:
         if self.body:

@@ -35,6 +35,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.loads import Load, Motion, PointLoad
 from knode_cosserat.rods.parameters import parameter
 from knode_cosserat.rods.parts import RodPoint, Wrench
+from knode_cosserat.rods.shapes import Shape, arrow
 from knode_cosserat.rotation import cross, dot
 
 #: diagonal of the projection across the rod
@@ -84,6 +85,19 @@ class Fluid(_Immersed):
     friction: Any = parameter(
         "", "C_f, coefficient of the friction drag, for the diameter", low=0.0, high=100.0, default=0.03
     )
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the layer of fluid that moves with the rod, and an arrow along the stream."""
+        radius, length = float(rod.section.radius), float(rod.length)
+        sleeve = np.sqrt(1.0 + float(self.added_mass)) * radius
+        about: dict[str, Any] = {"value": float(self.density), "unit": "kg/m3"}
+        found = [Shape("fluid", "fluid", at, np.zeros((len(at), 3)), sleeve, **about)]
+        stream = np.asarray(self.stream, dtype=float)
+        if speed := float(np.linalg.norm(stream)):
+            ends = (-0.35 * length * stream / speed, -0.1 * length * stream / speed)
+            more: dict[str, Any] = {"turns": False, "value": speed, "unit": "m/s"}
+            found.append(arrow("fluid", "stream", 0.5, *ends, 0.012 * length, **more))
+        return tuple(found)
 
     def load(self, point: RodPoint) -> Wrench:
         """Return the load of the fluid per length."""

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import Doubt, choice, parameter, place
 from knode_cosserat.rods.parts import Part, RodPoint, Stretched, Wrench
+from knode_cosserat.rods.shapes import Shape, arrow, ball, disk, rim
 from knode_cosserat.rotation import cross, dot, rotation_matrix
 
 
@@ -159,6 +160,17 @@ class PointWrench(_Prescribed, PointLoad):
     force: Any = parameter("N", "force", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
     moment: Any = parameter("N m", "moment", shape="vector", low=-1e9, high=1e9, default=(0.0, 0.0, 0.0))
 
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return an arrow that ends where the force acts."""
+        force, length = np.asarray(self.force, dtype=float), float(rod.length)
+        size = float(np.linalg.norm(force))
+        scale = control[:, 0] if self.controlled else np.ones(len(control))
+        if not size:
+            return ()
+        tail = -0.2 * length * scale[:, None] / (float(np.abs(scale).max()) or 1.0) * force / size
+        more: dict[str, Any] = {"turns": self.follows, "value": scale * size, "unit": "N"}
+        return (arrow("force", "force", self.at, tail, np.zeros(3), 0.008 * length, **more),)
+
     def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return the force and the moment."""
         return self.prescribed(motion, control)
@@ -201,6 +213,14 @@ class AttachedMass(PointLoad):
         high=10.0,
         default=None,
     )
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return a rib of a rod with tendons, and a ball on another."""
+        size, about = rim(rod), {"value": float(self.mass), "unit": "kg"}
+        if size is None:
+            radius = min(2.5 * float(rod.section.radius), 0.03 * float(rod.length))
+            return (ball("mass", "attached mass", self.at, radius, **about),)
+        return (disk("disk", "rib", self.at, size, **about),)
 
     @property
     def body(self) -> BodyInertia:

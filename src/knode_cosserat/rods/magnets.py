@@ -19,16 +19,20 @@ from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.loads import Load, Motion, PointLoad, SpreadLoad
 from knode_cosserat.rods.parameters import Doubt, choice, parameter, slot
 from knode_cosserat.rods.parts import Part, Wrench
+from knode_cosserat.rods.shapes import Shape, arrow
 from knode_cosserat.rotation import cross, dot
 
 #: μ₀/4π (T m/A); CODATA 2022 differs from it by 1e-10 of it
 MU_OVER_4PI = 1e-7
+#: length of the arrows of a field, and of a magnet, as parts of the rod's length
+FIELD_ARROW, MAGNET_ARROW = 0.25, 0.16
 #: square of a distance (m²) far below any magnet's size, so that a dipole's field is finite at its place
 CORE = 1e-18
 
@@ -68,6 +72,18 @@ class UniformField(MagneticField):
         """Three components of the flux density, if it is controlled."""
         fields = tuple(Field(f"B{axis}", 1, "T", f"flux density along {axis}, added") for axis in "xyz")
         return fields if self.controlled else ()
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return an arrow from the tip along the field, as long as the field is strong."""
+        flux = np.asarray(self.flux_density, dtype=float) + (control if self.controlled else 0.0)
+        flux = np.broadcast_to(flux, (len(control), 3))
+        size = np.linalg.norm(flux, axis=-1)
+        if not self.controlled and not size.max():
+            return ()
+        head = FIELD_ARROW * float(rod.length) * flux / (size.max() or 1.0)
+        radius = 0.012 * float(rod.length)
+        more: dict[str, Any] = {"turns": False, "value": size, "unit": "T"}
+        return (arrow("field", "field", 1.0, np.zeros(3), head, radius, **more),)
 
     def flux(self, p: Float[Any, "3"], control: Any) -> Float[Any, "3"]:
         """Return the constant and the control's part."""
@@ -112,13 +128,29 @@ class DipoleField(MagneticField):
         }
         return tuple(field for name in fields if name in self.controlled for field in fields[name])
 
-    def flux(self, p: Float[Any, "3"], control: Any) -> Float[Any, "3"]:
-        """Return B (T); within a nanometre of the dipole it is bounded."""
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return an arrow at the dipole along its moment."""
+        position, moment = (np.asarray(each) for each in self._state(control))
+        size = np.linalg.norm(moment, axis=-1, keepdims=True)
+        if not self.controlled and not size.max():
+            return ()
+        half = 0.5 * FIELD_ARROW * float(rod.length) * moment / (size.max() or 1.0)
+        radius = 0.03 * float(rod.length)
+        about: dict[str, Any] = {"value": size[..., 0].max(), "unit": "A m2"}
+        return (arrow("field", "dipole", None, position - half, position + half, radius, **about),)
+
+    def _state(self, control: Any) -> tuple[Any, Any]:
+        """Return position and moment (…, 3) under controls (…, k)."""
         position, moment = jnp.asarray(self.position), jnp.asarray(self.moment)
         if "position" in self.controlled:
-            position = position + control[:3]
+            position = position + control[..., :3]
         if "moment" in self.controlled:
-            moment = moment + control[-3:]
+            moment = moment + control[..., -3:]
+        return position, moment
+
+    def flux(self, p: Float[Any, "3"], control: Any) -> Float[Any, "3"]:
+        """Return B (T); within a nanometre of the dipole it is bounded."""
+        position, moment = self._state(control)
         r = p - position
         square = jnp.sum(r * r) + CORE
         along = 3.0 * jnp.sum(moment * r) / square
@@ -135,6 +167,15 @@ class _Magnetic(Load):
         """Controls of the field."""
         return self.field.control_fields
 
+    def arrows(self, rod: Any, places: Any, moment: Any) -> tuple[Shape, ...]:
+        """Return arrows of a moment (material frame) at places of the rod, and none of a moment of zero."""
+        moment, size = np.asarray(moment, dtype=float), float(np.linalg.norm(moment))
+        if not size:
+            return ()
+        half = 0.5 * MAGNET_ARROW * float(rod.length) * moment / size
+        radius = max(1.25 * float(rod.section.radius), 0.008 * float(rod.length))
+        return tuple(arrow("magnet", "magnet", place, -half, half, radius) for place in places)
+
 
 class Magnet(_Magnetic, SpreadLoad):
     """A magnetised stretch of the rod."""
@@ -150,6 +191,11 @@ class Magnet(_Magnetic, SpreadLoad):
         default=(0.0, 0.0, 0.0),
         doubt=Doubt(0.2),
     )
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the field's arrow, and three along the stretch."""
+        places = self.begin + (self.end - self.begin) * np.array([0.2, 0.5, 0.8])
+        return (*self.field.shapes(rod, at, control), *self.arrows(rod, places, self.magnetisation))
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return force and couple of the field per length."""
@@ -170,6 +216,10 @@ class PointMagnet(_Magnetic, PointLoad):
         default=(0.0, 0.0, 0.0),
         doubt=Doubt(0.2),
     )
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the arrows of field and magnet."""
+        return (*self.field.shapes(rod, at, control), *self.arrows(rod, [self.at], self.moment))
 
     def wrench(self, motion: Motion, control: Any) -> Wrench:
         """Return force and couple of the field."""

@@ -22,6 +22,7 @@ from knode_cosserat.rods.parameters import Doubt, ParameterError, parameter, slo
 from knode_cosserat.rods.parts import RodPoint
 from knode_cosserat.rods.rod import Y_LAYOUT, Z_LAYOUT, SlenderRod
 from knode_cosserat.rods.section import CrossSection
+from knode_cosserat.rods.shapes import Shape, ball
 from knode_cosserat.rods.strands import Bundle, in_strands
 from knode_cosserat.rods.system import Discontinuities, Scales, System, array_module
 from knode_cosserat.rotation import cross, dot, rotation_matrix
@@ -321,6 +322,22 @@ class _PlatformDrawing(Drawing, of=ParallelRobot):
         order = np.argsort(np.asarray(self.system.platform_angles) % (2.0 * np.pi))
         joints = np.moveaxis(legs[np.append(order, order[0]), ..., -1, :], 0, -2)
         return [*legs, joints]
+
+    def shapes(self, y: Any, control: Any) -> list[Shape]:
+        """Return the legs, the rods of their actuators, and the joints on the platform."""
+        legs = np.moveaxis(np.asarray(self.system.leg_positions(y)), -2, 0)
+        radius, length = float(self.system.strand.section.radius), float(self.system.length)
+        ground = np.array([1.0, 1.0, 0.0])
+        found = []
+        for k, leg in enumerate(legs, 1):
+            base, tip = leg[:, 0], leg[:, -1]
+            found.append(Shape("rod", f"leg {k}", None, leg, radius))
+            fixed = ground * base - np.array([0.0, 0.0, 0.15 * length])
+            actuator = np.stack([fixed, base], axis=1)
+            found.append(Shape("joint", f"actuator {k}", None, actuator, 1.8 * radius))
+            joint = ball("joint", f"joint {k}", 1.0, 2.2 * radius, turns=False)
+            found.append(joint._replace(at=None, offset=tip[:, None] + joint.offset))
+        return found
 
     def positions(self, y: Any) -> Any:
         """Return the robot's axis (…, 3) in m, from states y (…, y); at the tip, the platform's centre."""

@@ -18,6 +18,7 @@ from jaxtyping import Float
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, Parametrised, check_fields, place, slots_of
+from knode_cosserat.rods.shapes import Shape
 
 
 class Wrench(NamedTuple):
@@ -176,6 +177,14 @@ class Contribution:
     def usual_control(self, rod: Any, field: Field) -> float | None:
         """Return a high value of a control, for sliders that begin at zero; None if the unit decides it."""
         return None
+
+    def shapes(self, rod: Any, at: Float[Any, " n"], control: Float[Any, "rows k"]) -> tuple[Shape, ...]:
+        """Return the part's shapes for figures and viewer, under its control in each row; by default none.
+
+        Their number and sizes must not depend on the control's values: the live page fills them step by step.
+        `at` are the nodes, as fractions of the grid.
+        """
+        return ()
 
     # the frame of the robot's states; that of its parts, loads and gravity is the global one
 

@@ -14,11 +14,12 @@ import functools
 import math
 from typing import Any, ClassVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.aspects import Ends, Observed
+from knode_cosserat.rods.aspects import Drawing, Ends, Observed
 from knode_cosserat.rods.camera import Camera
 from knode_cosserat.rods.ends import AT_ORIGIN, Clamped, End, Free, Pose, velocities
 from knode_cosserat.rods.law import Fields, InternalState, MaterialLaw, Viscoelastic
@@ -40,6 +41,7 @@ from knode_cosserat.rods.section import (
     shape_at_rest,
     shear_modulus,
 )
+from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.rods.surroundings import Obstacle
 from knode_cosserat.rods.system import Discontinuities, Scales, System
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
@@ -668,6 +670,32 @@ class RodEnds(Ends, of=SlenderRod):
             for name, value in part.base_rates(point).items():
                 y = rod.y_layout.replaced(y, (name,), value)
         return y
+
+
+class RodDrawing(Drawing, of=SlenderRod):
+    """The rod, and the shapes of its parts."""
+
+    system: SlenderRod
+
+    def parts(self, at: Any, control: Any) -> list[Shape]:
+        """Return the shapes of rod and parts; tubes replace the rod."""
+        rod, control = self.system, np.asarray(control, dtype=float)
+        inputs = rod.inputs(control.T)
+        shapes = [
+            shape
+            for part, input in inputs
+            for shape in part.shapes(rod, at, np.asarray(input).T.reshape(len(control), -1))
+        ]
+        if any(shape.kind == "tube" for shape in shapes):
+            return shapes
+        return [Shape("rod", "rod", at, np.zeros((len(at), 3)), self._radii(at)), *shapes]
+
+    def _radii(self, at: Any) -> Any:
+        rod = self.system
+        if rod.is_uniform:
+            return np.full(len(at), float(rod.section.radius))
+        none = np.zeros(rod.control_layout.size)
+        return np.asarray(jax.vmap(lambda s: rod.material(s, none).radius + 0.0 * s)(at * rod.length))
 
 
 class RodObserved(Observed, of=SlenderRod):

@@ -22,6 +22,7 @@ from knode_cosserat.rods.ends import Pose
 from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, as_number, choice, known_size, parameter, places
 from knode_cosserat.rods.parts import Part, Stretched
+from knode_cosserat.rods.shapes import Shape, nodes_between
 from knode_cosserat.rods.system import is_traced
 from knode_cosserat.rotation import cross, mean_turned, quaternion_of, quaternion_product, rotate
 
@@ -423,6 +424,15 @@ class Stretch(SectionChange):
             elif gain:
                 field = field._replace(high=min(field.high, float(np.nextafter(least / gain, -np.inf))))
         return (field,) if self.controlled else ()
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the stretch as a skin of the rod, coloured by its control; none without one."""
+        if not self.controlled:
+            return ()
+        at, radius = nodes_between(at, self.begin, self.end), 1.02 * float(rod.section.radius)
+        (field,) = self.control_fields
+        line = np.zeros((len(at), 3))
+        return (Shape("stretch", "stretch", at, line, radius, value=control[:, 0], unit=field.unit),)
 
     def winding(self, rod: Any) -> float:
         """Return the angle of a rod with its curvature all along."""

@@ -47,10 +47,12 @@ from jaxtyping import Float
 
 from knode_cosserat.rods.law import Evolution, Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field
+from knode_cosserat.rods.loads import AttachedMass
 from knode_cosserat.rods.parameters import ParameterError, parameter, place, places
 from knode_cosserat.rods.parts import Contribution, Effect, Part, RodPoint
 from knode_cosserat.rods.routing import path_lengths
 from knode_cosserat.rods.section import ABOUT_X, ABOUT_Y, ACROSS, COUPLED
+from knode_cosserat.rods.shapes import Shape, disk, rim, tendon_routes
 from knode_cosserat.rods.tendon_law import Tendons, stretches
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.rotation import dot
@@ -254,6 +256,10 @@ def tension(point: RodPoint) -> Float[Any, " c"]:
     return running(point, T)
 
 
+#: most guides that are drawn of a robot without ribs
+GUIDES = 21
+
+
 @dataclasses.dataclass(frozen=True)
 class PulledTendons(Contribution):
     """Controls of tendons that are pulled with a tension."""
@@ -266,6 +272,27 @@ class PulledTendons(Contribution):
     def control_fields(self) -> tuple[Field, ...]:
         """One tension per tendon."""
         return (Field("tension", self.count, "N", "tendon tension"),)
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return the tendons along their routes, and thin guides at the nodes of a robot without ribs."""
+        # thin beside a thick body
+        radius, found = min(0.22 * float(rod.section.radius), 0.004 * float(rod.length)), []
+        (field,) = self.control_fields
+        routes = tendon_routes(rod, at)
+        for k, (end, route) in enumerate(zip(rod.tendon_ends, routes, strict=True)):
+            count = max(2, round(end * (len(at) - 1)) + 1)
+            value = control[:, k] if field.size == self.count else None
+            found.append(
+                Shape(
+                    "tendon", f"tendon {k + 1}", at[:count], route[:count], radius,
+                    value=value, unit=field.unit,
+                )
+            )  # fmt: skip
+        if any(isinstance(load, AttachedMass) for load in rod.loads):
+            return tuple(found)
+        count, size = min(len(at), GUIDES), rim(rod) or radius
+        guides = (disk("guide", "guide", k / (count - 1), size) for k in range(1, count))
+        return (*found, *guides)
 
 
 @dataclasses.dataclass(frozen=True)

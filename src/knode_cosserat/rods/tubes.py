@@ -31,7 +31,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.law import Fields, MaterialLaw
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.parameters import (
@@ -45,7 +44,7 @@ from knode_cosserat.rods.parameters import (
 )
 from knode_cosserat.rods.parts import Part, RodPoint
 from knode_cosserat.rods.powell import roots
-from knode_cosserat.rods.rod import RodEnds, RodObserved, SlenderRod
+from knode_cosserat.rods.rod import RodDrawing, RodEnds, RodObserved, SlenderRod
 from knode_cosserat.rods.section import (
     ALONG,
     CrossSection,
@@ -55,6 +54,7 @@ from knode_cosserat.rods.section import (
     round_section,
     shear_modulus,
 )
+from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.rods.system import CHOSEN_TURN
 from knode_cosserat.rotation import cross, dot, quaternion_product, rotation_matrix
 
@@ -205,8 +205,8 @@ class _Tubes(CrossSection):
 
     def arclength(self, rod: Any, s: Any, input: Any) -> tuple[Any, Any]:
         """Return the arclength (m) beyond the plate at s on the grid, and its rate along the grid."""
-        curved, ends = self.lengths(rod, input)
-        bounds = [bound for bound in (*curved, *ends) if bound is not None]
+        curved, ends = self._bounds(rod, input)
+        bounds = [*curved, *ends]
         # odd-even transposition sort: the engine has no sort
         for turn in range(len(bounds)):
             for k in range(turn % 2, len(bounds) - 1, 2):
@@ -229,6 +229,25 @@ class _Tubes(CrossSection):
         presence = jnp.where((at < tips) | (tips >= jnp.max(tips)), 1.0, 0.0)
         bent = [1.0 if begin is None else jnp.where(at >= begin, 1.0, 0.0) for begin in curved]
         return presence, presence * self.values("curvature") * jnp.stack(bent)
+
+    def shapes(self, rod: Any, at: Any, control: Any) -> tuple[Shape, ...]:
+        """Return each tube to its end, with its outer radius; the innermost is the darkest."""
+        every = jax.vmap(lambda row: [jnp.stack(each) for each in self._bounds(rod, row) if each])(control)
+        bounds, ends = np.concatenate(every, axis=-1), np.asarray(every[-1])
+        found = []
+        for k, tube in enumerate(self.tubes):
+            # the grid has an interval up to each bound
+            intervals = np.sum(bounds <= ends[:, k : k + 1] + 1e-12, axis=-1)
+            reach = intervals[:, None] / bounds.shape[-1]
+            shade = 0.55 * k / max(1, len(self.tubes) - 1)
+            line, name = np.zeros((len(at), 3)), f"tube {k + 1}"
+            found.append(Shape("tube", name, np.minimum(at, reach), line, float(tube.radius), shade=shade))
+        return tuple(found)
+
+    def _bounds(self, rod: Any, input: Any) -> tuple[list[Any], list[Any]]:
+        """Return the bounds (m) of the grid's intervals: where tubes begin to be curved, and their ends."""
+        curved, ends = self.lengths(rod, input)
+        return [begin for begin in curved if begin is not None], ends
 
     def section(self, rod: Any, part: Any, presence: Any = 1.0) -> Section:
         """Return the sum of the tubes that are present; all of them are at the base."""
@@ -500,7 +519,7 @@ def _shoot(pieces: Any, twist: Any) -> tuple[Any, Any]:
     return states[:, 0], states[:, 1]
 
 
-class _TubesDrawing(Drawing, of=ConcentricTubeRobot):
+class _TubesDrawing(RodDrawing, of=ConcentricTubeRobot):
     """The rod, whose frame does not twist; what is attached to the tip turns with the innermost tube."""
 
     def attached(self, y: Any) -> Any:

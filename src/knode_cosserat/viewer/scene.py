@@ -19,8 +19,7 @@ import numpy as np
 
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Field, Layout
-from knode_cosserat.rods.loads import AttachedMass
-from knode_cosserat.rods.rod import SlenderRod
+from knode_cosserat.rods.shapes import LOOKS, Shape
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.surroundings import Cylinder, Obstacle, Plane, Sphere
 from knode_cosserat.rods.system import System
@@ -243,10 +242,13 @@ def arrays_of(
     position = positions_of(system, y)
     orientation = quaternions_of(system, y)
     curves = drawn_lines(system, y, position)
+    control = np.asarray(trajectory.control, dtype=float)[rows]
+    shapes = separate_shapes(system, y, control)
     arrays = {
         "y": y[:, nodes],
         "z": np.asarray(trajectory.z, dtype=float)[rows][:, nodes],
-        "control": np.asarray(trajectory.control, dtype=float)[rows],
+        "control": control,
+        **shape_arrays(shapes),
     }
     where: dict[str, Any] = {}
     for name, values in (("position", position), ("orientation", orientation)):
@@ -263,7 +265,8 @@ def arrays_of(
     return arrays, {
         **where,
         "curves": [{"shape": curve["shape"], "array": f"curve{k}"} for k, curve in enumerate(curves)],
-        "drawing": drawing(system, nodes),
+        "drawing": drawing(system, nodes)
+        | {"shapes": [described(k, shape) for k, shape in enumerate(shapes)]},
         "fields": fields(system),
         "arclength": np.round(np.asarray(trajectory.arclength, dtype=float)[nodes], 7).tolist(),
     }
@@ -274,6 +277,9 @@ def last_row(system: System, trajectory: Trajectory, names: Sequence[str]) -> np
     nodes, _ = kept(np.shape(trajectory.y), system.z_layout.size)
     y = np.asarray(trajectory.y)[-1:]
     curves = list(Drawing.of(system).curves(y)) if any(name.startswith("curve") for name in names) else []
+    control = np.asarray(trajectory.control)[-1:]
+    shapes = separate_shapes(system, y, control) if "values" in names else []
+    shown = shape_arrays(shapes)
     functions = {
         "y": lambda: y[:, nodes],
         "z": lambda: np.asarray(trajectory.z)[-1:, nodes],
@@ -285,6 +291,8 @@ def last_row(system: System, trajectory: Trajectory, names: Sequence[str]) -> np
     for name in names:
         if name in functions:
             values = functions[name]()
+        elif name in shown:
+            values = shown[name]
         else:
             values = np.asarray(curves[int(name.removeprefix("curve"))])
             values = values[:, nodes] if values.shape[1] == system.nodes else values
@@ -306,10 +314,6 @@ def encoded_array(values: Any, kind: str) -> dict[str, Any]:
 
 #: default radius, as a fraction of the length
 SLIM = 0.006
-#: distance from the axis at which tendons without a route are drawn, in radii of the rod
-BESIDE = 2.5
-#: ratio of the ribs' radius to that of the tendons' circle
-RIM = 1.3
 #: mean tension in the paper (N)
 MEAN_TENSION = 6.0
 #: where sliders may end, between powers of ten
@@ -326,17 +330,14 @@ def physics_of(system: System) -> Any:
 def drawing(system: System, nodes: np.ndarray) -> dict[str, Any]:
     """Return the page's data for drawing a system's states at the given nodes."""
     robot = physics_of(system)
-    s = nodes / max(1, system.nodes - 1) * float(system.length)
-    radii = _radii(robot, s)
-    tendons = _tendons(robot, s, radii)
+    at = nodes / max(1, system.nodes - 1)
     # up is against gravity; planar positions are drawn in x and z
     gravity = np.asarray(getattr(robot, "gravity", np.zeros(3)), dtype=float)
     size = np.linalg.norm(gravity) if gravity.shape == (3,) else 0.0
     return {
         "kind": type(robot).__name__, "model": robot is not system, "length": float(system.length),
         "up": _short(-gravity / size) if size > 0.0 else [0.0, 0.0, 1.0],
-        "radii": _short(radii), "tendons": tendons,
-        "ribs": _ribs(robot, system.nodes, tendons, float(np.mean(radii))),
+        "radii": _short(_radii(robot, at)), "tendons": _tendons(robot, at), "ribs": _ribs(robot, at),
         "obstacles": [_obstacle(obstacle) for obstacle in getattr(robot, "surroundings", ())],
     }  # fmt: skip
 
@@ -346,44 +347,80 @@ def _short(values: Any) -> Any:
     return np.round(np.asarray(values, dtype=float), 7).tolist()
 
 
-def _radii(robot: Any, s: np.ndarray) -> np.ndarray:
-    strand = strand_of(robot)
-    if not isinstance(strand, SlenderRod):
-        return np.full(len(s), float(getattr(robot, "radius", SLIM * float(robot.length))))
-    none = np.zeros(robot.control_layout.size)
-    return np.asarray(jax.vmap(lambda at: strand.material(at, none).radius + 0.0 * at)(s))
+def _parts(robot: Any, at: np.ndarray) -> list[Shape]:
+    """Return the shapes beside a rod with nodes at these fractions, without control."""
+    return Drawing.of(robot).parts(at, np.zeros((1, robot.control_layout.size)))
 
 
-def _tendons(robot: Any, s: np.ndarray, radii: np.ndarray) -> dict[str, Any] | None:
+def _radii(robot: Any, at: np.ndarray) -> np.ndarray:
+    """Return the radius of the rod at each node; of the thinnest tube, in robots of tubes."""
+    found = [shape.radius for shape in _parts(strand_of(robot), at) if shape.kind in ("rod", "tube")]
+    if not found:
+        found = [float(getattr(robot, "radius", SLIM * float(robot.length)))]
+    return np.broadcast_to(min(found, key=np.max), len(at))
+
+
+def _tendons(robot: Any, at: np.ndarray) -> dict[str, Any] | None:
     """Return the tendons' routes (c, nodes, 3) in the material frame, their ends, and their tension."""
-    if not hasattr(robot, "routes_at"):
+    routes = [shape.offset for shape in _parts(robot, at) if shape.kind == "tendon"]
+    if not routes:
         return None
-    if robot.moment_arm is None and not float(robot.tendon_offset):
-        robot = robot.replace(tendon_offset=BESIDE * float(np.max(radii)))
-    where = np.stack(
-        [np.broadcast_to(np.asarray(robot.routes_at(at)[0]), (robot.tendon_count, 3)) for at in s]
-    )
     y, control = robot.y_layout, robot.control_layout
     array, layout = ("control", control) if "tension" in control.names else ("y", y)
     return {
-        "routes": _short(np.moveaxis(where, 0, 1)),
+        "routes": [_short(route) for route in routes],
         "ends": list(robot.tendon_ends),
         "tension": {"array": array, "offset": layout.slice("tension").start},
         "loss": {"array": "y", "offset": y.slice("loss").start} if "loss" in y.names else None,
     }
 
 
-def _ribs(robot: Any, nodes: int, tendons: dict[str, Any] | None, radius: float) -> list[dict[str, Any]]:
-    """Return discs that guide tendons, and masses: at the robot's masses, or else at its nodes."""
-    masses = [load for load in getattr(robot, "loads", ()) if isinstance(load, AttachedMass)]
-    shape, size = "ball", 2.5 * radius
-    if tendons is not None:
-        shape, size = "rib", RIM * max(float(np.linalg.norm(tendons["routes"], axis=-1).max()), 2.0 * radius)
-    if masses or tendons is None:
-        bodies = ((float(load.at), float(load.mass)) for load in masses)
-        return [{"at": at, "shape": shape, "radius": size, "mass": mass} for at, mass in bodies]
-    count = min(nodes, 21)
-    return [{"at": k / (count - 1), "shape": "guide", "radius": size} for k in range(1, count)]
+def _ribs(robot: Any, at: np.ndarray) -> list[dict[str, Any]]:
+    """Return discs that guide tendons, and masses."""
+    names = {"disk": "rib", "mass": "ball", "guide": "guide"}
+    found = []
+    for shape in _parts(robot, at):
+        if shape.kind in names:
+            about = {
+                "at": float(shape.at[0]),
+                "shape": names[shape.kind],
+                "radius": float(np.max(shape.radius)),
+            }
+            found.append(about if shape.value is None else about | {"mass": float(shape.value)})
+    return found
+
+
+def separate_shapes(system: System, y: np.ndarray, control: np.ndarray) -> list[Shape]:
+    """Return the shapes for states (T, N, y) that the page does not draw from the states of one rod."""
+    shapes = Drawing.of(system).shapes(y, control)
+    single = bool(Drawing.of(system).parts(np.linspace(0.0, 1.0, 2), control[:1])) if shapes else False
+    drawn = {"rod", "tendon", "guide", "disk", "mass"} if single else {"rod", "guide"}
+    return [shape for shape in shapes if shape.kind not in drawn]
+
+
+def _few(count: int) -> np.ndarray:
+    return np.unique(np.linspace(0, count - 1, min(count, MOST_NODES)).round().astype(int))
+
+
+def shape_arrays(shapes: Sequence[Shape]) -> dict[str, np.ndarray]:
+    """Return the positions of the points of each shape, and the values that colour them."""
+    if not shapes:
+        return {}
+    rows = len(shapes[0].offset)
+    values = [np.broadcast_to(0.0 if shape.value is None else shape.value, rows) for shape in shapes]
+    points = {f"shape{k}": shape.offset[:, _few(shape.offset.shape[1])] for k, shape in enumerate(shapes)}
+    return {"values": np.stack(values, axis=1), **points}
+
+
+def described(k: int, shape: Shape) -> dict[str, Any]:
+    """Return the page's data of the k-th shape."""
+    look, count = LOOKS[shape.kind], shape.offset.shape[1]
+    radii = np.broadcast_to(shape.radius, count)[_few(count)]
+    return {
+        "kind": shape.kind, "name": shape.name, "array": f"shape{k}", "radii": _short(radii),
+        "colour": look.colour, "opacity": look.opacity, "group": look.group, "shade": shape.shade,
+        "unit": shape.unit, "ramp": look.is_ramp and shape.value is not None,
+    }  # fmt: skip
 
 
 def _obstacle(obstacle: Obstacle) -> dict[str, Any]:

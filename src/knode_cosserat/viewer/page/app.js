@@ -38,7 +38,7 @@ function say(text) {
 class Viewer {
   constructor(scene, tracks, rows) {
     Object.assign(this, { scene, tracks, time: 0, speed: 1, playing: false, frames: 0, told: (scene.notes ?? []).join(" ") });
-    this.parts = { tendons: true, ribs: true, frames: false, path: true, measured: true };
+    this.parts = { tendons: true, ribs: true, parts: true, frames: false, path: true, measured: true };
     $("title").textContent = scene.title;
     for (const track of tracks) track.wanted = true;
     const starts = tracks.map((track) => track.times[0]);
@@ -59,7 +59,28 @@ class Viewer {
     else if (this.span[1] === this.span[0]) document.querySelector("footer").hidden = true;
     onChange(() => this.#repaint());
     this.#seen();
+    if (!scene.live && !rows) this.seek(this.rowTime(this.#farthest()));
     requestAnimationFrame((now) => this.#frame(now));
+  }
+
+  /** The time at which tips, or predicted and measured bodies, are farthest from each other; else the beginning. */
+  #farthest() {
+    const [first, ...others] = this.tracks;
+    let [time, most] = [this.span[0], 0];
+    const consider = (t, distance) => {
+      if (distance > most) [time, most] = [t, distance];
+    };
+    for (const track of this.tracks)
+      if (track.measured) track.tipErrors().forEach((away, row) => consider(track.times[row], away ?? 0));
+    if (most > 0) return time;
+    for (const t of first.times) {
+      const tip = first.tipAt(t);
+      for (const track of others) {
+        const other = track.tipAt(t);
+        if (tip && other) consider(t, Math.hypot(...tip.map((x, k) => x - other[k])));
+      }
+    }
+    return time;
   }
 
   get colours() {

@@ -3,7 +3,7 @@ import * as THREE from "three";
 import { QUANTITY, TENSION, axisColours, rampColour } from "viewer/colours";
 import { Measured } from "viewer/measured";
 import { Tube } from "viewer/tube";
-import { length } from "viewer/units";
+import { length, quantity } from "viewer/units";
 
 const UP = new THREE.Vector3(0, 1, 0);
 const ALONG = new THREE.Quaternion().setFromUnitVectors(UP, new THREE.Vector3(0, 0, 1));
@@ -15,6 +15,9 @@ const FADED = 0.35;
 /** Opacity of an overlay, and its radius in radii of the robot that it surrounds. */
 const OVERLAY = 0.45;
 const AROUND = 2.6;
+/** Opacity of a rod with chambers in it, and the colour of a part whose control is zero. */
+const OPEN = 0.35;
+const IDLE = new THREE.Color("#e4d9d2");
 
 export class RobotModel {
   constructor(track, colour, index, size) {
@@ -31,12 +34,15 @@ export class RobotModel {
     });
     this.points = new Float32Array(3 * nodes);
     this.turns = track.orientation ? new Float32Array(4 * nodes) : null;
-    this.parts = { rods: [], tendons: [], ribs: [], frames: [], path: [], base: [], measured: [] };
+    this.parts = { rods: [], tendons: [], ribs: [], parts: [], frames: [], path: [], base: [], measured: [] };
+    this.shapes = [];
     this.#rods();
+    if (drawing.shapes?.some(({ kind }) => kind === "chamber")) this.material.depthWrite = false;
     this.ribs = [];
     this.bases = [];
     this.baseHeight = 0;
     if (!this.overlay) {
+      this.#shapes(drawing.shapes ?? []);
       if (this.turns && drawing.tendons) this.#tendons(drawing.tendons);
       this.#ribs(drawing.ribs);
       if (this.turns) this.#frames();
@@ -47,7 +53,7 @@ export class RobotModel {
       this.measured = new Measured(track, this.colour, size);
       for (const object of this.measured.objects) this.#add("measured", object, false);
     }
-    this.lines = [...this.#rodLines(), ...this.#tendonLines()];
+    this.lines = [...this.#rodLines(), ...this.#tendonLines(), ...this.#shapeLines()];
   }
 
   #add(part, object, shadow = true) {
@@ -102,11 +108,70 @@ export class RobotModel {
     this.outlines.push({ geometry, points, count });
   }
 
+  /** Parts that have positions of their own: tubes, chambers, magnets, fields, joints … */
+  #shapes(shapes) {
+    const { track, size } = this;
+    // thin tubes are all magnified until the thinnest one is seen
+    const tubes = shapes.filter(({ kind }) => kind === "tube").map(({ radii }) => Math.max(...radii));
+    const magnified = Math.max(1, (0.0035 * size) / Math.min(...tubes, Infinity));
+    this.open = shapes.some(({ kind }) => kind === "chamber"); // seen through the rod
+    this.shapes = shapes.map((about, index) => {
+      const count = track.arrays[about.array].width / 3;
+      const material = new THREE.MeshStandardMaterial({
+        roughness: 0.6, transparent: true, opacity: about.opacity, vertexColors: about.ramp,
+        depthWrite: about.opacity > 0.5, polygonOffset: true, polygonOffsetFactor: this.index, polygonOffsetUnits: this.index,
+      });
+      const curved = about.kind === "tube" ? 3 : 1;
+      const tube = new Tube(count, material, { parts: curved, sides: 16, coloured: about.ramp });
+      const radii = about.radii.map((r) => Math.max(about.kind === "tube" ? magnified * r : r, 0.0012 * size));
+      if (about.radii.length === 4) radii[3] = 0; // the point of an arrow
+      this.#add(about.group || "rods", tube.mesh, about.opacity > 0.5);
+      return { ...about, index, tube, material, radii, count, points: new Float32Array(3 * count), colours: new Float32Array(3 * count) };
+    });
+    const { values, width } = track.arrays.values ?? { values: [], width: 1 };
+    for (const shape of this.shapes) {
+      shape.most = 0;
+      for (let at = shape.index; at < values.length; at += width) shape.most = Math.max(shape.most, Math.abs(values[at]));
+    }
+    this.#recolourShapes();
+  }
+
+  #recolourShapes() {
+    for (const { material, colour, shade, ramp } of this.shapes)
+      material.color.set(ramp ? "#ffffff" : (colour ?? this.colour)).lerp(new THREE.Color("#ffffff"), ramp ? 0 : shade);
+  }
+
+  #moveShapes(moment) {
+    const { track } = this;
+    if (!this.shapes.length) return;
+    this.values = track.whole("values", moment, (this.values ??= new Float32Array(this.shapes.length)));
+    for (const shape of this.shapes) {
+      track.whole(shape.array, moment, shape.points);
+      if (shape.ramp) {
+        const value = Math.abs(this.values[shape.index]);
+        shape.most = Math.max(shape.most, value); // live: the range grows
+        const colour = IDLE.clone().lerp(new THREE.Color(shape.colour), shape.most ? value / shape.most : 0);
+        for (let n = 0; n < shape.count; n++) colour.toArray(shape.colours, 3 * n);
+      }
+      shape.tube.update(shape.points, shape.radii, shape.ramp ? shape.colours : null);
+      // an arrow without length
+      if (shape.kind === "field" || shape.kind === "force") shape.tube.mesh.scale.setScalar(this.values[shape.index] ? 1 : 1e-9);
+      shape.material.opacity = shape.opacity * (moment.solved && !moment.coarse ? 1 : FADED);
+    }
+  }
+
+  #shapeLines() {
+    return this.shapes.map(({ points, count, radii, name, unit, index }) => ({
+      kind: "part", points, count, radius: Math.max(...radii),
+      place: () => (unit ? `${name}: ${quantity(this.values[index], unit)}` : name),
+    }));
+  }
+
   #tendons({ routes, ends }) {
     const { nodes, drawing } = this.track;
     const material = new THREE.MeshStandardMaterial({ vertexColors: true, roughness: 0.6, transparent: true });
     this.tendonMaterial = material;
-    const radius = Math.max(0.22 * Math.max(...drawing.radii), 0.0014 * this.size);
+    const radius = Math.max(Math.min(0.22 * Math.max(...drawing.radii), 0.004 * drawing.length), 0.0014 * this.size);
     this.tendons = routes.map((route, k) => {
       const count = Math.max(2, Math.round(ends[k] * (nodes - 1)) + 1);
       const tube = new Tube(count, material, { parts: 3, sides: 8, coloured: true });
@@ -232,6 +297,8 @@ export class RobotModel {
     this.material.color.copy(colour);
     this.material.emissiveIntensity = quantity ? 0 : 0.22;
     this.material.needsUpdate = true;
+    // the quantity is that of the line within the tubes
+    for (const { kind, tube } of this.shapes) if (kind === "tube") tube.mesh.visible = !quantity;
   }
 
   #quantityColours(moment) {
@@ -263,6 +330,7 @@ export class RobotModel {
       geometry.attributes.position.needsUpdate = true;
       geometry.computeVertexNormals();
     }
+    this.#moveShapes(moment);
     if (this.tendons) this.#pull(moment, range);
     for (const { at, mesh } of this.ribs) this.#place(mesh, at);
     for (const { mesh, rod } of this.bases) {
@@ -274,7 +342,8 @@ export class RobotModel {
     this.measured?.update(moment, this.seen);
     this.path?.until(Math.max(0, this.pathRows.filter((row) => row <= moment.drawn).length - 1));
     const opacity = (moment.solved && !moment.coarse ? 1 : FADED) * (this.overlay ? OVERLAY : 1);
-    for (const material of [this.material, this.tendonMaterial]) if (material) material.opacity = opacity;
+    this.material.opacity = opacity * (this.open ? OPEN : 1);
+    if (this.tendonMaterial) this.tendonMaterial.opacity = opacity;
     if (this.plateMaterial) this.plateMaterial.opacity = PLATE * opacity;
     return moment;
   }
@@ -385,6 +454,7 @@ export class RobotModel {
     if (!this.quantity) this.material.color.set(colour);
     this.material.emissive.set(colour);
     this.#axisColours();
+    this.#recolourShapes();
     this.measured?.recolour(colour);
     this.pathMaterial.color.set(colour);
     this.ghostMaterial.color.set(colour);
