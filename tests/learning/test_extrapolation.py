@@ -178,7 +178,9 @@ def test_tendons_that_pull_together_are_outside_where_each_is_within(down):
     angle = 2.0 * np.pi * np.arange(24) / 24
     turns = 4.0 + 3.0 * np.stack([np.cos(angle + 0.5 * np.pi * k) for k in range(4)], axis=1)
     rows = kc.equilibrium(robot, turns)
-    seen = types.SimpleNamespace(time=np.arange(24.0), z=rows.z[:, 0], control=turns, result=rows.result[:, 0])
+    seen = types.SimpleNamespace(
+        time=np.arange(24.0), z=rows.z[:, 0], control=turns, result=rows.result[:, 0]
+    )
     robot = robot.replace(trained=TrainedRange.of([seen]))
     again = kc.equilibrium(robot, np.concatenate([turns, np.full((1, 4), 6.9)]))
     assert again.extrapolated[:, 0].tolist() == [False] * 24 + [True]

@@ -325,7 +325,7 @@ class TangentEquations(Equations):
                 todo += program.arguments(node)
             elif name != "input":
                 found.add(node)
-        # not those that need more of a step than the results do: an entry of a parameter that they read as an array
+        # not those that need more of a step than the results do, such as an entry of an array of parameters
         hoisted, apart = {*self.step_terms, *self.place_terms}, set[int]()
         for node in program.needed(found, hoisted):
             is_input = program.operations[node][0] == "input" and program.levels[node] != STATE
