@@ -10,8 +10,6 @@ from tests.identification.missing import ROBOT, ROBOTS, equilibria
 
 #: effects that equilibria may show
 EFFECTS = ["tendon offset", "load cell gains", "early anchors", "rest curvature", "taper", "tip mass"]
-#: largest part of the error of unseen rows that is left, of the nominal robot's, and of the identified one's
-LEFT = {"kink": (0.35, 0.8), "rib": (0.6, 0.7), "cable": (0.35, 0.5), "one way": (0.4, 0.6)}
 
 
 @pytest.mark.campaign
@@ -22,9 +20,8 @@ def test_the_residual_carries_what_identification_does_not_know(name):
     model = fit(found, [given])
     assert model.about.facts["residual"], model.about.facts["steps"]
     nominal, identified, learned = (evaluate(it, unseen).tip_rmse for it in (ROBOT, found.robot, model))
-    said = f"{1e3 * nominal:.2f}, {1e3 * identified:.2f}, {1e3 * learned:.2f} mm"
-    of_nominal, of_identified = LEFT[name]
-    assert learned < of_nominal * nominal and learned < of_identified * identified, said
+    print(f"{name}: {1e3 * nominal:.2f}, {1e3 * identified:.2f}, {1e3 * learned:.2f} mm")
+    assert learned < 0.7 * identified and learned < 0.5 * nominal
 
 
 @pytest.mark.slow
