@@ -89,7 +89,7 @@ ROBOTS = {
 }
 
 
-def equilibria(robot, seed, count=72, high=6.0):
+def equilibria(robot, seed, count, high=6.0):
     """Noisy poses of a robot in equilibria under random tensions (N)."""
     rng = np.random.default_rng(seed)
     control = rng.uniform(0.0, high, (count, 4))

@@ -10,18 +10,21 @@ from tests.identification.missing import ROBOT, ROBOTS, equilibria
 
 #: effects that equilibria may show
 EFFECTS = ["tendon offset", "load cell gains", "early anchors", "rest curvature", "taper", "tip mass"]
+#: rows that are given, and the largest part that is left of the identified robot's error of unseen rows
+GIVEN = {"kink": (36, 0.75), "rib": (36, 0.8), "cable": (72, 0.35), "one way": (72, 0.6)}
 
 
 @pytest.mark.campaign
 @pytest.mark.parametrize("name", ROBOTS)
 def test_the_residual_carries_what_identification_does_not_know(name):
-    given, unseen = equilibria(ROBOTS[name], 0), equilibria(ROBOTS[name], 1)
+    count, left = GIVEN[name]
+    given, unseen = equilibria(ROBOTS[name], 0, count), equilibria(ROBOTS[name], 1, count)
     found = kc.identify(ROBOT, [given], effects=EFFECTS)
     model = fit(found, [given])
     assert model.about.facts["residual"], model.about.facts["steps"]
     nominal, identified, learned = (evaluate(it, unseen).tip_rmse for it in (ROBOT, found.robot, model))
     print(f"{name}: {1e3 * nominal:.2f}, {1e3 * identified:.2f}, {1e3 * learned:.2f} mm")
-    assert learned < 0.7 * identified and learned < 0.5 * nominal
+    assert learned < left * identified and learned < 0.5 * nominal
 
 
 @pytest.mark.slow
