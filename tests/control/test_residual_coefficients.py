@@ -20,7 +20,8 @@ TENSION = np.array([4.0, 1.0, 1.0, 2.0])
 
 
 def test_coefficients_are_replaced_by_their_names():
-    assert set(MODEL.coefficients()) == {"first", "second", "third", "fourth", "levers", "damping", "load"}
+    parts = {"first", "second", "third", "fourth", "levers", "tightened", "damping", "load"}
+    assert set(MODEL.coefficients()) == parts
     changed = MODEL.replace(**{"residual.damping": np.array([1.0, 0.0, 0.0, 0.0]), "youngs_modulus": 2e9})
     assert_allclose(changed.residual.damping, [1.0, 0.0, 0.0, 0.0])
     assert float(nominal_model(changed).youngs_modulus) == 2e9

@@ -1,6 +1,7 @@
 """Rows outside the range that a model was trained in are marked, wherever trajectories go."""
 
 import dataclasses
+import types
 
 import jax
 import numpy as np
@@ -168,3 +169,19 @@ def test_each_kind_of_number_is_judged_with_a_margin():
         TrainedRange(one, zero, -one, one)
     with pytest.raises(ParameterError, match="allowed is one number for each component"):
         TrainedRange(one, one, -one, one, np.zeros(4))
+
+
+@pytest.mark.parametrize("down", [(0.0, 0.0, -9.81), (9.81, 0.0, 0.0)], ids=["upright", "lying"])
+def test_tendons_that_pull_together_are_outside_where_each_is_within(down):
+    """Opposite tendons took turns in training: together they compress the rod as nothing did there."""
+    robot = kc.load_robot("delrin-routed-tendon-robot").replace(gravity=down, nodes=5)
+    angle = 2.0 * np.pi * np.arange(24) / 24
+    turns = 4.0 + 3.0 * np.stack([np.cos(angle + 0.5 * np.pi * k) for k in range(4)], axis=1)
+    rows = kc.equilibrium(robot, turns)
+    seen = types.SimpleNamespace(
+        time=np.arange(24.0), z=rows.z[:, 0], control=turns, result=rows.result[:, 0]
+    )
+    robot = robot.replace(trained=TrainedRange.of([seen]))
+    again = kc.equilibrium(robot, np.concatenate([turns, np.full((1, 4), 6.9)]))
+    assert again.extrapolated[:, 0].tolist() == [False] * 24 + [True]
+    assert "1 of 25 rows" in again.extrapolation

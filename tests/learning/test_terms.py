@@ -108,3 +108,19 @@ def test_a_file_holds_a_model(tmp_path):
     found = kc.load_model(tmp_path / "model")
     for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(model), strict=True):
         assert np.array_equal(one, other)
+
+
+@pytest.mark.slow
+def test_tangents_of_equilibria_are_those_of_differences():
+    """Of a rod with tendons beside it, by all numbers of which the functions of controls are an array."""
+    robot = kc.robots.RoutedTendonRobot.like(ROBOT, tendon_offset=0.02)
+    empty = terms(robot, CONTROLS[:12], moving=False)
+    begin, along = (drawn(empty, seed=seed).coefficients() for seed in (4, 5))
+
+    def tip(part):
+        coefficients = {name: 0.3 * begin[name] + part * along[name] for name in begin}
+        model = kc.KNODE(robot, empty.with_coefficients(coefficients))
+        return kc.equilibrium(model, CONTROLS[0], space="lobatto4").tip_position[0]
+
+    _, slope = jax.jvp(tip, (0.0,), (1.0,))
+    np.testing.assert_allclose(slope, (tip(1e-4) - tip(-1e-4)) / 2e-4, rtol=1e-5, atol=1e-9)

@@ -50,6 +50,35 @@ def test_a_stiffening_rod_bends_to_a_circle(cubic):
     assert found.tip_position[0, 2] == pytest.approx(height, rel=1e-9)
 
 
+class Stiffer(Effect):
+    """Bending that is stiffer by `more`, as a stiffness or as a moment."""
+
+    more: Any = parameter("N m2", "stiffness more", low=0.0, high=1e3)
+    nonlinear: Any = parameter("", "part of it that is a moment", low=0.0, high=1.0)
+
+    def law(self, point, law, internal):
+        bending, more = law.strains["u"], self.more * np.diag([1.0, 1.0, 0.0])
+        moment = Partial(lambda more, u, u_t: jnp.sum(more * u, axis=1), self.nonlinear * more)
+        stiffness = bending.stiffness + (1.0 - self.nonlinear) * more
+        return law.with_strain("u", bending._replace(stiffness=stiffness, moment=moment))
+
+
+@pytest.mark.slow
+def test_a_moment_acts_beside_tendons():
+    """A linear moment is a stiffness, also where tendons couple the strains; it was ignored there."""
+    nominal = kc.load_robot("delrin-routed-tendon-robot").replace(nodes=7)
+    pulled = np.tile([6.0, 2.0, 0.0, 0.0], (4, 1))
+    tips = {}
+    for part in (0.0, 1.0):
+        robot = nominal.replace(effects=(Stiffer(0.5 * float(nominal.Kbt[0, 0]), part),))
+        still = kc.equilibrium(robot, pulled[0])
+        moved = kc.simulate(robot, pulled, 0.05, initial="unstressed")
+        tips[part] = np.concatenate([still.tip_position, moved.tip_position])
+    np.testing.assert_allclose(tips[1.0], tips[0.0], rtol=0.0, atol=1e-8)
+    plain = kc.equilibrium(nominal, pulled[0]).tip_position
+    assert np.linalg.norm(tips[1.0][0] - plain[0]) > 1e-2
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

@@ -325,7 +325,13 @@ class TangentEquations(Equations):
                 todo += program.arguments(node)
             elif name != "input":
                 found.add(node)
-        return sorted(found)
+        # not those that need more of a step than the results do, such as an entry of an array of parameters
+        hoisted, apart = {*self.step_terms, *self.place_terms}, set[int]()
+        for node in program.needed(found, hoisted):
+            is_input = program.operations[node][0] == "input" and program.levels[node] != STATE
+            if node not in hoisted and (is_input or not apart.isdisjoint(program.arguments(node))):
+                apart.add(node)
+        return sorted(found - apart)
 
     def _pull(self, results: dict[str, list[int]], moved: np.ndarray) -> None:
         program = self.program

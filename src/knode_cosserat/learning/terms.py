@@ -4,6 +4,7 @@
                tendon needs more in length, where reels take tendons in
     bending    curvature more than by the nominal law, of the first to the fourth degree in the moment
     levers     curvature more, in proportion to each tendon's tension
+    tightened  curvature more, in proportion to each tendon's tension times the moment
     damping    Kelvin-Voigt damping of bending; not negative
     load       force per length in the global frame
 
@@ -165,6 +166,7 @@ class Terms(Residual):
         *(f"{name}.weights" for name in CONTROL),
         *BENDING,
         "levers",
+        "tightened",
         "damping",
         "load",
     )
@@ -180,6 +182,8 @@ class Terms(Residual):
     fourth: Float[Any, "places 5"] | None = None
     #: curvature in proportion to the tension of each tendon
     levers: Float[Any, "places 2 tendons"] | None = None
+    #: curvature in proportion to the products of both components of the moment with all tensions
+    tightened: Float[Any, "places 2 products"] | None = None
     damping: Float[Any, " places"] | None = None
     load: Float[Any, "places 3"] | None = None
 
@@ -199,7 +203,7 @@ class Terms(Residual):
         law = knowledge.constitutive(s, t, y, y_t, control)
         energy = [(degree, value) for degree, name in enumerate(BENDING, 1)
                   if (value := getattr(self, name)) is not None]  # fmt: skip
-        if not energy and self.levers is None and self.damping is None:
+        if not energy and self.levers is None and self.tightened is None and self.damping is None:
             return law
         L, (kappa, time, tension) = knowledge.length, self.units
         rest = Observed.of(knowledge).unstressed(s, control)
@@ -211,16 +215,20 @@ class Terms(Residual):
             if isinstance(law, InternalState):
                 return InternalState(law.evolutions, lambda internal: changed(law.law(internal)))
             u, more = law.strains["u"], jnp.zeros(2)
-            if energy:
+            if energy or self.tightened is not None:
                 # the rod's own part of the moment
                 moment = u.stress - dot(u.stiffness, unbent["u"])
                 if law.coupling is not None:
                     moment = moment - law.coupling.stresses(unbent)["u"]
                 bent = L / kappa * moment[:2]
-                more = sum(_bending(degree, hats(s / L, value), bent) for degree, value in energy)
-            if self.levers is not None:
+                more = sum((_bending(degree, hats(s / L, value), bent) for degree, value in energy), more)
+            if self.levers is not None or self.tightened is not None:
                 pulled = _tensions(knowledge, y, control) / tension
+            if self.levers is not None:
                 more = more + BENT * dot(hats(s / L, self.levers), pulled)
+            if self.tightened is not None:
+                products = (bent[:, None] * pulled).reshape(-1)
+                more = more + BENT * dot(hats(s / L, self.tightened), products)
             u = u._replace(stress=u.stress + dot(u.stiffness, jnp.append(more, 0.0)) / L)
             if self.damping is not None:
                 damping = kappa * time * _not_negative(hats(s / L, self.damping))
@@ -294,7 +302,7 @@ def terms(knowledge: System, controls: Float[np.ndarray, "rows c"], moving: bool
         parts["load"] = np.zeros((PLACES, 3))
         if "tension" in (*knowledge.y_layout.names, *knowledge.control_layout.names):
             count = len(_tensions(knowledge, sizes, np.zeros(knowledge.control_layout.size)))
-            parts["levers"] = np.zeros((PLACES, 2, count))
+            parts |= {"levers": np.zeros((PLACES, 2, count)), "tightened": np.zeros((PLACES, 2, 2 * count))}
             # of tendons at a tenth of the length from the axis
             tension = 10.0 * kappa / float(knowledge.length) ** 2
         if moving:

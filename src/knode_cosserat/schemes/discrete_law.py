@@ -173,6 +173,11 @@ class MaterialStep:
         """Return strains and internal variables in the order of z."""
         if self.law.coupling is None:
             strains = {name: self._strain(name) for name in self.elastic}
+        elif moments := {name: it.moment for name, it in self.law.strains.items() if it.moment is not None}:
+            law = _CoupledStrains(
+                self.elastic, moments, self.law.coupling, self.c0, self.history, self.length
+            )
+            strains = law.split(_solution(law))
         else:
             strains = self.law.coupling.strains(self.elastic)
         values = strains | self._internal(strains)
@@ -203,10 +208,7 @@ class MaterialStep:
         strain, elastic = self.law.strains[name], self.elastic[name]
         if strain.moment is None:
             return elastic.strain()
-        law = _NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length)
-        # the search is not differentiated: one more correction has the derivatives of the implicit function
-        found = _search(jax.lax.stop_gradient(law))
-        return found + law.correction(found)
+        return _solution(_NonlinearStrain(elastic, strain.moment, self.c0, self.history[name], self.length))
 
     def _internal(self, strains: Fields) -> Fields:
         """Return all internal variables for these strains."""
@@ -269,18 +271,80 @@ class _NonlinearStrain(NamedTuple):
         """Return Newton's correction."""
         return -dot(inverse(jax.jacfwd(self.residual)(strain)), self.residual(strain))
 
+    @property
+    def start(self) -> Float[Any, "3"]:
+        """Strain from which it is searched: without sliding, friction makes no correction overshoot."""
+        moving = self.c0 > 0.0
+        return jnp.where(moving, -self.h / jnp.where(moving, self.c0, 1.0), self.elastic.strain())
 
-def _search(law: _NonlinearStrain) -> Float[Any, "3"]:
-    """Return the strain by Newton's method with a line search; NaN if it does not converge."""
-    moving = law.c0 > 0.0
-    # without sliding, friction does not make the first corrections overshoot
-    start = jnp.where(moving, -law.h / jnp.where(moving, law.c0, 1.0), law.elastic.strain())
+    def size(self, strain: Float[Any, "3"]) -> Any:
+        """Return the size of the terms of the law."""
+        nonlinear = jnp.abs(self.moment(strain, jnp.zeros_like(strain)))
+        return jnp.max(_sizes(self.elastic, strain, self.length) + nonlinear)
+
+
+def _sizes(elastic: Elastic, strain: Float[Any, "3"], length: Any) -> Float[Any, "3"]:
+    """Return the sizes of the terms of an elastic law."""
     # a straight rod at rest has no moments, only rounding errors of the tendons' that cancel
-    elastic = dot(jnp.abs(law.elastic.softened), jnp.abs(start) + 1.0 / law.length)
-    size = jnp.max(elastic + jnp.abs(law.elastic.stress) + jnp.abs(law.moment(start, jnp.zeros_like(start))))
+    return dot(jnp.abs(elastic.softened), jnp.abs(strain) + 1.0 / length) + jnp.abs(elastic.stress)
+
+
+class _CoupledStrains(NamedTuple):
+    """Laws of strains with a coupling and nonlinear moments, for one time step."""
+
+    elastic: dict[str, Elastic]
+    #: of the strains that have one
+    moments: dict[str, Any]
+    coupling: Any
+    c0: Any
+    history: Fields
+    #: length of the rod (m)
+    length: Any
+
+    def split(self, strains: Float[Any, "6"]) -> Fields:
+        """Return the strains by their names."""
+        return {"v": strains[:3], "u": strains[3:]}
+
+    def residual(self, strains: Float[Any, "6"]) -> Float[Any, "6"]:
+        """Return the residual of the laws."""
+        values = self.split(strains)
+        stresses = self.coupling.stresses(values)
+        left = {name: self.elastic[name].residual(value) + stresses[name] for name, value in values.items()}
+        for name, moment in self.moments.items():
+            left[name] = left[name] + moment(values[name], self.c0 * values[name] + self.history[name])
+        return jnp.concatenate([left["v"], left["u"]])
+
+    def correction(self, strains: Float[Any, "6"]) -> Float[Any, "6"]:
+        """Return Newton's correction."""
+        return -dot(small_inverse(jax.jacfwd(self.residual)(strains)), self.residual(strains))
+
+    @property
+    def start(self) -> Float[Any, "6"]:
+        """Strains from which they are searched: those without moments."""
+        found = self.coupling.strains(self.elastic)
+        return jnp.concatenate([found["v"], found["u"]])
+
+    def size(self, strains: Float[Any, "6"]) -> Float[Any, "6"]:
+        """Return the sizes of the terms of the laws."""
+        values = self.split(strains).items()
+        largest = [jnp.max(_sizes(self.elastic[name], value, self.length)) for name, value in values]
+        return jnp.concatenate([jnp.stack([each] * 3) for each in largest])
+
+
+def _solution(law: Any) -> Float[Any, " n"]:
+    """Return the solution of a law with nonlinear moments, with its derivatives."""
+    # the search is not differentiated: one more correction has the derivatives of the implicit function
+    found = _search(jax.lax.stop_gradient(law))
+    return found + law.correction(found)
+
+
+def _search(law: Any) -> Float[Any, " n"]:
+    """Return the strains by Newton's method with a line search; NaN if it does not converge."""
+    start = law.start
+    size = law.size(start)
 
     def unsolved(strain: Any) -> Any:
-        return ~(jnp.max(jnp.abs(law.residual(strain))) <= TOLERANCE * size)
+        return ~(jnp.max(jnp.abs(law.residual(strain)) - TOLERANCE * size) <= 0.0)
 
     def continues(state: Any) -> Any:
         strain, count = state
@@ -289,7 +353,7 @@ def _search(law: _NonlinearStrain) -> Float[Any, "3"]:
     def corrected(state: Any) -> Any:
         strain, count = state
         tried = strain + PARTS[:, None] * law.correction(strain)
-        left = jax.vmap(lambda strain: jnp.sum(law.residual(strain) ** 2))(tried)
+        left = jax.vmap(lambda strain: jnp.sum((law.residual(strain) / size) ** 2))(tried)
         return tried[jnp.argmin(left)], count + 1
 
     strain, _ = jax.lax.while_loop(continues, corrected, (start, 0))
