@@ -2,6 +2,8 @@
 
 Each robot is recorded as the paper's was, with noisy sensors, lost frames and motors with a lag. It is
 identified from three recordings, a residual is learned on it, and both predict two other recordings.
+
+In equilibria, under random tensions, many more are identified in the same time.
 """
 
 from __future__ import annotations
@@ -12,16 +14,20 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
-from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.evaluate import LEVEL, Evaluation, evaluate
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import identify
 from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
 from knode_cosserat.identification.result import Identified
+from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import DT, Measurements
-from knode_cosserat.recordings.virtual import record_virtual
+from knode_cosserat.recordings.virtual import PLANT_NODES, Sensors, record_virtual
 from knode_cosserat.schemes.result import SimulationError
+from knode_cosserat.solvers.equilibrium import equilibria
+from knode_cosserat.solvers.places import seen_positions, seen_quaternions
 from studies.report import Report, markdown_table, write_report
 from studies.runner import Job, Product, run
 
@@ -33,20 +39,26 @@ START = 0.5
 DRAWS, APART = 5, 1000
 
 
-def jobs(seeds: Sequence[int]) -> list[Job]:
+#: equilibria to identify from, and to predict; range of their tensions, and the noise of their means (N)
+EQUILIBRIA, LOW, HIGH, NOISE = 60, 1.0, 8.0, 0.01
+
+
+def jobs(seeds: Sequence[int], static: bool = False) -> list[Job]:
     """Return one job for each robot."""
-    return [Job(f"robot-{seed}", robot_facts, {"seed": seed}) for seed in seeds]
+    work, name = (static_facts, "static-robot") if static else (robot_facts, "robot")
+    return [Job(f"{name}-{seed}", work, {"seed": seed}) for seed in seeds]
 
 
-def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
+def rerun(out: Path, seeds: Sequence[int], static: bool = False, **how: Any) -> Report:
     """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
         out: the folder; an earlier run in it is continued.
         seeds: one for each robot.
+        static: identify in equilibria, not in motions.
         how: as `runner.run` has it.
     """
-    facts = list(run(jobs(seeds), out, **how).values())
+    facts = list(run(jobs(seeds, static), out, **how).values())
     return write_report(out, "virtual_robots", facts, as_markdown(facts))
 
 
@@ -61,6 +73,63 @@ def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> li
             record_virtual(path, signal, END + 0.5, 100 * seed + k, robot=robot)
             found.append(load_recording(path).sampled(DT, START, END, mean=True))
     return found
+
+
+def equilibria_of(truth: Imperfect, seed: int) -> Measurements:
+    """Return measured equilibria of a robot under random tensions; those without a solution are left out."""
+    random, sensors = np.random.default_rng(seed), Sensors()
+    robot = truth.model.robot(truth.x).replace(nodes=PLANT_NODES)
+    tensions = random.uniform(LOW, HIGH, (EQUILIBRIA, 4))
+    rows = equilibria(
+        robot, tensions, space="lobatto4", initial="separate", on_failure="return", with_stability=False
+    )
+    places = [marker.fraction for marker in RecordingConfig.paper_robot().markers]
+    on = np.asarray(rows.result) >= 0
+    y, count = np.asarray(rows.y)[on], int(on.sum())
+    position = np.asarray(seen_positions(robot, y, places, np.asarray(rows.z)[on]))
+    turns = Rotation.from_rotvec(sensors.turn_noise * random.normal(size=(position.size // 3, 3)))
+    frames = np.asarray(seen_quaternions(robot, y, places)).reshape(-1, 4)
+    turned = (Rotation.from_quat(frames, scalar_first=True) * turns).as_quat(scalar_first=True)
+    return Measurements(
+        time=np.arange(count, dtype=float),
+        control=tensions[on] + NOISE * random.normal(size=(count, 4)),
+        fractions=np.array(places),
+        position=position + sensors.position_noise * random.normal(size=position.shape),
+        quaternion=turned.reshape(*position.shape[:2], 4),
+        measured=np.ones(position.shape[:2], dtype=bool),
+        simulated=True,
+        source=f"equilibria of robot {seed}",
+        static=True,
+    )
+
+
+def static_facts(settings: Any) -> Product:
+    """Return the identification's result for one robot in equilibria, and its prediction of others."""
+    seed = int(settings["seed"])
+    truth = drawn_robot(seed)
+    given, unseen = (equilibria_of(truth, 100 * seed + k) for k in range(2))
+    found = identify(nominal_robot(), [given])
+    before = evaluate(nominal_robot(), unseen)
+    after = evaluate(found.robot, unseen, ensemble=found.ensemble)
+    moving = {it.name for it in truth.model.effects if it.of_motion}
+    facts = {
+        "seed": seed,
+        "true_effects": [name for name in truth.effects if name not in moving],
+        "true_values": dict(truth.values),
+        "identified": found.to_dict(),
+        "covered": _covered(truth, found),
+        "unseen": {"equilibria": _outcome(before, after)},
+    }
+    return Product(facts, {})
+
+
+def _outcome(before: Evaluation, after: Evaluation) -> dict[str, Any]:
+    return {
+        "nominal": before.to_dict(),
+        "identified": after.to_dict(),
+        "improvement": _gain(before, after),
+        "band": after.band and after.band.coverage,
+    }
 
 
 class _Recorded(NamedTuple):
@@ -99,14 +168,9 @@ def robot_facts(settings: Any) -> Product:
     residual = learned.about.facts
     outcomes = {}
     for name, each in zip(UNSEEN, unseen, strict=True):
-        before, after = (evaluate(robot, each) for robot in (nominal_robot(), found.robot))
+        before, after = evaluate(nominal_robot(), each), evaluate(found.robot, each, ensemble=found.ensemble)
         last = evaluate(learned, each) if residual["residual"] else after
-        outcomes[name] = {
-            "nominal": before.to_dict(),
-            "identified": after.to_dict(),
-            "residual": last.to_dict(),
-            "improvement": _gain(before, after),
-        }
+        outcomes[name] = _outcome(before, after) | {"residual": last.to_dict()}
     facts = {
         "seed": seed,
         "redrawn": redrawn,
@@ -142,7 +206,7 @@ def _covered(truth: Imperfect, found: Identified) -> dict[str, bool]:
 
 def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
     """Return the results in Markdown: one row for each robot, and a summary."""
-    rows = []
+    rows, unseen = [], [*facts[0]["unseen"]]
     for each in facts:
         true, have = set(each["true_effects"]), set(each["identified"]["effects"])
         undecided = set(each["identified"]["undecided"])
@@ -159,10 +223,11 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
                 ", ".join(sorted(true - have - undecided)) or "none",
                 ", ".join(sorted(have - true)) or "none",
                 f"{sum(inside)} of {len(inside)}",
+                *("none" if it["band"] is None else f"{it['band']:.0%}" for it in each["unseen"].values()),
             ]
         )
-    gains = [f"improvement, {name}" for name in UNSEEN]
-    angles = [f"orientations, {name} [degrees]" for name in UNSEEN]
+    gains = [f"improvement, {name}" for name in unseen]
+    angles = [f"orientations, {name} [degrees]" for name in unseen]
     heads = [
         "seed",
         *gains,
@@ -172,6 +237,7 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
         "missed",
         "false",
         "in interval",
+        *(f"in band, {name}" for name in unseen),
     ]
     told = summary(facts)
     lines = [
@@ -184,7 +250,9 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
         f"{100 * told['least_improvement']:.1f} %, failed predictions {told['failed']}. "
         f"False effects {told['false']} of {told['found']} found. Intervals (95 %) hold the true value of "
         f"{told['covered']} of {told['intervals']} numbers; where the set of effects is right, of "
-        f"{told['covered_right']} of {told['intervals_right']}.",
+        f"{told['covered_right']} of {told['intervals_right']}. Missed effects {told['missed']} of "
+        f"{told['true']}. Bands ({LEVEL:.0%}) hold {told['band']:.0%} of the positions that were not learned "
+        f"from ({told['least_band']:.0%} to {told['most_band']:.0%}).",
     ]
     return "\n\n".join(lines) + "\n"
 
@@ -193,6 +261,8 @@ def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return counts and medians over all robots."""
     gains = [outcome["improvement"] for each in facts for outcome in each["unseen"].values()]
     solved = [gain for gain in gains if gain is not None] or [np.nan]
+    outcomes = [outcome for each in facts for outcome in each["unseen"].values()]
+    bands = [outcome["band"] for outcome in outcomes if outcome["band"] is not None] or [np.nan]
     found = [(set(each["identified"]["effects"]), set(each["true_effects"])) for each in facts]
     undecided = [set(each["identified"]["undecided"]) for each in facts]
     right = [each for each, (have, true) in zip(facts, found, strict=True) if have == true]
@@ -208,6 +278,10 @@ def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "missed": sum(
             len(true - have - others) for (have, true), others in zip(found, undecided, strict=True)
         ),
+        "true": sum(len(true) for _, true in found),
+        "band": float(np.mean(bands)),
+        "least_band": float(np.min(bands)),
+        "most_band": float(np.max(bands)),
         "covered": sum(inside),
         "intervals": len(inside),
         "covered_right": sum(inside_right),

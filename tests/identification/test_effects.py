@@ -39,7 +39,6 @@ def test_nominal_numbers_change_nothing(model):
     """The robot with all effects at zero is the nominal one, and so is the one without their parts."""
     x = np.zeros(model.size)
     basic = x.copy()
-    # damping has no nominal value of its own: it is that of a usual damping ratio
     expected = shape(ROUTED)
     assert np.allclose(shape(model.robot(basic)), expected, rtol=0.0, atol=1e-9)
     reduced = model.reduced(x, ("stiffness", "damping"))

@@ -232,7 +232,8 @@ def record_virtual(
 
     The recording has the format of the paper's robot. The simulation includes effects that models do not
     have: tendon friction, ribs with masses, a sleeve, motor lag and sensor noise. --states writes the true
-    states. With --imperfections the robot is the paper's with random effects that `identify` can find.
+    states. With --imperfections the robot is the paper's with random effects that `identify` can find, and
+    little damping.
 
     Examples:
         record-virtual sine:1.0 --out x.bag

@@ -20,8 +20,9 @@ from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 SHARE = 1.0 / 3.0
 #: sizes of an effect's numbers, in standard deviations of their priors
 SIZES = (0.5, 1.5)
-#: data sheet of virtual robots; their training recordings, by name, and the end of the part used (s)
-NOMINAL = "delrin-tendon-robot"
+#: data sheet of virtual robots, and its damping (N m² s), little: a fiftieth of the critical one;
+#: their training recordings, by name, and the end of the part used (s)
+NOMINAL, DAMPING = "delrin-tendon-robot", 4.55e-4
 TRAINING = {"sine_1p0": "sine:1.0", "sine_3p0": "sine:3.0", "rand_0": "random:0"}
 END = 7.5
 
@@ -81,10 +82,10 @@ def imperfect_robot(
 
 
 def nominal_robot() -> TendonRod:
-    """Return the robot of the data sheet of all virtual robots."""
+    """Return the robot of the data sheet of all virtual robots: the paper's, with little damping."""
     robot = load_robot(NOMINAL)
     assert isinstance(robot, TendonRod)
-    return robot
+    return robot.replace(bending_damping=DAMPING)
 
 
 def drawn_robot(seed: int) -> Imperfect:

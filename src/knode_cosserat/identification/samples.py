@@ -16,8 +16,6 @@ from knode_cosserat.learning.residual import Nothing
 
 #: number of samples
 MEMBERS = 10
-#: deviations are at most multiplied by this
-MOST_INFLATED = 30.0
 
 
 def sampled(
@@ -29,26 +27,32 @@ def sampled(
 ) -> Ensemble | None:
     """Return samples of the robots that agree with the data, and can follow their controls; None if none can.
 
-    Their spread is, in root mean square, at least that of the differences of held-out recordings, or of all
-    recordings if none was held out.
+    They state the noise at each body: by how much the differences of held-out recordings, or of all if none
+    was held out, are more than the spread of the samples (root mean squares).
     """
     model, (x, names), samples = search.misfit.model, at, posterior.samples()
     rollouts = search.solved(x)
     assert rollouts is not None
     search.misfit.differentiated(rollouts)
-    covariance, expected, seen = np.atleast_2d(np.cov(samples, rowvar=False)), 0.0, 0.0
+    covariance = np.atleast_2d(np.cov(samples, rowvar=False))
+    more: dict[float, list[np.ndarray]] = {}
     for rollout, off in zip(rollouts, held_out or [it.values for it in rollouts], strict=True):
         slopes = rollout.derivatives
         spread = np.einsum("nre,nm,mre->re", slopes, covariance, slopes, optimize=True)
-        known = np.isfinite(off) if off.size else np.zeros_like(spread, dtype=bool)
-        expected, seen = expected + np.sum(spread[known]), seen + np.sum(off[known] ** 2)
-    ratio = np.clip(np.sqrt(seen / max(expected, np.finfo(float).tiny)), 1.0, MOST_INFLATED)
-    members = []
+        squares = rollout.data.positions((off**2 - spread) * rollout.data.noise**2) if off.size else None
+        for k, place in enumerate(() if squares is None else rollout.data.places):
+            more.setdefault(place, []).append(squares[1:, k].ravel())
+    noise = [
+        (place, float(np.sqrt(max(np.nanmean(np.concatenate(parts)), 0.0))))
+        for place, parts in sorted(more.items())
+        if np.isfinite(np.concatenate(parts)).any()
+    ]
+    about, members = About({"identified": True, "noise": noise}), []
     for sample in samples[np.random.default_rng(0).choice(len(samples), MEMBERS, replace=False)]:
-        wide = np.clip(x + ratio * (sample - samples.mean(axis=0)), *model.bounds)
-        wide = np.where(model.mask(names), wide, 0.0)
-        if all(search.misfit.differences(wide)):
-            robot = model.reduced(wide, names)
+        moved = np.clip(x + sample - samples.mean(axis=0), *model.bounds)
+        moved = np.where(model.mask(names), moved, 0.0)
+        if all(search.misfit.differences(moved)):
+            robot = model.reduced(moved, names)
             robot = robot if trained is None else robot.replace(trained=trained)
-            members.append(KNODE(robot, Nothing(), About({"identified": True})))
+            members.append(KNODE(robot, Nothing(), about))
     return Ensemble(members) if members else None
