@@ -136,16 +136,15 @@ def clock_of(recording: str) -> str:
     return f"clock of {recording}"
 
 
-def clock_effects(deviations: Mapping[str, float], *, flat: bool) -> list[PossibleEffect]:
+def clock_effects(deviations: Mapping[str, float]) -> list[PossibleEffect]:
     """Return, by recording, how much later than stated its controls acted (s), where this is not known.
 
-    They belong to a recording in several files: `Misfit` moves its controls, and no robot changes. `flat`
-    ones have no priors.
+    They belong to a recording in several files: `Misfit` moves its controls, and no robot changes.
     """
     return [
         PossibleEffect(
             clock_of(name),
-            (Number(clock_of(name), "s", 0.0, deviation, -LATEST, LATEST, flat=flat),),
+            (Number(clock_of(name), "s", 0.0, deviation, -LATEST, LATEST),),
             _unchanged,
             basic=True,
             of_recordings=True,

@@ -109,9 +109,6 @@ def gap_of(search: ParameterSearch, point: SearchEnd, at_end: bool) -> tuple[tup
         ]
         size = max(abs(it) for it in [*values, *(number.nominal for number in effect.numbers)])
         size = size or effect.numbers[0].high - effect.numbers[0].low
-        if effect.of_recordings:
-            # what was known before
-            size = max(size, effect.numbers[0].width)
         largest += [VAGUE if it.logarithmic else POOR * size / it.width for it in effect.numbers]
     beyond = errors / np.array(largest)[free]
     k = int(np.argmax(beyond))

@@ -105,8 +105,11 @@ def identify(
     plain = [] if parameters is None else parameter_effects(robot, parameters)
     measured = [it for it in rows if isinstance(it, Measurements)]
     plain += place_effects(measured, flat=named)
-    clocks = (it.clock_deviation for it in measured)
-    plain += clock_effects(dict(zip(names_of(measured), clocks, strict=True)), flat=named)
+    if not named:
+        # without priors, and without the effects that they lack, plain parameters would make up for delays
+        plain += clock_effects(
+            {name: it.clock_deviation for name, it in zip(names_of(measured), measured, strict=True)}
+        )
 
     def searched(robot: Any) -> ParameterSearch:
         if named:
