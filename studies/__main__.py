@@ -473,20 +473,20 @@ def virtual_robots(
     out: Out = Path("virtual-robots-study"),
     robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots.")] = 20,
     first: Annotated[int, typer.Option(metavar="SEED", min=0, help="Seed of the first one.")] = 0,
-    static: Annotated[bool, typer.Option("--static", help="In equilibria, not in motions.")] = False,
+    arms: Annotated[bool, typer.Option("--arms", help="Arms with chambers, in equilibria.")] = False,
     **how: Any,
 ) -> Study:
     """Identify virtual robots with random, known imperfections.
 
     Each robot is recorded with noise, identified from three recordings, and evaluated on two others. Writes
     the improvement over the nominal robot, missed and false effects, and the coverage of intervals and bands
-    (virtual_robots.md, .json). A robot takes some minutes; with --static, in equilibria, less. Resumes an
+    (virtual_robots.md, .json). A robot takes some minutes; --arms, less. Resumes an
     earlier run in the same folder.
     """
     from studies.virtual_robots import rerun
 
     seeds = range(first, first + robots)
-    return lambda: rerun(out, seeds, static, **how), {"robots": robots, "first": first, "static": static}
+    return lambda: rerun(out, seeds, arms, **how), {"robots": robots, "first": first, "arms": arms}
 
 
 # a loop around another simulator's robot

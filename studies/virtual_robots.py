@@ -3,7 +3,7 @@
 Each robot is recorded as the paper's was, with noisy sensors, lost frames and motors with a lag. It is
 identified from three recordings, a residual is learned on it, and both predict two other recordings.
 
-In equilibria, under random tensions, many more are identified in the same time.
+Arms with pressure chambers are identified in equilibria: many more in the same time, by the same code.
 """
 
 from __future__ import annotations
@@ -14,20 +14,27 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from knode_cosserat.identification.evaluate import LEVEL, Evaluation, evaluate
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import identify
-from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
+from knode_cosserat.identification.imperfections import (
+    END,
+    TRAINING,
+    Imperfect,
+    drawn_robot,
+    imperfect_robot,
+    nominal_robot,
+)
 from knode_cosserat.identification.result import Identified
-from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import DT, Measurements
-from knode_cosserat.recordings.virtual import PLANT_NODES, Sensors, record_virtual
+from knode_cosserat.recordings.virtual import record_virtual
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.solvers.equilibrium import equilibria
-from knode_cosserat.solvers.places import seen_positions, seen_quaternions
+from knode_cosserat.solvers.places import seen_positions
 from studies.report import Report, markdown_table, write_report
 from studies.runner import Job, Product, run
 
@@ -39,26 +46,28 @@ START = 0.5
 DRAWS, APART = 5, 1000
 
 
-#: equilibria to identify from, and to predict; range of their tensions, and the noise of their means (N)
-EQUILIBRIA, LOW, HIGH, NOISE = 60, 1.0, 8.0, 0.01
+#: an arm with pressure chambers, and places of its markers
+ARM, BODIES = "three-chamber-arm", (0.5, 1.0)
+#: equilibria to identify from, and as many to predict; their highest pressure and its noise (Pa), noise (m)
+EQUILIBRIA, HIGHEST, PRESSURE_NOISE, POSITION_NOISE = 40, 5e4, 50.0, 3e-4
 
 
-def jobs(seeds: Sequence[int], static: bool = False) -> list[Job]:
+def jobs(seeds: Sequence[int], arms: bool = False) -> list[Job]:
     """Return one job for each robot."""
-    work, name = (static_facts, "static-robot") if static else (robot_facts, "robot")
+    work, name = (arm_facts, "arm") if arms else (robot_facts, "robot")
     return [Job(f"{name}-{seed}", work, {"seed": seed}) for seed in seeds]
 
 
-def rerun(out: Path, seeds: Sequence[int], static: bool = False, **how: Any) -> Report:
+def rerun(out: Path, seeds: Sequence[int], arms: bool = False, **how: Any) -> Report:
     """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
         out: the folder; an earlier run in it is continued.
         seeds: one for each robot.
-        static: identify in equilibria, not in motions.
+        arms: identify arms with pressure chambers.
         how: as `runner.run` has it.
     """
-    facts = list(run(jobs(seeds, static), out, **how).values())
+    facts = list(run(jobs(seeds, arms), out, **how).values())
     return write_report(out, "virtual_robots", facts, as_markdown(facts))
 
 
@@ -75,46 +84,36 @@ def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> li
     return found
 
 
-def equilibria_of(truth: Imperfect, seed: int) -> Measurements:
-    """Return measured equilibria of a robot under random tensions; those without a solution are left out."""
-    random, sensors = np.random.default_rng(seed), Sensors()
-    robot = truth.model.robot(truth.x).replace(nodes=PLANT_NODES)
-    tensions = random.uniform(LOW, HIGH, (EQUILIBRIA, 4))
-    rows = equilibria(
-        robot, tensions, space="lobatto4", initial="separate", on_failure="return", with_stability=False
-    )
-    places = [marker.fraction for marker in RecordingConfig.paper_robot().markers]
-    on = np.asarray(rows.result) >= 0
-    y, count = np.asarray(rows.y)[on], int(on.sum())
-    position = np.asarray(seen_positions(robot, y, places, np.asarray(rows.z)[on]))
-    turns = Rotation.from_rotvec(sensors.turn_noise * random.normal(size=(position.size // 3, 3)))
-    frames = np.asarray(seen_quaternions(robot, y, places)).reshape(-1, 4)
-    turned = (Rotation.from_quat(frames, scalar_first=True) * turns).as_quat(scalar_first=True)
+def equilibria_of(robot: System, seed: int) -> Measurements:
+    """Return measured equilibria of an arm under random pressures."""
+    random = np.random.default_rng(seed)
+    pressures = random.uniform(0.0, HIGHEST, (EQUILIBRIA, 3))
+    rows = equilibria(robot, pressures, space="lobatto4", initial="separate", with_stability=False)
+    position = np.asarray(seen_positions(robot, np.asarray(rows.y), BODIES, np.asarray(rows.z)))
     return Measurements(
-        time=np.arange(count, dtype=float),
-        control=tensions[on] + NOISE * random.normal(size=(count, 4)),
-        fractions=np.array(places),
-        position=position + sensors.position_noise * random.normal(size=position.shape),
-        quaternion=turned.reshape(*position.shape[:2], 4),
+        time=np.arange(EQUILIBRIA, dtype=float),
+        control=pressures + PRESSURE_NOISE * random.normal(size=pressures.shape),
+        fractions=np.array(BODIES),
+        position=position + POSITION_NOISE * random.normal(size=position.shape),
+        quaternion=np.full((*position.shape[:2], 4), np.nan),
         measured=np.ones(position.shape[:2], dtype=bool),
         simulated=True,
-        source=f"equilibria of robot {seed}",
+        source=f"equilibria of arm {seed}",
         static=True,
     )
 
 
-def static_facts(settings: Any) -> Product:
-    """Return the identification's result for one robot in equilibria, and its prediction of others."""
+def arm_facts(settings: Any) -> Product:
+    """Return the identification's result for one arm in equilibria, and its prediction of others."""
     seed = int(settings["seed"])
-    truth = drawn_robot(seed)
-    given, unseen = (equilibria_of(truth, 100 * seed + k) for k in range(2))
-    found = identify(nominal_robot(), [given])
-    before = evaluate(nominal_robot(), unseen)
-    after = evaluate(found.robot, unseen, ensemble=found.ensemble)
-    moving = {it.name for it in truth.model.effects if it.of_motion}
+    nominal, usual = load_robot(ARM), np.full((1, 3), 0.5 * HIGHEST)
+    truth = imperfect_robot(nominal, usual, seed, BODIES, static=True)
+    given, unseen = (equilibria_of(truth.model.robot(truth.x), 100 * seed + k) for k in range(2))
+    found = identify(nominal, [given])
+    before, after = evaluate(nominal, unseen), evaluate(found.robot, unseen, ensemble=found.ensemble)
     facts = {
         "seed": seed,
-        "true_effects": [name for name in truth.effects if name not in moving],
+        "true_effects": list(truth.effects),
         "true_values": dict(truth.values),
         "identified": found.to_dict(),
         "covered": _covered(truth, found),
