@@ -109,7 +109,7 @@ def test_clocks_in_doubt_are_found_with_the_robot():
         assert estimate.value == pytest.approx(by, abs=2e-3) and not estimate.held
     damping = float(np.ravel(true.bending_damping)[0])
     assert found["bending_damping"].value == pytest.approx(damping, rel=0.1)
-    # with clocks that are taken as they are stated, damping makes up for the delays
+    # with clocks that are taken as they are stated, no robot moves like this one
     apart = kc.identify(NOMINAL, given, [])
-    assert abs(apart["bending_damping"].value / damping - 1.0) > 0.1
+    assert sum(found.error.values()) < 0.5 * sum(apart.error.values())
     assert found.robot.load_cells is None
