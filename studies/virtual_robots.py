@@ -49,7 +49,7 @@ DRAWS, APART = 5, 1000
 #: an arm with pressure chambers, and places of its markers
 ARM, BODIES = "three-chamber-arm", (0.5, 1.0)
 #: equilibria to identify from, and as many to predict; their highest pressure and its noise (Pa), noise (m)
-EQUILIBRIA, HIGHEST, PRESSURE_NOISE, POSITION_NOISE = 40, 5e4, 50.0, 3e-4
+EQUILIBRIA, HIGHEST, PRESSURE_NOISE, POSITION_NOISE = 30, 5e4, 50.0, 3e-4
 
 
 def jobs(seeds: Sequence[int], arms: bool = False) -> list[Job]:
