@@ -259,9 +259,8 @@ def record_virtual(
         )
     began = perf_counter()
     drawn = None if imperfections is None else drawn_robot(imperfections)
-    trajectory = virtual.record_virtual(
-        out, signal, seconds, seed, virtual.Sensors(swap=swap), robot=None if drawn is None else drawn.robot
-    )
+    robot: Any = None if drawn is None else drawn.robot
+    trajectory = virtual.record_virtual(out, signal, seconds, seed, virtual.Sensors(swap=swap), robot=robot)
     elapsed = perf_counter() - began
     facts: dict[str, Any] = {
         "signal": signal,

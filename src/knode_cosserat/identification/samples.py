@@ -59,8 +59,9 @@ def _noise(
     more: dict[float, list[np.ndarray]] = {}
     for it, off, variance in zip(data, differences, spread, strict=False):
         squares = it.positions((off**2 - variance) * it.noise**2) if off.size else None
-        for k, place in enumerate(() if squares is None else it.places):
-            more.setdefault(place, []).append(squares[1:, k].ravel())
+        if squares is not None:
+            for k, place in enumerate(it.places):
+                more.setdefault(place, []).append(squares[1:, k].ravel())
     known = {place: np.concatenate(parts) for place, parts in sorted(more.items())}
     means = {place: np.nanmean(it) for place, it in known.items() if np.isfinite(it).any()}
     return [(place, float(np.sqrt(max(mean, 0.0)))) for place, mean in means.items()]

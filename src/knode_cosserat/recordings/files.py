@@ -128,8 +128,9 @@ def clock_deviation(files: Sequence[File], config: RecordingConfig) -> float:
     def doubts_of(wanted: set[str]) -> dict[str, float]:
         return {file.name: doubts.get(file.name, 0.0) for file, there in topics if there & wanted}
 
-    driving = doubts_of({it.topic for it in (*config.measured, config.command) if it})
-    moving = doubts_of({it.topic for it in (*config.markers, *config.sensors)})
+    sent = set() if config.command is None else {config.command.topic}
+    driving = doubts_of({it.topic for it in config.measured} | sent)
+    moving = doubts_of({it.topic for it in config.markers} | {it.topic for it in config.sensors})
     apart = [np.hypot(a, b) for one, a in driving.items() for other, b in moving.items() if one != other]
     return float(max(apart, default=0.0))
 
