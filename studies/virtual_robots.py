@@ -184,14 +184,13 @@ def robot_facts(settings: Any) -> Product:
 
 
 def _gain(before: Evaluation, after: Evaluation) -> float | None:
-    """Return the mean part by which DTW and pose MSE are less; None if a prediction failed."""
-    parts = []
-    for name in ("tip_dtw", "pose_mse"):
-        a, b = getattr(before, name), getattr(after, name)
-        if a is None or b is None:
-            return None
-        parts.append(1.0 - b / a)
-    return float(np.mean(parts))
+    """Return the mean part by which DTW and pose MSE are less; None if a prediction failed.
+
+    Without orientations it is that of DTW.
+    """
+    pairs = [(getattr(before, name), getattr(after, name)) for name in ("tip_dtw", "pose_mse")]
+    parts = [1.0 - b / a for a, b in pairs if a is not None and b is not None]
+    return float(np.mean(parts)) if parts else None
 
 
 def _covered(truth: Imperfect, found: Identified) -> dict[str, bool]:
@@ -211,12 +210,12 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
         undecided = set(each["identified"]["undecided"])
         gains = [outcome["improvement"] for outcome in each["unseen"].values()]
         inside = list(each["covered"].values())
-        angles = [outcome["identified"]["rotation_rmse"] for outcome in each["unseen"].values()]
+        angles = [outcome["identified"].get("rotation_rmse") for outcome in each["unseen"].values()]
         rows.append(
             [
                 str(each["seed"]),
                 *("failed" if gain is None else f"{100 * gain:.1f} %" for gain in gains),
-                *("failed" if angle is None else f"{np.degrees(angle):.2f}" for angle in angles),
+                *("-" if angle is None else f"{np.degrees(angle):.2f}" for angle in angles),
                 f"{len(true & have)} of {len(true)}",
                 ", ".join(sorted(undecided & true)) or "none",
                 ", ".join(sorted(true - have - undecided)) or "none",
