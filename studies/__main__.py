@@ -471,18 +471,22 @@ def cables(
 @_study("virtual-robots --robots 20 --out results", name="virtual-robots")
 def virtual_robots(
     out: Out = Path("virtual-robots-study"),
-    robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots: seeds 0 to N - 1.")] = 20,
+    robots: Annotated[int, typer.Option(metavar="N", min=1, help="Number of robots.")] = 20,
+    first: Annotated[int, typer.Option(metavar="SEED", min=0, help="Seed of the first one.")] = 0,
+    arms: Annotated[bool, typer.Option("--arms", help="Arms with chambers, in equilibria.")] = False,
     **how: Any,
 ) -> Study:
     """Identify test robots with random, known imperfections.
 
     Each robot is recorded with noise, identified from three recordings, and evaluated on two others. Writes
-    the improvement over the nominal robot, missed and false effects, and the coverage of confidence intervals
-    (virtual_robots.md, .json). A robot takes some minutes. Resumes an earlier run in the same folder.
+    the improvement over the nominal robot, missed and false effects, and the coverage of intervals and bands
+    (virtual_robots.md, .json). A robot takes some minutes; --arms, less. Resumes an
+    earlier run in the same folder.
     """
     from studies.virtual_robots import rerun
 
-    return lambda: rerun(out, range(robots), **how), {"robots": robots}
+    seeds = range(first, first + robots)
+    return lambda: rerun(out, seeds, arms, **how), {"robots": robots, "first": first, "arms": arms}
 
 
 # a loop around another simulator's robot

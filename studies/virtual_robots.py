@@ -2,6 +2,8 @@
 
 Each robot is recorded as the paper's was, with noisy sensors, lost frames and motors with a lag. It is
 identified from three recordings, a residual is learned on it, and both predict two other recordings.
+
+Arms with pressure chambers are identified in equilibria: many more in the same time, by the same code.
 """
 
 from __future__ import annotations
@@ -13,15 +15,26 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from knode_cosserat.identification.evaluate import Evaluation, evaluate
+from knode_cosserat.identification.evaluate import LEVEL, Evaluation, evaluate
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import identify
-from knode_cosserat.identification.imperfections import END, TRAINING, Imperfect, drawn_robot, nominal_robot
+from knode_cosserat.identification.imperfections import (
+    END,
+    TRAINING,
+    Imperfect,
+    drawn_robot,
+    imperfect_robot,
+    nominal_robot,
+)
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.recordings.load import load_recording
 from knode_cosserat.recordings.measurements import DT, Measurements
 from knode_cosserat.recordings.virtual import record_virtual
+from knode_cosserat.rods.robot_file import load_robot
+from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.result import SimulationError
+from knode_cosserat.solvers.equilibrium import equilibria
+from knode_cosserat.solvers.places import seen_positions
 from studies.report import Report, markdown_table, write_report
 from studies.runner import Job, Product, run
 
@@ -33,20 +46,28 @@ START = 0.5
 DRAWS, APART = 5, 1000
 
 
-def jobs(seeds: Sequence[int]) -> list[Job]:
+#: an arm with pressure chambers, and places of its markers
+ARM, BODIES = "three-chamber-arm", (0.5, 1.0)
+#: equilibria to identify from, and as many to predict; their highest pressure and its noise (Pa), noise (m)
+EQUILIBRIA, HIGHEST, PRESSURE_NOISE, POSITION_NOISE = 30, 5e4, 50.0, 3e-4
+
+
+def jobs(seeds: Sequence[int], arms: bool = False) -> list[Job]:
     """Return one job for each robot."""
-    return [Job(f"robot-{seed}", robot_facts, {"seed": seed}) for seed in seeds]
+    work, name = (arm_facts, "arm") if arms else (robot_facts, "robot")
+    return [Job(f"{name}-{seed}", work, {"seed": seed}) for seed in seeds]
 
 
-def rerun(out: Path, seeds: Sequence[int], **how: Any) -> Report:
+def rerun(out: Path, seeds: Sequence[int], arms: bool = False, **how: Any) -> Report:
     """Run the study on these seeds, and write virtual_robots.md and .json; interrupted runs are continued.
 
     Args:
         out: the folder; an earlier run in it is continued.
         seeds: one for each robot.
+        arms: identify arms with pressure chambers.
         how: as `runner.run` has it.
     """
-    facts = list(run(jobs(seeds), out, **how).values())
+    facts = list(run(jobs(seeds, arms), out, **how).values())
     return write_report(out, "virtual_robots", facts, as_markdown(facts))
 
 
@@ -61,6 +82,53 @@ def recordings_of(truth: Imperfect, signals: Mapping[str, str], seed: int) -> li
             record_virtual(path, signal, END + 0.5, 100 * seed + k, robot=robot)
             found.append(load_recording(path).sampled(DT, START, END, mean=True))
     return found
+
+
+def equilibria_of(robot: System, seed: int) -> Measurements:
+    """Return measured equilibria of an arm under random pressures."""
+    random = np.random.default_rng(seed)
+    pressures = random.uniform(0.0, HIGHEST, (EQUILIBRIA, 3))
+    rows = equilibria(robot, pressures, space="lobatto4", initial="separate", with_stability=False)
+    position = np.asarray(seen_positions(robot, np.asarray(rows.y), BODIES, np.asarray(rows.z)))
+    return Measurements(
+        time=np.arange(EQUILIBRIA, dtype=float),
+        control=pressures + PRESSURE_NOISE * random.normal(size=pressures.shape),
+        fractions=np.array(BODIES),
+        position=position + POSITION_NOISE * random.normal(size=position.shape),
+        quaternion=np.full((*position.shape[:2], 4), np.nan),
+        measured=np.ones(position.shape[:2], dtype=bool),
+        simulated=True,
+        source=f"equilibria of arm {seed}",
+        static=True,
+    )
+
+
+def arm_facts(settings: Any) -> Product:
+    """Return the identification's result for one arm in equilibria, and its prediction of others."""
+    seed = int(settings["seed"])
+    nominal, usual = load_robot(ARM), np.full((1, 3), 0.5 * HIGHEST)
+    truth = imperfect_robot(nominal, usual, seed, BODIES, static=True)
+    given, unseen = (equilibria_of(truth.model.robot(truth.x), 100 * seed + k) for k in range(2))
+    found = identify(nominal, [given])
+    before, after = evaluate(nominal, unseen), evaluate(found.robot, unseen, ensemble=found.ensemble)
+    facts = {
+        "seed": seed,
+        "true_effects": list(truth.effects),
+        "true_values": dict(truth.values),
+        "identified": found.to_dict(),
+        "covered": _covered(truth, found),
+        "unseen": {"equilibria": _outcome(before, after)},
+    }
+    return Product(facts, {})
+
+
+def _outcome(before: Evaluation, after: Evaluation) -> dict[str, Any]:
+    return {
+        "nominal": before.to_dict(),
+        "identified": after.to_dict(),
+        "improvement": _gain(before, after),
+        "band": after.band and after.band.coverage,
+    }
 
 
 class _Recorded(NamedTuple):
@@ -99,14 +167,9 @@ def robot_facts(settings: Any) -> Product:
     residual = learned.about.facts
     outcomes = {}
     for name, each in zip(UNSEEN, unseen, strict=True):
-        before, after = (evaluate(robot, each) for robot in (nominal_robot(), found.robot))
+        before, after = evaluate(nominal_robot(), each), evaluate(found.robot, each, ensemble=found.ensemble)
         last = evaluate(learned, each) if residual["residual"] else after
-        outcomes[name] = {
-            "nominal": before.to_dict(),
-            "identified": after.to_dict(),
-            "residual": last.to_dict(),
-            "improvement": _gain(before, after),
-        }
+        outcomes[name] = _outcome(before, after) | {"residual": last.to_dict()}
     facts = {
         "seed": seed,
         "redrawn": redrawn,
@@ -121,14 +184,13 @@ def robot_facts(settings: Any) -> Product:
 
 
 def _gain(before: Evaluation, after: Evaluation) -> float | None:
-    """Return the mean part by which DTW and pose MSE are less; None if a prediction failed."""
-    parts = []
-    for name in ("tip_dtw", "pose_mse"):
-        a, b = getattr(before, name), getattr(after, name)
-        if a is None or b is None:
-            return None
-        parts.append(1.0 - b / a)
-    return float(np.mean(parts))
+    """Return the mean part by which DTW and pose MSE are less; None if a prediction failed.
+
+    Without orientations it is that of DTW.
+    """
+    pairs = [(getattr(before, name), getattr(after, name)) for name in ("tip_dtw", "pose_mse")]
+    parts = [1.0 - b / a for a, b in pairs if a is not None and b is not None]
+    return float(np.mean(parts)) if parts else None
 
 
 def _covered(truth: Imperfect, found: Identified) -> dict[str, bool]:
@@ -142,27 +204,28 @@ def _covered(truth: Imperfect, found: Identified) -> dict[str, bool]:
 
 def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
     """Return the results in Markdown: one row for each robot, and a summary."""
-    rows = []
+    rows, unseen = [], [*facts[0]["unseen"]]
     for each in facts:
         true, have = set(each["true_effects"]), set(each["identified"]["effects"])
         undecided = set(each["identified"]["undecided"])
         gains = [outcome["improvement"] for outcome in each["unseen"].values()]
         inside = list(each["covered"].values())
-        angles = [outcome["identified"]["rotation_rmse"] for outcome in each["unseen"].values()]
+        angles = [outcome["identified"].get("rotation_rmse") for outcome in each["unseen"].values()]
         rows.append(
             [
                 str(each["seed"]),
                 *("failed" if gain is None else f"{100 * gain:.1f} %" for gain in gains),
-                *("failed" if angle is None else f"{np.degrees(angle):.2f}" for angle in angles),
+                *("-" if angle is None else f"{np.degrees(angle):.2f}" for angle in angles),
                 f"{len(true & have)} of {len(true)}",
                 ", ".join(sorted(undecided & true)) or "none",
                 ", ".join(sorted(true - have - undecided)) or "none",
                 ", ".join(sorted(have - true)) or "none",
                 f"{sum(inside)} of {len(inside)}",
+                *("none" if it["band"] is None else f"{it['band']:.0%}" for it in each["unseen"].values()),
             ]
         )
-    gains = [f"improvement, {name}" for name in UNSEEN]
-    angles = [f"orientations, {name} [degrees]" for name in UNSEEN]
+    gains = [f"improvement, {name}" for name in unseen]
+    angles = [f"orientations, {name} [degrees]" for name in unseen]
     heads = [
         "seed",
         *gains,
@@ -172,6 +235,7 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
         "missed",
         "false",
         "in interval",
+        *(f"in band, {name}" for name in unseen),
     ]
     told = summary(facts)
     lines = [
@@ -184,7 +248,9 @@ def as_markdown(facts: Sequence[Mapping[str, Any]]) -> str:
         f"{100 * told['least_improvement']:.1f} %, failed predictions {told['failed']}. "
         f"False effects {told['false']} of {told['found']} found. Intervals (95 %) hold the true value of "
         f"{told['covered']} of {told['intervals']} numbers; where the set of effects is right, of "
-        f"{told['covered_right']} of {told['intervals_right']}.",
+        f"{told['covered_right']} of {told['intervals_right']}. Missed effects {told['missed']} of "
+        f"{told['true']}. Bands ({LEVEL:.0%}) hold {told['band']:.0%} of the positions that were not learned "
+        f"from ({told['least_band']:.0%} to {told['most_band']:.0%}).",
     ]
     return "\n\n".join(lines) + "\n"
 
@@ -193,6 +259,8 @@ def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return counts and medians over all robots."""
     gains = [outcome["improvement"] for each in facts for outcome in each["unseen"].values()]
     solved = [gain for gain in gains if gain is not None] or [np.nan]
+    outcomes = [outcome for each in facts for outcome in each["unseen"].values()]
+    bands = [outcome["band"] for outcome in outcomes if outcome["band"] is not None] or [np.nan]
     found = [(set(each["identified"]["effects"]), set(each["true_effects"])) for each in facts]
     undecided = [set(each["identified"]["undecided"]) for each in facts]
     right = [each for each, (have, true) in zip(facts, found, strict=True) if have == true]
@@ -208,6 +276,10 @@ def summary(facts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         "missed": sum(
             len(true - have - others) for (have, true), others in zip(found, undecided, strict=True)
         ),
+        "true": sum(len(true) for _, true in found),
+        "band": float(np.mean(bands)),
+        "least_band": float(np.min(bands)),
+        "most_band": float(np.max(bands)),
         "covered": sum(inside),
         "intervals": len(inside),
         "covered_right": sum(inside_right),

@@ -39,11 +39,23 @@ def test_nominal_numbers_change_nothing(model):
     """The robot with all effects at zero is the nominal one, and so is the one without their parts."""
     x = np.zeros(model.size)
     basic = x.copy()
-    # damping has no nominal value of its own: it is that of a usual damping ratio
     expected = shape(ROUTED)
     assert np.allclose(shape(model.robot(basic)), expected, rtol=0.0, atol=1e-9)
     reduced = model.reduced(x, ("stiffness", "damping"))
     assert reduced.sections == () and reduced.loads == () and reduced.load_cells is None
+
+
+def test_a_stated_damping_is_the_nominal_one():
+    def damping_of(stated):
+        model = library_model(NOMINAL.replace(bending_damping=stated), np.tile(TENSION, (4, 1)))
+        return model.effect("damping").numbers[0]
+
+    assert damping_of(0.03).nominal == 0.03 and damping_of([0.002, 0.002, 0.001]).nominal == 0.002
+    # a fiftieth of the critical damping of the first mode, of a robot that states none
+    usual = damping_of(0.0)
+    w = 3.516 * np.sqrt(NOMINAL.Kbt[0, 0] / NOMINAL.mass_per_length) / NOMINAL.length**2
+    assert usual.nominal == pytest.approx(0.04 * NOMINAL.Kbt[0, 0] / w, rel=0.01)
+    assert usual.width == damping_of(0.03).width
 
 
 @pytest.mark.campaign

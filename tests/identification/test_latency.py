@@ -91,3 +91,25 @@ def test_latency_is_found_and_kept_in_the_robots_file(tmp_path):
     prompt = robot.replace(load_cells=dataclasses.replace(robot.load_cells, latency=0.0))
     for each in given:
         assert evaluate(robot, each).tip_rmse < 0.2 * evaluate(prompt, each).tip_rmse
+
+
+@pytest.mark.campaign
+def test_clocks_in_doubt_are_found_with_the_robot():
+    """Each recording in several files has a delay of its own; the robot has none."""
+    true, late_by = kc.robots.RoutedTendonRobot.like(NOMINAL, youngs_modulus=1.5e9), (0.017, -0.012)
+    pulls = (tensions(1.0, 3.0), tensions("random", 3.0, seed=1))
+    given = [
+        measured(true, pulled, f"recording {k}", seed=k, reading=lambda tension, by=by: late(tension, by))
+        for k, (pulled, by) in enumerate(zip(pulls, late_by, strict=True))
+    ]
+    doubtful = [dataclasses.replace(each, clock_deviation=0.015) for each in given]
+    found = kc.identify(NOMINAL, doubtful, [])
+    for k, by in enumerate(late_by):
+        estimate = found[f"clock of recording {k}"]
+        assert estimate.value == pytest.approx(by, abs=2e-3) and not estimate.held
+    damping = float(np.ravel(true.bending_damping)[0])
+    assert found["bending_damping"].value == pytest.approx(damping, rel=0.1)
+    # with clocks that are taken as they are stated, no robot moves like this one
+    apart = kc.identify(NOMINAL, given, [])
+    assert sum(found.error.values()) < 0.5 * sum(apart.error.values())
+    assert found.robot.load_cells is None

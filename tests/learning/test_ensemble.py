@@ -8,7 +8,8 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.learning.config import StructuredOptions
 from knode_cosserat.learning.ensemble import Ensemble, Prediction
-from knode_cosserat.learning.knode import ModelFileError
+from knode_cosserat.learning.knode import KNODE, About, ModelFileError
+from knode_cosserat.learning.residual import Nothing
 
 DT = 0.05
 ROBOT = kc.load_robot("delrin-tendon-robot")
@@ -97,6 +98,23 @@ def test_coverage_is_the_level_where_the_truth_is_one_more_member(count, level):
     members = [Drawn(draw.normal(size=(400, 11, 3))) for _ in range(count)]
     reference = Drawn(draw.normal(size=(400, 11, 3)))
     assert Prediction(members).coverage(reference, level) == pytest.approx(level, abs=0.02)
+
+
+@pytest.mark.parametrize("share", [0.1, 1.0, 10.0])
+def test_coverage_is_the_level_where_no_member_has_the_noise(share):
+    draw, noise = np.random.default_rng(1), share * np.linspace(0.0, 1.0, 11)
+    members = [Drawn(draw.normal(size=(400, 11, 3))) for _ in range(10)]
+    reference = Drawn(draw.normal(size=(400, 11, 3)) + noise[:, None] * draw.normal(size=(400, 11, 3)))
+    assert Prediction(members, noise).coverage(reference, 0.9) == pytest.approx(0.9, abs=0.02)
+
+
+def test_noise_is_stated_at_bodies_and_linear_between():
+    about = About({"noise": [(0.5, 1e-3), (1.0, 2e-3)]})
+    ensemble = Ensemble([KNODE(ROBOT, Nothing(), about)] * 2)
+    np.testing.assert_allclose(
+        ensemble.noise_at([0.0, 0.25, 0.5, 0.75, 1.0]), [0.0, 5e-4, 1e-3, 1.5e-3, 2e-3]
+    )
+    np.testing.assert_array_equal(Ensemble([KNODE(ROBOT, Nothing())]).noise_at([0.5, 1.0]), 0.0)
 
 
 def test_coverage_tells_that_members_agree_on_something_wrong():

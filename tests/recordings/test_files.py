@@ -125,6 +125,11 @@ def test_stated_clocks_are_taken_as_they_are(tmp_path, motion):
         dataclasses.replace(it, offset=0.25) if it.name == "mocap.csv" else it for it in first.config.files
     ]
     other = load_recording(paths, first.config.replace(files=tuple(files)))
+    # the doubt is that of the estimate, stays with it, and is of no stated offset
+    assert 0.0 < first.clock_deviation < 0.02 and again.clock_deviation == first.clock_deviation
+    assert first.sampled(0.05).clock_deviation == first.clock_deviation
+    known = [dataclasses.replace(it, deviation=None) for it in files]
+    assert load_recording(paths, first.config.replace(files=tuple(known))).clock_deviation == 0.0
     shift = other.bodies[0].time - other.control.time[0] - (first.bodies[0].time - first.control.time[0])
     np.testing.assert_allclose(shift, 0.25 - first.config.files[1].offset, atol=2e-6)
 

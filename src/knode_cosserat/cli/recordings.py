@@ -232,7 +232,8 @@ def record_virtual(
 
     The recording has the format of the paper's robot. The simulation includes effects that models do not
     have: tendon friction, ribs with masses, a sleeve, motor lag and sensor noise. --states writes the true
-    states. With --imperfections the robot is the paper's with random effects that `identify` can find.
+    states. With --imperfections the robot is the paper's with random effects that `identify` can find, and
+    little damping.
 
     Examples:
         record-virtual sine:1.0 --out x.bag
@@ -258,9 +259,8 @@ def record_virtual(
         )
     began = perf_counter()
     drawn = None if imperfections is None else drawn_robot(imperfections)
-    trajectory = virtual.record_virtual(
-        out, signal, seconds, seed, virtual.Sensors(swap=swap), robot=None if drawn is None else drawn.robot
-    )
+    robot: Any = None if drawn is None else drawn.robot
+    trajectory = virtual.record_virtual(out, signal, seconds, seed, virtual.Sensors(swap=swap), robot=robot)
     elapsed = perf_counter() - began
     facts: dict[str, Any] = {
         "signal": signal,

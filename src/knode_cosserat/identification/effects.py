@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -23,6 +23,8 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
 from knode_cosserat.rods.tendons import Markers
 
+#: bound of a recording's clock (s)
+LATEST = 0.2
 #: tendon offset of a robot that states none, over its radius
 OFFSET = 5.0
 
@@ -127,6 +129,34 @@ def place_effects(measured: Iterable[Measurements], *, flat: bool) -> list[Possi
         of_recordings=True,
     )
     return [effect] if stated else []
+
+
+def clock_of(recording: str) -> str:
+    """Return the name of the effect of a recording's clocks, by the recording's name."""
+    return f"clock of {recording}"
+
+
+def clock_effects(deviations: Mapping[str, float]) -> list[PossibleEffect]:
+    """Return, by recording, how much later than stated its controls acted (s), where this is not known.
+
+    They belong to a recording in several files: `Misfit` moves its controls, and no robot changes.
+    """
+    return [
+        PossibleEffect(
+            clock_of(name),
+            (Number(clock_of(name), "s", 0.0, deviation, -LATEST, LATEST),),
+            _unchanged,
+            basic=True,
+            of_recordings=True,
+            of_motion=True,
+        )
+        for name, deviation in deviations.items()
+        if deviation > 0.0
+    ]
+
+
+def _unchanged(robot: Any, values: list[Any]) -> Any:
+    return robot
 
 
 def along_axes(label: str, unit: str, width: float, axes: str = "xyz", **bounds: Any) -> tuple[Number, ...]:

@@ -34,7 +34,7 @@ LEVEL = 0.9
 
 
 class Band(NamedTuple):
-    """Interval of predicted positions that holds those of one more model with a probability (Student's t).
+    """Interval of predicted positions that holds those of one more model, and its noise, with a probability.
 
     Attributes:
         low: lower limits of the positions (m).
@@ -202,8 +202,8 @@ def coverage(
 ) -> float:
     """Return the fraction of the measured positions within the spread of several models.
 
-    Each starts in its own equilibrium under the initial tensions. The interval contains one more model with
-    the given probability (Student's t), as in `Prediction.interval`; the first row is not counted.
+    Each starts in its own equilibrium under the initial tensions. The interval is that of
+    `Prediction.interval`, with the noise that an `Ensemble` states; the first row is not counted.
 
     Args:
         members: at least two models, such as an `Ensemble`.
@@ -217,11 +217,12 @@ def coverage(
     """
     check_arguments(coverage, locals())
     measured = Measurements.of(measured)
+    members = members if isinstance(members, Ensemble) else list(members)
     poses = [
         _Poses.of(robot, predict(robot, measured, space=space, recovery=RECOVERY), measured)
         for robot in members
     ]
-    return _prediction(poses).coverage(measured, level, first=0)
+    return _prediction(poses, _noise_of(members, measured)).coverage(measured, level, first=0)
 
 
 def predict(
@@ -324,7 +325,7 @@ def evaluate(
         return Evaluation(failed=str(error), comparison=empty)
     if moved is None and not motions:
         return Evaluation(failed=f"no member has a solution; the last: {reason}", comparison=empty)
-    return _compared(empty, moved, motions, len(members))
+    return _compared(empty, moved, motions, len(members), _noise_of(members, measured))
 
 
 def compared(
@@ -363,13 +364,22 @@ class _Poses(NamedTuple):
             return cls(position, np.full((*position.shape[:2], 4), np.nan))
 
 
-def _prediction(poses: Sequence[_Poses]) -> Prediction:
+def _prediction(poses: Sequence[_Poses], noise: Any = 0.0) -> Prediction:
     members: Any = poses
-    return Prediction(members)
+    return Prediction(members, noise)
+
+
+def _noise_of(members: Iterable[System], measured: Measurements) -> Any:
+    """Return the noise (M,) of the members of an ensemble at the bodies (m); zero if none is stated."""
+    return members.noise_at(measured.fractions) if isinstance(members, Ensemble) else 0.0
 
 
 def _compared(
-    empty: Comparison, moved: Trajectory | None, motions: Sequence[tuple[System, Trajectory]], members: int
+    empty: Comparison,
+    moved: Trajectory | None,
+    motions: Sequence[tuple[System, Trajectory]],
+    members: int,
+    noise: Any = 0.0,
 ) -> Evaluation:
     """Return the errors of a prediction.
 
@@ -378,6 +388,7 @@ def _compared(
         moved: the prediction; None: the mean of an ensemble's.
         motions: members of an ensemble that have a solution, and their predictions.
         members: number of all members.
+        noise: of the members (M,).
     """
     measured, rows = empty.measured, empty.rows
     spread = [
@@ -406,7 +417,7 @@ def _compared(
         extrapolated=None if extrapolated is None else np.asarray(extrapolated)[rows],
     )
     if len(spread) > 1:
-        prediction = _prediction(spread)
+        prediction = _prediction(spread, noise)
         low, high = prediction.interval(LEVEL)
         inside = prediction.coverage(types.SimpleNamespace(position=it.seen), LEVEL, first=0)
         it = dataclasses.replace(it, band=Band(low, high, LEVEL, inside, len(spread), members - len(spread)))

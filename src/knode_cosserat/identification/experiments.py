@@ -104,6 +104,12 @@ class Experiment:
         return rows[:, :width].reshape(len(rows), len(output.fractions), -1)[..., :3]
 
     @property
+    def places(self) -> tuple[float, ...]:
+        """Places of the bodies of `positions`, as parts of the length; none of nodes."""
+        outputs: tuple[Any, ...] = getattr(self.output, "outputs", (self.output,))
+        return tuple(getattr(outputs[0], "fractions", ()))
+
+    @property
     def is_resolved(self) -> bool:
         """True if time steps follow a continuous signal, so that shorter ones are nearer to the robot."""
         return not self.static and is_resolved(self.dt, self.continuous)

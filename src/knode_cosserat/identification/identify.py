@@ -12,13 +12,14 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.estimation.parameters import ParameterModel
-from knode_cosserat.identification.effects import library_model, place_effects
+from knode_cosserat.identification.effects import clock_effects, library_model, place_effects
 from knode_cosserat.identification.experiments import (
     Experiment,
     experiments_of,
     in_parts,
     listed_rows,
     measured_rows,
+    names_of,
 )
 from knode_cosserat.identification.free_parameters import identify_parameters, parameter_effects
 from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError, SearchError
@@ -102,7 +103,13 @@ def identify(
     journal = Journal(progress or log.info, checkpoint, minutes)
     rows: Any = listed_rows(data) if named else in_parts(measured_rows(data))
     plain = [] if parameters is None else parameter_effects(robot, parameters)
-    plain += place_effects([it for it in rows if isinstance(it, Measurements)], flat=named)
+    measured = [it for it in rows if isinstance(it, Measurements)]
+    plain += place_effects(measured, flat=named)
+    if not named:
+        # without priors, and without the effects that they lack, plain parameters would make up for delays
+        plain += clock_effects(
+            {name: it.clock_deviation for name, it in zip(names_of(measured), measured, strict=True)}
+        )
 
     def searched(robot: Any) -> ParameterSearch:
         if named:

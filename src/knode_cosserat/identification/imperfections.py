@@ -14,14 +14,21 @@ from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.virtual import commands
 from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.robot_file import load_robot
-from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRod
+from knode_cosserat.rods.system import System
+from knode_cosserat.rods.tendon_robots import TendonRod
 
 #: probability that a robot has an effect
 SHARE = 1.0 / 3.0
 #: sizes of an effect's numbers, in standard deviations of their priors
 SIZES = (0.5, 1.5)
+<<<<<<< HEAD
 #: data sheet of test robots; their training recordings, by name, and the end of the part used (s)
 NOMINAL = "delrin-tendon-robot"
+=======
+#: data sheet of virtual robots, and its damping (N m² s), little: a fiftieth of the critical one;
+#: their training recordings, by name, and the end of the part used (s)
+NOMINAL, DAMPING = "delrin-tendon-robot", 4.55e-4
+>>>>>>> 21447c59
 TRAINING = {"sine_1p0": "sine:1.0", "sine_3p0": "sine:3.0", "rand_0": "random:0"}
 END = 7.5
 
@@ -38,7 +45,7 @@ class Imperfect:
         x: coordinates (n,) of the robot.
     """
 
-    robot: RoutedTendonRobot
+    robot: System
     effects: tuple[str, ...]
     values: Mapping[str, float]
     model: ParameterModel
@@ -46,7 +53,11 @@ class Imperfect:
 
 
 def imperfect_robot(
-    nominal: TendonRod, tension: Float[np.ndarray, "T c"], seed: int, bodies: Sequence[float] = ()
+    nominal: System,
+    tension: Float[np.ndarray, "T c"],
+    seed: int,
+    bodies: Sequence[float] = (),
+    static: bool = False,
 ) -> Imperfect:
     """Return a robot with imperfections drawn from the library of effects.
 
@@ -55,16 +66,17 @@ def imperfect_robot(
 
     Args:
         nominal: the robot of the data sheet.
-        tension: tensions (N) of its motions, which set the sizes of some effects.
+        tension: its controls; tensions (N) set the sizes of some effects.
         seed: a whole number from 0 to 2**32 - 1.
         bodies: places of bodies, which may be on ribs, as parts of the length.
+        static: leave out effects that change no equilibrium.
 
     Raises:
         ParameterError: a seed out of range.
     """
     if not 0 <= seed < 2**32:
         raise ParameterError(f"seed is {seed}; allowed is a whole number from 0 to {2**32 - 1}")
-    model, random = library_model(nominal, tension, bodies), np.random.default_rng(seed)
+    model, random = library_model(nominal, tension, bodies, static=static), np.random.default_rng(seed)
     names: list[str] = []
     for effect in (it for it in model.effects if not it.of_recordings):
         present = bool(random.uniform() < SHARE) or effect.basic
@@ -81,10 +93,14 @@ def imperfect_robot(
 
 
 def nominal_robot() -> TendonRod:
+<<<<<<< HEAD
     """Return the robot of the data sheet of all test robots."""
+=======
+    """Return the robot of the data sheet of all virtual robots: the paper's, with little damping."""
+>>>>>>> 21447c59
     robot = load_robot(NOMINAL)
     assert isinstance(robot, TendonRod)
-    return robot
+    return robot.replace(bending_damping=DAMPING)
 
 
 def drawn_robot(seed: int) -> Imperfect:

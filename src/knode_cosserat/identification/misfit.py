@@ -21,9 +21,10 @@ from knode_cosserat.engine.equations import with_moving
 from knode_cosserat.estimation.online import errors_along, errors_of, sensitive
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.estimation.parameters import ParameterModel, ParametrisedRobot
+from knode_cosserat.identification.effects import clock_of
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import stepped
-from knode_cosserat.rods.tendons import LoadCells
+from knode_cosserat.rods.tendons import LoadCells, rows_later
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.solvers.run import TimeIntegration, usable_cores
 from knode_cosserat.solvers.tangent_motion import start_at, tangent_motion
@@ -88,6 +89,12 @@ class Misfit:
 
     def __init__(self, model: ParameterModel, data: Sequence[Experiment]):
         self.model, self.data = model, tuple(data)
+        #: coordinate of the clocks of each recording where they are in doubt, by its name
+        self._clocks = {
+            it.name: model.slice(clock_of(it.name)).start
+            for it in self.data
+            if clock_of(it.name) in model.names
+        }
         self._first = True
         self._known_columns: dict[Output, tuple[int, ...]] = {}
         #: accurate differences of the last points, by coordinates and number of the experiment
@@ -224,7 +231,10 @@ class Misfit:
         start = start_at(robot, x, system, task, data.held, data.initial)
         if start is None:
             return None
-        acting, slope = _acting(system, data)
+        late, clock = None, self._clocks.get(data.name)
+        if clock is not None:
+            late = self.model.numbers[clock].value(x[clock])
+        acting, slope = _acting(system, data, late)
         motion = tangent_motion(task, system, start, acting, seen * data.steps)
         if motion is None:
             return None
@@ -243,7 +253,10 @@ class Misfit:
             weights = np.eye(len(x))[:, which]
             d_controls = np.zeros((*motion.controls.shape, weights.shape[1]))
             if slope is not None:
-                d_controls = slope[: len(d_controls), :, None] * np.asarray(by_latency)[which]
+                by_late = np.array(by_latency)
+                if clock is not None:
+                    by_late[clock] = self.model.numbers[clock].width
+                d_controls = slope[: len(d_controls), :, None] * by_late[which]
             columns = self._columns(system, data.output, filled(records), seen_data)
             kept = np.isin(np.arange(records[0].size), columns).reshape(records[0].shape)
             # zeros in all other columns: one compiled program serves any coordinates
@@ -279,23 +292,22 @@ def _cells(system: Any) -> LoadCells | None:
     return getattr(nominal_model(system), "load_cells", None)
 
 
-def _acting(system: Any, data: Experiment) -> tuple[np.ndarray, np.ndarray | None]:
-    """Return the controls of all steps by the load cells' latency, and their derivative by it (N/s).
+def _acting(system: Any, data: Experiment, late: float | None) -> tuple[np.ndarray, np.ndarray | None]:
+    """Return the controls of all steps by a recording's latency, and their derivative by it (N/s).
 
-    The derivative is a central difference over one step, because it jumps between steps.
+    It is that of the load cells, and of the files' clocks if they are in doubt. The derivative is a central
+    difference over one step, because it jumps between steps.
     """
     cells, dt = _cells(system), data.dt / data.steps
     before = data.control[0] if data.held is None else data.held
     control = stepped(data.control, before, data.steps, data.continuous)
-    if cells is None or not data.readings:
+    if not data.readings or (cells is None and late is None):
         return control, None
-    late, early, acting = (
-        dataclasses.replace(cells, latency=np.asarray(cells.latency) + shift).undelayed(
-            control, dt, data.held
-        )
-        for shift in (0.5 * dt, -0.5 * dt, 0.0)
+    latency = (late or 0.0) + (0.0 if cells is None else float(np.asarray(cells.latency)))
+    after, earlier, acting = (
+        rows_later(control, latency + shift, dt, data.held) for shift in (0.5 * dt, -0.5 * dt, 0.0)
     )
-    return acting, (late - early) / dt
+    return acting, (after - earlier) / dt
 
 
 @jax.jit

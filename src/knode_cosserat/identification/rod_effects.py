@@ -86,9 +86,11 @@ def _inertia_effects(nominal: SlenderRod) -> list[PossibleEffect]:
     L, EI = float(nominal.length), float(nominal.Kbt[0, 0])
     masses = [(k, float(load.mass)) for k, load in enumerate(nominal.loads) if isinstance(load, AttachedMass)]
     carried = float(nominal.mass_per_length) * L + sum(mass for _, mass in masses)
-    # frequency of the first mode (rad/s), damping (N m² s) and drag (kg/(m s)) for its usual damping ratio
+    # frequency of the first mode (rad/s), and drag (kg/(m s)) for its usual damping ratio
     frequency = FIRST_MODE * (EI * L / carried) ** 0.5 / L**2
-    damping, drag = 2.0 * DAMPING_RATIO * EI / frequency, 2.0 * DAMPING_RATIO * frequency * carried / L
+    drag = 2.0 * DAMPING_RATIO * frequency * carried / L
+    # of a robot that states none (N m² s), that of the same ratio
+    damping = float(np.ravel(nominal.bending_damping)[0]) or 2.0 * DAMPING_RATIO * EI / frequency
     viscous = Number("bending_damping", "N m2 s", damping, 1.5, 1e-9, 1e2, True)
     tip = Replace((f"loads.{len(nominal.loads)}.mass",))
     linear = numbers_at(_draggable(nominal), "linear_drag", 3.0 * drag, begin=0.1)

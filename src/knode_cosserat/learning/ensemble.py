@@ -49,6 +49,15 @@ class Ensemble(Sequence[KNODE]):
     def __iter__(self) -> Iterator[KNODE]:
         return iter(self.members)
 
+    def noise_at(self, places: Any) -> Float[np.ndarray, " M"]:
+        """Return the standard deviation of what no member can follow, at places (parts of the length; m).
+
+        It is that of the recordings that the members were identified from (`About.facts["noise"]`), linear
+        between their bodies and zero at the base. Models that were fitted state none.
+        """
+        stated = np.array([(0.0, 0.0), *self.members[0].about.facts.get("noise", [])])
+        return np.interp(np.asarray(places, dtype=float), *stated.T)
+
     def predict(self, controls: Any, dt: float, **options: Any) -> Prediction:
         """Simulate every member under the controls (T, c).
 
@@ -63,8 +72,10 @@ class Ensemble(Sequence[KNODE]):
         """
         if len({jax.tree.structure(member) for member in self.members}) == 1 and "initial" not in options:
             batch = simulate(list(self.members), controls, dt, **options)
-            return Prediction([batch[k] for k in range(len(self))])
-        return Prediction([simulate(member, controls, dt, **options) for member in self.members])
+            motions = [batch[k] for k in range(len(self))]
+        else:
+            motions = [simulate(member, controls, dt, **options) for member in self.members]
+        return Prediction(motions, self.noise_at(np.linspace(0.0, 1.0, motions[0].position.shape[-2])))
 
     def save(self, folder: str | Path) -> None:
         """Write every member to its own file in a folder; `load_ensemble` reads them back."""
@@ -89,11 +100,12 @@ class Prediction:
     """Predictions of all members, with their mean and spread in every row.
 
     `time`, `position`, `quaternion` and `tip_position` are those of the mean, so that a prediction can be
-    compared and plotted like a trajectory.
+    compared and plotted like a trajectory. `noise` is the standard deviation (N,) of what no member can
+    follow (m), in the rows' nodes.
     """
 
-    def __init__(self, members: Sequence[Trajectory]):
-        self.members = list(members)
+    def __init__(self, members: Sequence[Trajectory], noise: Any = 0.0):
+        self.members, self.noise = list(members), np.asarray(noise, dtype=float)
 
     def __repr__(self) -> str:
         return f"Prediction of {count_of(len(self.members), 'member')}; the first: {self.members[0]!r}"
@@ -140,13 +152,19 @@ class Prediction:
         return np.sqrt(np.where(count > 1, square / np.maximum(count - 1, 1), np.nan))
 
     def interval(self, level: float = 0.9) -> tuple[Float[np.ndarray, "T N 3"], Float[np.ndarray, "T N 3"]]:
-        """Return the lower and upper prediction limits of one more member, at this level (Student's t)."""
+        """Return the lower and upper prediction limits of one more member with its noise, at this level.
+
+        Those of the members are Student's.
+        """
         if not 0.0 < level < 1.0:
             raise ValueError(f"level is {level!r}; allowed is a number between 0 and 1")
-        from scipy.stats import t
+        from scipy.stats import norm, t
 
-        count = len(self.members)
-        half = t.ppf(0.5 + level / 2.0, max(count - 1, 1)) * np.sqrt(1.0 + 1.0 / count) * self.spread
+        count, at = len(self.members), 0.5 + level / 2.0
+        half = np.hypot(
+            t.ppf(at, max(count - 1, 1)) * np.sqrt(1.0 + 1.0 / count) * self.spread,
+            norm.ppf(at) * self.noise[..., None],
+        )
         return self.position - half, self.position + half
 
     def coverage(self, reference: Any, level: float = 0.9, first: int = 1) -> float:

@@ -447,6 +447,8 @@ class FileSource(_RecordingSettings):
             first file's clock; None: estimated.
         drift: by how much this file's clock is faster than the first one's (ppm, 1e-6); None: estimated with
             the offset, or zero beside a stated offset.
+        deviation: standard deviation of the offset (s), which `identify` then finds; None: it is known, or
+            that of the estimate.
         time: title of its times; None: that of `columns`.
         time_unit: "s", "ms", "us" or "ns"; None: the unit that the title states, or s.
         rate: rows per second (Hz), for a table without times.
@@ -455,6 +457,7 @@ class FileSource(_RecordingSettings):
     name: Annotated[str, LINE]
     offset: Annotated[float | None, number(-1e10, 1e10, "s")] = None
     drift: Annotated[float | None, number(-1e4, 1e4, "ppm")] = None
+    deviation: Annotated[float | None, number(0.0, 10.0, "s")] = None
     time: Annotated[str | None, LINE._replace(read=_title, schema={"type": ["string", "integer"]})] = None
     time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, choice(TIME_UNITS)] = None
     rate: Annotated[float | None, number(1e-6, 1e6, "Hz")] = None

@@ -106,15 +106,33 @@ def streams_of_files(
     moved: list[tuple[_Clocked, list[tuple[float, float, float]]]] = []
     for it in clocked:
         stated = sources.get(it.name, FileSource(it.name))
-        parts = [(it.start, 0.0, 0.0)] if it is first else _parts(first, it, stated, config, findings)
+        parts, doubt = [(it.start, 0.0, 0.0)], stated.deviation
+        if it is not first:
+            parts, doubt = _parts(first, it, stated, config, findings)
         _, offset, drift = parts[0]
         # the offset is between the files' own stamps
         apart = offset - (it.zero - first.zero) * 1e-9
-        found[it.name] = stated.replace(offset=round(apart, 6), drift=round(1e6 * drift, 2))
+        clock = {"offset": round(apart, 6), "drift": round(1e6 * drift, 2)}
+        found[it.name] = stated.replace(**clock, deviation=doubt and round(doubt, 6))
         moved.append((it, parts))
     rows = _on_one_clock(moved, config, findings)
     names = [it.name for it in files]
     return rows, streams, config.replace(files=tuple(found[name] for name in names if name in found))
+
+
+def clock_deviation(files: Sequence[File], config: RecordingConfig) -> float:
+    """Return the standard deviation (s) of the time between controls and bodies, by their files' clocks."""
+    doubts = {it.name: it.deviation or 0.0 for it in config.files}
+    topics = [(it, set(it.content.topics_there(_of_file(config, it)))) for it in files]
+
+    def doubts_of(wanted: set[str]) -> dict[str, float]:
+        return {file.name: doubts.get(file.name, 0.0) for file, there in topics if there & wanted}
+
+    sent = set() if config.command is None else {config.command.topic}
+    driving = doubts_of({it.topic for it in config.measured} | sent)
+    moving = doubts_of({it.topic for it in config.markers} | {it.topic for it in config.sensors})
+    apart = [np.hypot(a, b) for one, a in driving.items() for other, b in moving.items() if one != other]
+    return float(max(apart, default=0.0))
 
 
 def _of_file(config: RecordingConfig, file: File) -> RecordingConfig:
@@ -164,16 +182,19 @@ def _require_topics(
 
 def _parts(
     first: _Clocked, it: _Clocked, stated: FileSource, config: RecordingConfig, findings: list[Finding]
-) -> list[tuple[float, float, float]]:
-    """Return beginning (s), offset (s, between the files' zeros) and drift of each part of a file's clock."""
+) -> tuple[list[tuple[float, float, float]], float | None]:
+    """Return beginning (s), offset (s, between the files' zeros) and drift of each part of a file's clock.
+
+    The second result is the standard deviation of an offset that was estimated (s), the largest of all parts.
+    """
     apart = (it.zero - first.zero) * 1e-9
     begins = [it.start, *it.resets]
     if stated.offset is not None:
-        return [(begins[0], stated.offset + apart, 1e-6 * (stated.drift or 0.0))]
+        return [(begins[0], stated.offset + apart, 1e-6 * (stated.drift or 0.0))], stated.deviation
     if _is_absolute(first, it):
         _add_check(first, it, apart, config, findings)
-        return [(begins[0], apart, 0.0)]
-    parts = list[tuple[float, float, float]]()
+        return [(begins[0], apart, 0.0)], stated.deviation
+    parts, doubt = list[tuple[float, float, float]](), 0.0
     for begin, end in zip(begins, [*begins[1:], np.inf], strict=True):
         try:
             if config.static:
@@ -192,6 +213,7 @@ def _parts(
             continue
         offset = match.offset + match.drift * (match.at - begin)
         parts.append((begin, offset, match.drift))
+        doubt = max(doubt, match.offset_error)
         number = f", part {len(parts)}" if len(begins) > 1 else ""
         findings.append(
             Finding(
@@ -202,7 +224,7 @@ def _parts(
                 "(dead time of the robot is in it)",
             )
         )
-    return parts
+    return parts, doubt
 
 
 def _drift_text(match: Match) -> str:

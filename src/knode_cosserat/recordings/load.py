@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.resources
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ from pathlib import Path
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.recordings import checks, frame
 from knode_cosserat.recordings.config import RecordingConfig
-from knode_cosserat.recordings.files import File, qualified, streams_of_files
+from knode_cosserat.recordings.files import File, clock_deviation, qualified, streams_of_files
 from knode_cosserat.recordings.findings import SEVERITIES, Finding, RecordingError, naming
 from knode_cosserat.recordings.formats import format_of
 from knode_cosserat.recordings.formats.csv_table import read_csv
@@ -137,7 +138,8 @@ def _recording_of_files(paths: Sequence[Path], config: RecordingConfig | None) -
     with naming(names):
         rows, streams, config = streams_of_files(files, config, findings)
         uses = {name: use for file in files for name, use in file.content.uses(config).items()}
-        return _cleaned(rows, streams, config, findings, (names, uses))
+        recording = _cleaned(rows, streams, config, findings, (names, uses))
+        return dataclasses.replace(recording, clock_deviation=clock_deviation(files, config))
 
 
 def _recording(content: Bag | Table, config: RecordingConfig | None, name: str) -> Recording:

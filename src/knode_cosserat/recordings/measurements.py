@@ -74,6 +74,8 @@ class Measurements:
     deviations: tuple[float, ...] = ()
     #: quantities of the columns of `control`, each with the count of its columns; empty: not stated
     quantities: tuple[tuple[str, int], ...] = ()
+    #: standard deviation of the time between controls and poses (s), zero if it is known; or it is identified
+    clock_deviation: float = 0.0
 
     def __repr__(self) -> str:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""

@@ -50,6 +50,7 @@ class Recording:
         delays: median delay from stamp to recording (s) by topic; NaN without stamps.
         sensors: sensors beside motion capture.
         uses: use of each column of a table, or topic of a bag; empty text: it is not read.
+        clock_deviation: standard deviation of the time between controls and poses (s), of several files.
     """
 
     source: str
@@ -64,6 +65,7 @@ class Recording:
     delays: Mapping[str, float]
     sensors: tuple[Sensor, ...] = ()
     uses: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    clock_deviation: float = 0.0
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
@@ -172,6 +174,7 @@ class Recording:
             ),
             deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
             quantities=driver.quantities,
+            clock_deviation=0.0 if self.config.static else self.clock_deviation,
         )
 
     def _initial_control(

@@ -206,19 +206,29 @@ class LoadCells(Part):
     ) -> Float[np.ndarray, "T c"]:
         """Return the readings (N) at the times of the poses: each row's reading from `latency` later.
 
-        Rows are means over steps of `dt` (s), with linear interpolation between them. The last row holds
-        beyond the end. Before the first row the value is `before`, or by default the first row.
+        `dt` and `before` as in `rows_later`.
         """
-        first = measured[0] if before is None else before
-        rows = np.concatenate([[first], measured, measured[-1:]])
-        at = np.clip(np.arange(1, len(measured) + 1) + float(self.latency) / dt, 0, len(measured) + 1)
-        low = np.minimum(at.astype(int), len(measured))
-        part = (at - low)[:, None]
-        return np.asarray((1.0 - part) * rows[low] + part * rows[low + 1])
+        return rows_later(measured, float(self.latency), dt, before)
 
     def tension(self, measured: Float[Any, " c"]) -> Float[Any, " c"]:
         """Return true tensions (N)."""
         return jnp.maximum(self.gain * measured + self.offset, 0.0)
+
+
+def rows_later(
+    measured: Float[np.ndarray, "T c"], late: float, dt: float, before: Float[np.ndarray, " c"] | None = None
+) -> Float[np.ndarray, "T c"]:
+    """Return each row's value from `late` (s) later.
+
+    Rows are means over steps of `dt` (s), with linear interpolation between them. The last row holds beyond
+    the end. Before the first row the value is `before`, or by default the first row.
+    """
+    first = measured[0] if before is None else before
+    rows = np.concatenate([[first], measured, measured[-1:]])
+    at = np.clip(np.arange(1, len(measured) + 1) + late / dt, 0, len(measured) + 1)
+    low = np.minimum(at.astype(int), len(measured))
+    part = (at - low)[:, None]
+    return np.asarray((1.0 - part) * rows[low] + part * rows[low + 1])
 
 
 def remove_delay(
