@@ -21,14 +21,9 @@ from knode_cosserat.rods.tendon_robots import TendonRod
 SHARE = 1.0 / 3.0
 #: sizes of an effect's numbers, in standard deviations of their priors
 SIZES = (0.5, 1.5)
-<<<<<<< HEAD
-#: data sheet of test robots; their training recordings, by name, and the end of the part used (s)
-NOMINAL = "delrin-tendon-robot"
-=======
-#: data sheet of virtual robots, and its damping (N m² s), little: a fiftieth of the critical one;
+#: data sheet of test robots, and its damping (N m² s), little: a fiftieth of the critical one;
 #: their training recordings, by name, and the end of the part used (s)
 NOMINAL, DAMPING = "delrin-tendon-robot", 4.55e-4
->>>>>>> 21447c59
 TRAINING = {"sine_1p0": "sine:1.0", "sine_3p0": "sine:3.0", "rand_0": "random:0"}
 END = 7.5
 
@@ -93,11 +88,7 @@ def imperfect_robot(
 
 
 def nominal_robot() -> TendonRod:
-<<<<<<< HEAD
-    """Return the robot of the data sheet of all test robots."""
-=======
-    """Return the robot of the data sheet of all virtual robots: the paper's, with little damping."""
->>>>>>> 21447c59
+    """Return the robot of the data sheet of all test robots: the paper's, with little damping."""
     robot = load_robot(NOMINAL)
     assert isinstance(robot, TendonRod)
     return robot.replace(bending_damping=DAMPING)
