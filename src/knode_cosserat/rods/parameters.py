@@ -195,8 +195,8 @@ class Parameter:
         try:
             number = in_unit(value, self.unit) if isinstance(value, str) else None
         except UnitError as error:
-            said = "" if self.unit else f", {self.meaning}"
-            raise ParameterError(f"{name} must be {self.allowed} (got {excerpt(value)}): {error}{said}") from None
+            said = f"{error}" if self.unit else f"{error}, {self.meaning}"
+            raise ParameterError(f"{name} must be {self.allowed} (got {excerpt(value)}): {said}") from None
         return value if number is None else number
 
     def read(self, name: str, value: Any) -> Any:
