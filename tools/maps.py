@@ -1,6 +1,7 @@
 """Errors of simple learned maps from controls to tip on the splits of docs/real-robots.md.
 
     python -m tools.maps trunk=observations_controlled_11.csv.gz three-cables servo=v6_train.csv,v6_val.csv
+    python -m tools.maps beam=recordings
 
 Each map's own numbers are chosen by blocks of training rows that are left out in turn; the held-out rows are
 predicted once, by the best of each kind:
@@ -8,21 +9,27 @@ predicted once, by the best of each kind:
     linear    affine map of the controls, and of those some rows before
     kernel    ridge regression with a Gaussian kernel of the same
     echo      echo-state network: a reservoir that remembers the controls, and a linear map of its states
+
+A release of the beam has no controls: it is predicted by the training recording with the same load.
 """
 
 import itertools
 import sys
+from pathlib import Path
 
 import numpy as np
 
 import knode_cosserat as kc
 from knode_cosserat.recordings import RecordingConfig
+from studies import beam
 from tools.pictures import ROOT
 
 EXAMPLES = ROOT / "examples"
 #: blocks of training rows, and rows between kept rows of a motion (10 a second)
 BLOCKS, DT = 6, 0.1
 RIDGES = (1e-6, 1e-4, 1e-2, 1e-1, 1.0, 10.0)
+#: time from a beam's release until its drop is seen (s)
+RELEASED = 0.03
 #: rows before that a map sees, for motions
 LAGS = ((), (1,), (1, 2, 4), (1, 2, 4, 8))
 #: units of the reservoir, its radii, and how much of each state is new
@@ -133,7 +140,7 @@ def errors(control, tip, count, moving):
 
 def joined(*rows):
     """Return controls and tips of rows, and the number of the first."""
-    control, tip = ([getattr(it, name) for it in rows] for name in ("tension", "tip_position"))
+    control, tip = ([getattr(it, name) for it in rows] for name in ("control", "tip_position"))
     return np.concatenate(control), np.concatenate(tip), len(rows[0].time)
 
 
@@ -156,6 +163,23 @@ def three_cables(paths):
     return of_files("three_cables", paths.split(",") if paths else own)
 
 
+def replayed(folder):
+    """Return the error (m) of each beam that was held out, if the training release is played once more."""
+    recordings = beam.read_folder(Path(folder))
+    train = [it for it in recordings if it.name in beam.training_names(recordings)]
+    found = {}
+    for it in recordings:
+        for known in train:
+            if it.load == known.load and it.name != known.name:
+                at = it.time - it.crossing + known.crossing
+                columns = known.tip.reshape(len(known.time), -1).T
+                rows = [np.interp(at, known.time, each, right=np.nan) for each in columns]
+                predicted = np.stack(rows, axis=1).reshape(-1, 3, 3)
+                predicted[it.time < it.crossing - RELEASED] = np.nan
+                found[it.name] = beam.marker_rmse(predicted, it)
+    return found
+
+
 ROBOTS = {
     "trunk": of_trunk,
     "three-cables": three_cables,
@@ -164,6 +188,10 @@ ROBOTS = {
 
 if __name__ == "__main__":
     for name, _, paths in (it.partition("=") for it in sys.argv[1:]):
+        if name == "beam":
+            for file, error in replayed(paths).items():
+                print(f"beam, replay: {1e3 * error:.2f} mm on {file}", flush=True)
+            continue
         for kind, (error, left_out, options) in errors(*ROBOTS[name](paths)).items():
             print(
                 f"{name}, {kind}: {1e3 * error:.2f} mm held out, {1e3 * left_out:.2f} mm on training rows "
