@@ -4,6 +4,7 @@ Parts are in modules: `chambers`, `ends`, `fluids`, `loads`, `magnets`, `routing
 `tendons`, `tubes`; the forms of a material's law are in `law`.
 """
 
+from knode_cosserat.part_check import CheckLine, PartError, PartReport, check
 from knode_cosserat.rods import (
     chambers,
     ends,
@@ -36,6 +37,7 @@ from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot
 __all__ = [
     "Assembly",
     "Camera",
+    "CheckLine",
     "Discontinuities",
     "Doubt",
     "Drawing",
@@ -46,6 +48,8 @@ __all__ = [
     "Observed",
     "ParallelRobot",
     "ParameterError",
+    "PartError",
+    "PartReport",
     "Relaxation",
     "RigidBody",
     "RobotFileError",
@@ -58,6 +62,7 @@ __all__ = [
     "TendonRobot",
     "Wrench",
     "chambers",
+    "check",
     "ends",
     "fluids",
     "law",
