@@ -8,9 +8,9 @@ import pytest
 from jax.tree_util import Partial
 
 import knode_cosserat as kc
+from knode_cosserat.robots import Effect, Wrench, check, law, loads, parameter
 from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.parts import Part
-from knode_cosserat.robots import Effect, Wrench, check, law, loads, parameter
 from knode_cosserat.rotation import dot
 
 #: parameters of parts that need some, or that do nothing without; within the default rod of 0.3 m

@@ -137,6 +137,10 @@ def check(part: Part, robot: System | None = None, *, active: bool = False) -> P
             f"part is a {type(part).__name__}; allowed is a part, such as an object of a subclass of "
             "kc.robots.Effect or kc.robots.loads.SpreadLoad"
         )
+    if not isinstance(robot, System | None):
+        raise PartError(
+            f"robot is a {type(robot).__name__}; allowed is a robot, from load_robot(NAME), or None"
+        )
     bare, whole = _robots(part, robot)
     checks: tuple[tuple[str, Callable[[], CheckLine]], ...] = (
         ("units", lambda: _units(part, bare, whole)),
@@ -213,7 +217,8 @@ def _first_values(cls: Any) -> dict[str, Any]:
 def _with(part: Part, robot: System) -> System:
     """Return a robot with a further part in the slot of its family."""
     for name, slot in slots_of(type(robot)).items():
-        if not isinstance(part, slot.family) or name == "base_end" and not getattr(part, "anywhere", True):
+        elsewhere = name == "base_end" and not getattr(part, "anywhere", True)
+        if elsewhere or not isinstance(part, slot.family):
             continue
         if not slot.many:
             changes: dict[str, Any] = {name: part}
@@ -503,14 +508,14 @@ def _rest(bare: System, whole: System) -> CheckLine:
 
 
 def _wrench(bare: System, whole: System, point: semi_discrete.Point, z: Any) -> tuple[Any, Any]:
-    """Return the force and moment per length that the part adds at a point, for the same state and strains."""
+    """Return the force and moment per length that the part adds at a point, for the same strains."""
     small = _narrowed(bare, whole, point)
     common = jnp.concatenate([whole.z_layout.get(z, name) for name in bare.z_layout.names])
     rates = semi_discrete.rates(whole, point, z), semi_discrete.rates(bare, small, common)
-    found = []
-    for name in ("n", "m"):
-        found.append(bare.y_layout.get(rates[1], name) - whole.y_layout.get(rates[0], name))
-    return found[0], found[1]
+    force, moment = (
+        bare.y_layout.get(rates[1], name) - whole.y_layout.get(rates[0], name) for name in ("n", "m")
+    )
+    return force, moment
 
 
 def _narrowed(bare: System, whole: System, point: semi_discrete.Point) -> semi_discrete.Point:
@@ -590,7 +595,7 @@ def _no_energy(part: Part, bare: System, whole: System) -> str:
 
 
 def _waves(seed: int) -> np.ndarray:
-    """Return amplitudes (12, 2, 2) of position, rotation, force and moment: two harmonics, cosine and sine."""
+    """Return amplitudes (12, 2, 2) of position, rotation, force and moment: two harmonics."""
     return np.random.default_rng(seed).uniform(-1.0, 1.0, (12, 2, 2)) * np.array([1.0, 0.5])[:, None]
 
 
@@ -603,7 +608,7 @@ def _cycle(bare: Any, whole: Any, control: Any, period: Any, way: Any, waves: An
     """
     bare_scale, layout = bare.scales().y, bare.y_layout
     length = bare.length
-    middle, strain = bare.rest(0.43 * length)
+    middle = bare.rest(0.43 * length)[0]
     n_size, m_size = (bare.y_layout.get(bare_scale, name)[0] for name in ("n", "m"))
     amplitudes = jnp.concatenate(
         [jnp.full(3, 0.05 * length), jnp.full(3, 0.3), jnp.full(3, 0.5 * n_size), jnp.full(3, 0.3 * m_size)]
