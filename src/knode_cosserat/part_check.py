@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from knode_cosserat._arguments import check_arguments
 from knode_cosserat._units import UnitError, unit_of
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.assembly import Assembly
@@ -137,10 +138,7 @@ def check(part: Part, robot: System | None = None, *, active: bool = False) -> P
             f"part is a {type(part).__name__}; allowed is a part, such as an object of a subclass of "
             "kc.robots.Effect or kc.robots.loads.SpreadLoad"
         )
-    if not isinstance(robot, System | None):
-        raise PartError(
-            f"robot is a {type(robot).__name__}; allowed is a robot, from load_robot(NAME), or None"
-        )
+    check_arguments(check, locals())
     bare, whole = _robots(part, robot)
     checks: tuple[tuple[str, Callable[[], CheckLine]], ...] = (
         ("units", lambda: _units(part, bare, whole)),
