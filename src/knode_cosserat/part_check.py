@@ -50,7 +50,7 @@ CYCLE, BEFORE, PERIODS = 400, 1, (3.0, 300.0)
 OWN = ("p", "h", "n", "m", "q", "w")
 #: usual sizes of controls by unit
 USUAL = {"N": 1.0, "Pa": 1e4, "rad": 0.3, "m": 5e-3, "T": 0.01, "1/m": 1.0, "m3": 1e-7}
-_ROD = {"length": 0.3, "density": 1200.0, "youngs_modulus": 5e7, "gravity": (0.0, 0.0, 0.0)}
+_ROD: dict[str, Any] = {"length": 0.3, "density": 1200.0, "youngs_modulus": 5e7, "gravity": (0.0, 0.0, 0.0)}
 
 
 class PartError(KnodeCosseratError, ValueError):

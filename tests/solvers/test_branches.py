@@ -83,7 +83,7 @@ def test_a_row_at_another_equilibrium_is_named_and_does_not_count():
     found = evaluate(robot, measured)
     several = found.several
     assert several.rows.tolist() == sorted(set(rows.tolist())) == [0, 6]
-    assert several.count.tolist() == [3, 3]
+    assert several.equilibria.tolist() == [3, 3]
     assert several.elsewhere.tolist() == [k == rows[-1] for k in several.rows]
     noise = np.sqrt(3) * 1e-4
     np.testing.assert_allclose(several.nearest, noise, rtol=1e-3)

@@ -64,7 +64,7 @@ class SeveralEquilibria(NamedTuple):
 
     Attributes:
         rows: indices of the rows in the recording.
-        count: number of equilibria found in each.
+        equilibria: number of equilibria found in each.
         predicted: distance of the tip from the prediction (m).
         nearest: distance of the tip from the nearest of the equilibria (m).
         tip_rmse_nearest: tip RMSE of all rows with the nearest equilibrium of each (m). It is not the error
@@ -75,7 +75,7 @@ class SeveralEquilibria(NamedTuple):
     """
 
     rows: Int[np.ndarray, " R"]
-    count: Int[np.ndarray, " R"]
+    equilibria: Int[np.ndarray, " R"]
     predicted: Float[np.ndarray, " R"]
     nearest: Float[np.ndarray, " R"]
     tip_rmse_nearest: float
@@ -95,7 +95,7 @@ class SeveralEquilibria(NamedTuple):
         }
 
     def __str__(self) -> str:
-        fewest, most = int(self.count.min()), int(self.count.max())
+        fewest, most = int(self.equilibria.min()), int(self.equilibria.max())
         many = f"{fewest}" if fewest == most else f"{fewest} to {most}"
         where = "row" if len(self.rows) == 1 else "rows"
         words = f"{len(self.rows)} {where} with {many} equilibria ({_listed(self.rows)}"
@@ -547,7 +547,7 @@ def _several(found: Evaluation) -> SeveralEquilibria | None:
     alone = known & ~np.isin(np.arange(len(known)), rows)
     return SeveralEquilibria(
         rows=it.rows[rows],
-        count=count + 1,
+        equilibria=count + 1,
         predicted=predicted[rows],
         nearest=nearest,
         tip_rmse_nearest=float(np.sqrt(np.mean(every[known] ** 2))),
