@@ -13,6 +13,7 @@ from knode_cosserat.rods.parameters import kinds_of
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rotation import dot
 
+FIELD = kc.robots.magnets.DipoleField(moment=(0.0, 0.0, 10.0), position=(0.05, 0.0, 0.4))
 #: parameters of parts that need some, or that do nothing without; within the default rod of 0.3 m
 GIVEN: dict[str, dict[str, Any]] = {
     "attached-mass": {"mass": 0.01, "offset": (0.01, 0.0, 0.0)},
@@ -25,10 +26,10 @@ GIVEN: dict[str, dict[str, Any]] = {
     "fluid": {"density": 1000.0},
     "helical": {"radius": 0.01, "phase": 0.3, "turns": 0.5},
     "hollow": {"radius": 0.003, "inner_radius": 0.002},
-    "magnet": {"magnetisation": (0.0, 0.0, 1.0)},
+    "magnet": {"magnetisation": (0.0, 0.0, 1.0), "field": FIELD},
     "markers": {"at": (0.5, 1.0), "stated": (0.5, 1.0)},
     "plane": {"point": (0.0, 0.0, 0.129), "normal": (0.0, 0.0, 1.0)},
-    "point-magnet": {"moment": (0.0, 0.0, 0.1)},
+    "point-magnet": {"moment": (0.0, 0.0, 0.1), "field": FIELD},
     "point-wrench": {"force": (0.0, 0.1, -0.1)},
     "polynomial": {"x": (0.01, -0.004), "y": (0.0, 0.003)},
     "rectangular": {"width": 0.003, "height": 0.002},
