@@ -19,7 +19,18 @@ BASE = (
 )
 #: packages and modules, each depends on those before it only; the empty name is `import knode_cosserat`
 ORDER = (
-    *("io", "rods", "robots", "controls", "schemes", "engine", "trajectory", "solvers", "metrics"),
+    *(
+        "io",
+        "rods",
+        "controls",
+        "schemes",
+        "engine",
+        "part_check",
+        "robots",
+        "trajectory",
+        "solvers",
+        "metrics",
+    ),
     *("estimation", "recordings", "statics", "control", "learning", "loading", "figures"),
     *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli", "__main__"),
 )

@@ -4,6 +4,7 @@ Parts are in modules: `chambers`, `ends`, `fluids`, `loads`, `magnets`, `routing
 `tendons`, `tubes`; the forms of a material's law are in `law`, and drawings of parts in `shapes`.
 """
 
+from knode_cosserat.part_check import CheckLine, PartError, PartReport, check
 from knode_cosserat.rods import (
     chambers,
     ends,
@@ -37,6 +38,7 @@ from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot
 __all__ = [
     "Assembly",
     "Camera",
+    "CheckLine",
     "Discontinuities",
     "Doubt",
     "Drawing",
@@ -47,6 +49,8 @@ __all__ = [
     "Observed",
     "ParallelRobot",
     "ParameterError",
+    "PartError",
+    "PartReport",
     "Relaxation",
     "RigidBody",
     "RobotFileError",
@@ -59,6 +63,7 @@ __all__ = [
     "TendonRobot",
     "Wrench",
     "chambers",
+    "check",
     "ends",
     "fluids",
     "law",

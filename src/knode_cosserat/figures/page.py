@@ -312,6 +312,8 @@ def _section(name: str, it: Evaluation) -> str:
             f"{_percent(it.band.level)} band of {it.band.members} models.{lost} A band is calibrated if the "
             "two are equal; if far fewer are inside, the models share an error.</p>"
         )
+    if it.several is not None:
+        parts.append(f"<p>Several equilibria: {_text(str(it.several))}.</p>")
     if it.sensors:
         rows = "".join(
             f"<tr><td>{_text(each)}</td><td>{error:.3g}</td></tr>" for each, error in it.sensors.items()

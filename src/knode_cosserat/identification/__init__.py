@@ -2,7 +2,13 @@
 
 from knode_cosserat.estimation.parameters import Number, PossibleEffect, numbers_at
 from knode_cosserat.identification.effects import effects_of, register
-from knode_cosserat.identification.evaluate import Comparison, Evaluation, evaluate, predict
+from knode_cosserat.identification.evaluate import (
+    Comparison,
+    Evaluation,
+    SeveralEquilibria,
+    evaluate,
+    predict,
+)
 from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.fit import fit
 from knode_cosserat.identification.identify import identify
@@ -17,6 +23,7 @@ __all__ = [
     "Identified",
     "Number",
     "PossibleEffect",
+    "SeveralEquilibria",
     "effects_of",
     "evaluate",
     "fit",

@@ -22,6 +22,7 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.rotation import quaternion_product, since_first
 from knode_cosserat.schemes.result import SimulationError
 from knode_cosserat.schemes.space import SpaceScheme
+from knode_cosserat.solvers.branches import other_equilibria
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.places import seen_positions, seen_quaternions
 from knode_cosserat.solvers.refinement import fix_grid
@@ -29,6 +30,8 @@ from knode_cosserat.trajectory import Trajectory
 
 #: seconds that recovery may take before a prediction has failed
 RECOVERY = 5.0
+#: rows that are listed one by one
+MOST_LISTED = 6
 #: probability of the band of an ensemble's predictions
 LEVEL = 0.9
 
@@ -51,6 +54,73 @@ class Band(NamedTuple):
     coverage: float
     members: int
     failed: int
+
+
+class SeveralEquilibria(NamedTuple):
+    """Compared rows of a static recording with several equilibria under their controls.
+
+    The robot's history decides at which one it is; the rows do not have it. The search takes many first
+    guesses (`solvers.branches`), finds stable and unstable equilibria, and may miss some.
+
+    Attributes:
+        rows: indices of the rows in the recording.
+        equilibria: number of equilibria found in each.
+        predicted: distance of the tip from the prediction (m).
+        nearest: distance of the tip from the nearest of the equilibria (m).
+        tip_rmse_nearest: tip RMSE of all rows with the nearest equilibrium of each (m). It is not the error
+            of a prediction, since the measurement chooses.
+        tip_rmse_unambiguous: tip RMSE of the prediction in the rows with one equilibrium (m), or None.
+        tip_rmse_same: tip RMSE of the prediction without rows where another equilibrium is nearer (m), or
+            None.
+    """
+
+    rows: Int[np.ndarray, " R"]
+    equilibria: Int[np.ndarray, " R"]
+    predicted: Float[np.ndarray, " R"]
+    nearest: Float[np.ndarray, " R"]
+    tip_rmse_nearest: float
+    tip_rmse_unambiguous: float | None
+    tip_rmse_same: float | None
+
+    @property
+    def elsewhere(self) -> Bool[np.ndarray, " R"]:
+        """True in rows where another equilibrium than the predicted one is nearer to the measurement."""
+        return np.asarray(self.nearest < self.predicted)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return all fields as plain JSON values."""
+        return {
+            name: value.tolist() if isinstance(value, np.ndarray) else value
+            for name, value in self._asdict().items()
+        }
+
+    def __str__(self) -> str:
+        fewest, most = int(self.equilibria.min()), int(self.equilibria.max())
+        many = f"{fewest}" if fewest == most else f"{fewest} to {most}"
+        where = "row" if len(self.rows) == 1 else "rows"
+        words = f"{len(self.rows)} {where} with {many} equilibria ({_listed(self.rows)}"
+        if self.tip_rmse_unambiguous is not None:
+            words += f"; tip RMSE of the other rows {1e3 * self.tip_rmse_unambiguous:.2f} mm"
+        words += ")"
+        if not self.elsewhere.any():
+            return f"{words}, of which the predicted are the nearest"
+        away = [
+            f"row {row}: {1e3 * far:.2f} mm, the nearest {1e3 * near:.2f} mm"
+            for row, far, near in zip(self.rows, self.predicted, self.nearest, strict=True)
+            if near < far
+        ]
+        more = f"; and {len(away) - MOST_LISTED} more rows" if len(away) > MOST_LISTED else ""
+        words += f"; predicted at another than the nearest: {'; '.join(away[:MOST_LISTED])}{more}"
+        if self.tip_rmse_same is not None:
+            them = "it" if len(away) == 1 else "them"
+            words += f"; tip RMSE without {them} {1e3 * self.tip_rmse_same:.2f} mm"
+        return f"{words}; with the nearest equilibrium of each row {1e3 * self.tip_rmse_nearest:.2f} mm"
+
+
+def _listed(rows: Int[np.ndarray, " R"]) -> str:
+    """Return indices of rows, the first of many only."""
+    first = ", ".join(map(str, rows[:MOST_LISTED]))
+    return f"{first} and {len(rows) - MOST_LISTED} more" if len(rows) > MOST_LISTED else first
 
 
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
@@ -130,6 +200,7 @@ class Evaluation:
         failed: why there is no prediction, or None.
         extrapolated: part of the rows outside the range that the robot was identified in; None: not known.
         sensors: root mean square error of each sensor beside motion capture, by its name and unit.
+        several: rows of equilibria that have several, and errors without them; None if none was found.
         comparison: the rows that were compared; None if there was nothing to simulate.
     """
 
@@ -140,6 +211,7 @@ class Evaluation:
     failed: str | None = None
     extrapolated: float | None = None
     sensors: Mapping[str, float] | None = None
+    several: SeveralEquilibria | None = dataclasses.field(default=None, compare=False)
     comparison: Comparison | None = dataclasses.field(default=None, compare=False)
 
     @property
@@ -161,6 +233,8 @@ class Evaluation:
             more["band"] = {
                 name: getattr(self.band, name) for name in ("level", "coverage", "members", "failed")
             }
+        if self.several:
+            more["several_equilibria"] = self.several.to_dict()
         return errors | {name: value for name, value in more.items() if value is not None}
 
     def __repr__(self) -> str:
@@ -188,6 +262,8 @@ class Evaluation:
             )
         if self.extrapolated:
             parts.append(f"{self.extrapolated:.0%} of the rows extrapolated")
+        if self.several:
+            parts.append(str(self.several))
         return (
             ", ".join(parts) or "nothing to compare: no row has the positions of all bodies and the controls"
         )
@@ -325,7 +401,8 @@ def evaluate(
         return Evaluation(failed=str(error), comparison=empty)
     if moved is None and not motions:
         return Evaluation(failed=f"no member has a solution; the last: {reason}", comparison=empty)
-    return _compared(empty, moved, motions, len(members), _noise_of(members, measured))
+    found = _compared(empty, moved, motions, len(members), _noise_of(members, measured))
+    return dataclasses.replace(found, several=_several(found)) if measured.static else found
 
 
 def compared(
@@ -453,6 +530,40 @@ def _errors(it: Comparison, robot: System, moved: Trajectory) -> Evaluation:
         extrapolated=None if it.extrapolated is None else float(np.mean(it.extrapolated)),
         sensors=_sensor_errors(it, robot, moved) or None,
         comparison=it,
+    )
+
+
+def _several(found: Evaluation) -> SeveralEquilibria | None:
+    """Return the rows with several equilibria, where the tip was seen; None if there are none."""
+    it = found.comparison
+    if it is None or it.trajectory is None or found.tip_rmse is None:
+        return None
+    others, records = other_equilibria(it.trajectory)
+    predicted = it.distance[:, -1]
+    known = np.isfinite(predicted)
+    rows, count = np.unique(others[known[others]], return_counts=True)
+    if not len(rows):
+        return None
+    system, width = it.trajectory.system, it.trajectory.system.y_layout.size
+    y, z = np.split(records, [width], axis=-1)
+    position = np.asarray(seen_positions(system, y, it.measured.fractions.tolist(), z))
+    away = np.linalg.norm(position[:, -1] - it.seen[others, -1], axis=-1)
+    nearest = np.array([min(predicted[row], *away[others == row]) for row in rows])
+    every = predicted.copy()
+    every[rows] = nearest
+
+    def rms(chosen: Bool[np.ndarray, " T"]) -> float | None:
+        return float(np.sqrt(np.mean(predicted[chosen] ** 2))) if chosen.any() else None
+
+    alone = known & ~np.isin(np.arange(len(known)), rows)
+    return SeveralEquilibria(
+        rows=it.rows[rows],
+        equilibria=count + 1,
+        predicted=predicted[rows],
+        nearest=nearest,
+        tip_rmse_nearest=float(np.sqrt(np.mean(every[known] ** 2))),
+        tip_rmse_unambiguous=rms(alone),
+        tip_rmse_same=rms(known & (every == predicted)),
     )
 
 

@@ -73,6 +73,13 @@ class Ends(_Aspect):
         """
         return np.broadcast_to(y, (len(controls), *np.shape(y)))
 
+    def branches(self, y: Any, along: Any, controls: Any) -> tuple[Any, Any]:
+        """Return guesses (K, points, y) by which several equilibria are found, and the control's row of each.
+
+        Arguments as in `unloaded`. By default there are none.
+        """
+        return np.zeros(0, dtype=int), np.zeros((0, *np.shape(y)))
+
     def poses(self, control: Any) -> tuple[Any, Any]:
         """Return the constrained poses of base and tip under a control; None for a free end."""
         return None, None

@@ -110,9 +110,10 @@ def _dogleg(J: np.ndarray, diag: np.ndarray, f: np.ndarray, delta: np.ndarray) -
     down = gradient / (_positive(steep)[:, None] * diag)
     bend = np.linalg.norm(np.einsum("bij,bj->bi", J, down), axis=1)
     best = steep / _positive(bend) ** 2
-    # between the lowest point along the gradient and Gauss-Newton's
+    # between the lowest point along the gradient and Gauss-Newton's; a start that is a zero has no radius
+    radius = _positive(delta)
     cosine = np.einsum("bi,bi->b", diag * down, diag * newton) / _positive(size)
-    linear = _between(best / delta, size / delta, cosine)
+    linear = _between(best / radius, size / radius, cosine)
     part = np.where(best >= delta, 0.0, linear)
     inner = np.where(best >= delta, delta, np.minimum(best, delta))
     step = (1.0 - part)[:, None] * inner[:, None] * down + part[:, None] * newton

@@ -56,12 +56,15 @@ from knode_cosserat.rods.section import (
 )
 from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.rods.system import CHOSEN_TURN
-from knode_cosserat.rotation import cross, dot, quaternion_product, rotation_matrix
+from knode_cosserat.rotation import cross, dot, quaternion_product, rotation_matrix, small_inverse
 
 #: default number of segments of each interval: of order 4, their error is below 1e-4 of the length at rest
 SEGMENTS = 4
 #: steps of a shot in each interval
 STEPS = 5
+#: number of first guesses of the angles at the tip, and corrections of each; error (rad) of an equilibrium,
+#: and distance of the angles within which two are the same
+TIP_ANGLES, CORRECTIONS, MET, SAME = 64, 10, 1e-9, 1e-4
 
 
 class Tube(Part):
@@ -460,6 +463,37 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
         if len(self.system.tubes) == 1:
             return states
         twist, found = roots(lambda twist: np.asarray(_shoot(pieces, twist)[1][:, -1]), np.zeros_like(alpha))
+        states[found] = self._with_tubes(states, along, pieces, twist)[found]
+        return states
+
+    def branches(self, y: Any, along: Any, controls: Any) -> tuple[Any, Any]:
+        """Return guesses of all equilibria without loads: backwards from angles at the tip to the plate.
+
+        Without torsion at the tip, the angles there determine those at the actuators, so that equilibria are
+        zeros of a function on a torus. Newton's method starts from `TIP_ANGLES` points of a grid on it.
+        """
+        count, controls = len(self.system.tubes), np.asarray(controls, dtype=float)
+        if count == 1 or not len(controls):
+            return super().branches(y, along, controls)
+        pieces = _pieces_of(self.system, controls)[0]
+        grid = np.linspace(0.0, 2.0 * np.pi, round(TIP_ANGLES ** (1.0 / (count - 1))), endpoint=False)
+        starts = np.stack(np.meshgrid(*[grid] * (count - 1), indexing="ij"), axis=-1).reshape(-1, count - 1)
+        tip, twist, error = map(np.asarray, _meet(pieces, starts))
+        # angles as points of circles
+        tip = np.concatenate([np.cos(tip), np.sin(tip)], axis=-1)
+        rows, chosen = list[int](), list[int]()
+        for row, k in zip(*np.nonzero(error < MET), strict=True):
+            same = [j for i, j in zip(rows, chosen, strict=True) if i == row]
+            if all(np.linalg.norm(tip[row, k] - tip[row, j]) > SAME for j in same):
+                rows.append(int(row))
+                chosen.append(int(k))
+        states = np.array(np.broadcast_to(y, (len(rows), *np.shape(y))))
+        own = [np.asarray(part)[rows] for part in pieces]
+        return np.array(rows, dtype=int), self._with_tubes(states, along, own, twist[rows, chosen])
+
+    def _with_tubes(self, states: Any, along: Any, pieces: Any, twist: Any) -> Any:
+        """Return states (K, points, y) with the angles and torsion of shots from the plate."""
+        layout, states = self.system.y_layout, np.array(states)
         angles, twists = map(np.asarray, _shoot(pieces, twist))
         path = np.concatenate([angles, np.asarray(pieces[-1])[:, None] * twists], axis=-1)
         at, last = np.asarray(along) * (path.shape[1] - 1), path.shape[1] - 2
@@ -467,8 +501,8 @@ class _TubeEnds(RodEnds, of=ConcentricTubeRobot):
         part = (at - first)[:, None]
         values = (1.0 - part) * path[:, first] + part * path[:, first + 1]
         turned, torsion = np.split(values, 2, axis=-1)
-        states[found, :, layout.slice("angle")] = turned[found]
-        states[found, :, layout.slice("torsion")] = torsion[found, :, 1:]
+        states[..., layout.slice("angle")] = turned
+        states[..., layout.slice("torsion")] = torsion[..., 1:]
         return states
 
 
@@ -495,11 +529,8 @@ def _pieces_of(robot: Any, controls: Any) -> Any:
     return jax.vmap(of)(controls)
 
 
-@jax.jit
-@functools.partial(jax.vmap, in_axes=(0, 0))
-def _shoot(pieces: Any, twist: Any) -> tuple[Any, Any]:
-    """Return angles and twists (1/m) of all tubes from the plate to the tip, without loads."""
-    lengths, presence, curvature, alpha, straight, EI, GJ = pieces
+def _shot(begin: Any, pieces: Any, EI: Any, GJ: Any) -> tuple[Any, Any]:
+    """Return the last angles and twists of a shot through intervals, and all of them; lengths have signs."""
 
     def step(state: Any, piece: Any) -> tuple[Any, Any]:
         # leapfrog: half a step with the twist, a step of the twist, half a step
@@ -512,11 +543,50 @@ def _shoot(pieces: Any, twist: Any) -> tuple[Any, Any]:
         new = middle + 0.5 * h * there * after, after
         return new, jnp.stack(new)
 
-    begin = alpha + straight * twist, twist
+    lengths, presence, curvature = pieces
     every = tuple(jnp.repeat(part, STEPS, axis=0) for part in (lengths / STEPS, presence, curvature))
-    _, states = jax.lax.scan(step, begin, every, unroll=STEPS)
+    return jax.lax.scan(step, begin, every, unroll=STEPS)
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, 0))
+def _shoot(pieces: Any, twist: Any) -> tuple[Any, Any]:
+    """Return angles and twists (1/m) of all tubes from the plate to the tip, without loads."""
+    lengths, presence, curvature, alpha, straight, EI, GJ = pieces
+    begin = alpha + straight * twist, twist
+    _, states = _shot(begin, (lengths, presence, curvature), EI, GJ)
     states = jnp.concatenate([jnp.stack(begin)[None], states])
     return states[:, 0], states[:, 1]
+
+
+@jax.jit
+@functools.partial(jax.vmap, in_axes=(0, None))
+@functools.partial(jax.vmap, in_axes=(None, 0))
+def _meet(pieces: Any, tip: Any) -> tuple[Any, Any, Any]:
+    """Return relative angles at the tip, twists at the plate (1/m), and the error of the actuators (rad).
+
+    They are found by Newton's method from relative angles (n - 1,) at the tip.
+    """
+    lengths, presence, curvature, alpha, straight, EI, GJ = (jnp.asarray(part) for part in pieces)
+    back = -lengths[::-1], presence[::-1], curvature[::-1]
+
+    def at_actuators(tip: Any) -> tuple[Any, Any]:
+        angle = jnp.concatenate([jnp.zeros(1), tip])
+        (angle, twist), _ = _shot((angle, jnp.zeros_like(angle)), back, EI, GJ)
+        off = angle - straight * twist - alpha
+        return off[1:] - off[0], twist
+
+    def turned(off: Any) -> Any:
+        return off - 2.0 * jnp.pi * jnp.round(off / (2.0 * jnp.pi))
+
+    def correct(_: Any, tip: Any) -> Any:
+        slopes = jax.jacfwd(lambda tip: at_actuators(tip)[0])(tip)
+        step = dot(small_inverse(slopes), turned(at_actuators(tip)[0]))
+        return tip - step * jnp.minimum(1.0, 1.0 / jnp.maximum(jnp.linalg.norm(step), 1e-300))
+
+    tip = jax.lax.fori_loop(0, CORRECTIONS, correct, tip)
+    off, twist = at_actuators(tip)
+    return tip, twist, jnp.max(jnp.abs(turned(off)))
 
 
 class _TubesDrawing(RodDrawing, of=ConcentricTubeRobot):
