@@ -74,7 +74,7 @@ def test_the_command_names_the_imperfections(tmp_path):
 
 @pytest.mark.campaign
 def test_twenty_virtual_robots(tmp_path):
-    """All predictions succeed and are better than before learning; docs/simulated-recordings.md has the figures."""
+    """All predictions succeed and are better than before learning."""
     report = virtual_robots.rerun(tmp_path, range(20))
     told = virtual_robots.summary(report.cells)
     print(report.tables[0].read_text())
