@@ -190,7 +190,7 @@ def test_each_check_finds_a_wrong_part(part, name, words):
 
 
 def test_a_part_that_no_robot_takes_is_refused_in_one_line():
-    with pytest.raises(kc.robots.PartError, match="part is a function; allowed is a part"):
+    with pytest.raises(kc.robots.PartCheckError, match="part is a function; allowed is a part"):
         check(moment_of)
-    with pytest.raises(kc.robots.PartError, match="a ParallelRobot has no slot for a Wind"):
+    with pytest.raises(kc.robots.PartCheckError, match="a ParallelRobot has no slot for a Wind"):
         check(Wind(), kc.load_robot("six-legged-robot"))

@@ -53,10 +53,10 @@ USUAL = {"N": 1.0, "Pa": 1e4, "rad": 0.3, "m": 5e-3, "T": 0.01, "1/m": 1.0, "m3"
 _ROD: dict[str, Any] = {"length": 0.3, "density": 1200.0, "youngs_modulus": 5e7, "gravity": (0.0, 0.0, 0.0)}
 
 
-class PartError(KnodeCosseratError, ValueError):
+class PartCheckError(KnodeCosseratError, ValueError):
     """A part that no known robot takes; the message is one line."""
 
-    code = "part"
+    code = "part-check"
 
 
 class CheckLine(NamedTuple):
@@ -131,10 +131,10 @@ def check(part: Part, robot: System | None = None, *, active: bool = False) -> P
         active: True if the part may do work, such as a follower force or a motor.
 
     Raises:
-        PartError: no robot has a slot for the part.
+        PartCheckError: no robot has a slot for the part.
     """
     if not isinstance(part, Part):
-        raise PartError(
+        raise PartCheckError(
             f"part is a {type(part).__name__}; allowed is a part, such as an object of a subclass of "
             "kc.robots.Effect or kc.robots.loads.SpreadLoad"
         )
@@ -190,7 +190,7 @@ def _robots(part: Part, robot: System | None) -> tuple[System, System]:
             if isinstance(part, slot.family) and not slot.many:
                 bare = SlenderRod(**_ROD, radius=3e-3, nodes=11)
                 return bare, _with(outer(**{name: part, **_first_values(outer)}), bare)
-    raise PartError(
+    raise PartCheckError(
         f"no robot has a slot for a {type(part).__name__}; allowed is an object of a subclass of Effect, "
         "SpreadLoad or PointLoad, or give robot="
     )
@@ -233,7 +233,7 @@ def _with(part: Part, robot: System) -> System:
         else:
             changes = {name: (*(getattr(robot, name) or ()), part)}
         return robot.replace(**changes)
-    raise PartError(f"a {type(robot).__name__} has no slot for a {type(part).__name__}")
+    raise PartCheckError(f"a {type(robot).__name__} has no slot for a {type(part).__name__}")
 
 
 # the equations at a few states

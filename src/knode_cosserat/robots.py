@@ -4,7 +4,7 @@ Parts are in modules: `chambers`, `ends`, `fluids`, `loads`, `magnets`, `routing
 `tendons`, `tubes`; the forms of a material's law are in `law`, and drawings of parts in `shapes`.
 """
 
-from knode_cosserat.part_check import CheckLine, PartError, PartReport, check
+from knode_cosserat.part_check import CheckLine, PartCheckError, PartReport, check
 from knode_cosserat.rods import (
     chambers,
     ends,
@@ -49,7 +49,7 @@ __all__ = [
     "Observed",
     "ParallelRobot",
     "ParameterError",
-    "PartError",
+    "PartCheckError",
     "PartReport",
     "Relaxation",
     "RigidBody",
