@@ -71,6 +71,13 @@ def test_the_tables_on_the_pages_are_those_of_the_code():
         assert tables.filled(text) == text, f"{page.name}: python -m tools.site.tables writes it"
 
 
+@pytest.mark.parametrize(
+    "word", ["hysteresis", "OptiTrack", "Young's modulus", "MPC", "Vicon", "ROS 2", "friction", "workspace"]
+)
+def test_words_that_users_search_for_are_on_a_page(word):
+    assert any(word in page.read_text(encoding="utf-8") for page in DOCS.glob("*.md"))
+
+
 def test_every_public_name_is_on_one_page_of_the_api():
     shown = api.shown(DOCS / "api")
     assert sorted(shown) == sorted(api.rooms())
