@@ -84,7 +84,8 @@ def pages(folder: Path) -> dict[str, str]:
     for file in sorted(folder.glob("*.md")):
         title = file.read_text(encoding="utf-8").splitlines()[0].lstrip("# ")
         for path in ordered(*_rooms_of(file)):
-            found[f"{path}.md"] = f"[{title}]({file.name})\n\n::: {path}\n"
+            head = f"---\ntitle: {_name(path)}\n---\n\n[{title}]({file.name})"
+            found[f"{path}.md"] = f"{head}\n\n::: {path}\n"
     return found
 
 
