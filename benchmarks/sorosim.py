@@ -125,20 +125,20 @@ def _vibration(name: str, path: Path) -> Compared:
 def table(shapes: dict[str, list[Compared]], motions: dict[str, Compared]) -> str:
     """As Markdown."""
     rows = [
-        "| compared | number | amplitude, m | mean distance | largest |",
-        "| --- | --- | --- | --- | --- |",
+        "| compared | amplitude, m | mean distance | largest |",
+        "| --- | --- | --- | --- |",
     ]
     for name, each in shapes.items():
         parts = [100.0 * np.max(one.distances) / one.length for one in each]
         rows.append(
-            f"| {name}, static shapes | {len(each)} | – | {np.mean(parts):.3f} % of the length | "
+            f"| {name}, {len(each)} static shapes | – | {np.mean(parts):.3f} % of the length | "
             f"{np.max(parts):.3f} % |"
         )
     for name, one in motions.items():
         rms, largest = 1e3 * np.sqrt(np.mean(one.distances**2)), 1e3 * np.max(one.distances)
         size = 0.5 * np.max(np.linalg.norm(one.theirs[:, None, :] - one.theirs[None, ::5], axis=-1))
         label = name.removeprefix("sorosim_").removeprefix("dynamics_").replace("RodMuJoCo_", " ")
-        rows.append(f"| {label}, free vibration | 1 | {size:.2f} | {rms:.2f} mm | {largest:.2f} mm |")
+        rows.append(f"| {label}, free vibration | {size:.2f} | {rms:.2f} mm | {largest:.2f} mm |")
     return "\n".join(rows)
 
 

@@ -8,7 +8,7 @@ from knode_cosserat.recordings.quantities import QUANTITIES
 def page() -> str:
     """Return the table in Markdown."""
     rows = [
-        "| key | units | plausible, in the first unit | columns that it recognises, for example | controls |",
+        "| key | units | plausible, in the first unit | recognised columns, such as | controls |",
         "| --- | --- | --- | --- | --- |",
     ]
     for name, quantity in QUANTITIES.items():
@@ -18,7 +18,7 @@ def page() -> str:
         ]
         units = ", ".join(f"`{unit}`" for unit in quantity.units)
         size = "any" if quantity.low == 0.0 else f"{quantity.low:g} to {quantity.high:g}"
-        shown = ", ".join(words[:6])
+        shown = ", ".join(words[:3])
         rows.append(
             f"| `{name}` | {units} | {size} | {shown} | {', '.join(quantity.controls) or 'with a `gain`'} |"
         )
