@@ -9,6 +9,7 @@ from typer.testing import CliRunner
 
 import knode_cosserat as kc
 from knode_cosserat.cli import app
+from knode_cosserat.cli.arguments import modified
 from knode_cosserat.cli.init import MATERIALS, QUESTIONS
 from tests.commands import run, succeeded
 
@@ -102,7 +103,7 @@ def test_questions_are_asked_one_by_one_and_wrong_answers_again(tmp_path, monkey
         (["--kind", "rod", "--material", "siliconee"], "did you mean silicone"),
         (["--kind", "chambers", "--chamber-diameter", "20 mm"], "allowed is a smaller diameter or distance"),
         (["--kind", "chambers", "--chambers", "0"], "a whole number from 1 to 64"),
-        (["--kind", "tubes", "--outer", "1, 2 mm"], "outer has 2, .* allowed is a number for each tube"),
+        (["--kind", "tubes", "--outer", "1, 2 mm"], "lengths has 3, outer has 2; .* change --outer"),
     ],
 )
 def test_a_wrong_answer_is_one_line_and_writes_nothing(tmp_path, options, words):
@@ -132,3 +133,11 @@ def test_every_question_is_an_option():
     assert {name for questions in QUESTIONS.values() for name in questions} | {"kind"} == set(
         _Answers._fields
     )
+
+
+def test_a_modulus_without_effect_is_said():
+    robot = kc.load_robot("delrin-tendon-robot").replace(bending_stiffness=[0.1, 0.1, 0.07])
+    with pytest.warns(
+        UserWarning, match="youngs_modulus has no effect: the robot states its bending_stiffness"
+    ):
+        modified(robot, ["youngs_modulus=1 GPa"])

@@ -369,13 +369,17 @@ def _tubes(values: dict[str, Any]) -> list[str]:
     names = ("lengths", "outer", "inner", "curvatures", "curved", "behind")
     counts = {len(values[name]) for name in names}
     if len(counts) > 1:
-        words = ", ".join(f"{name} has {len(values[name])}" for name in names)
-        raise ValueError(f"{words}; allowed is a number for each tube")
+        count = len(values["lengths"])
+        others = [name for name in names if len(values[name]) != count]
+        words = ", ".join(f"{name} has {len(values[name])}" for name in others)
+        options = ", ".join(f"--{name}" for name in others)
+        raise ValueError(f"lengths has {count}, {words}; allowed is a number for each tube: change {options}")
     modulus, density = MATERIALS[values["material"]]
     longest = values["lengths"][0]
     lines = [
         *_head("concentric-tube-robot", f"{len(values['outer'])} concentric tubes"),
         f"  length: {_of_length(longest)}  # of the inner tube beyond the plate, without insertion",
+        _damping(values | {"length": longest}, *_all_tubes(values)),
         _gravity(values["mounted"]),
         "  tubes:  # the inner tube first; end is a part of the length",
     ]
@@ -384,10 +388,17 @@ def _tubes(values: dict[str, Any]) -> list[str]:
     ):
         lines.append(
             f"    - {{kind: tube, radius: {_of_length(outer / 2)}, inner_radius: {_of_length(inner / 2)}, "
-            f"youngs_modulus: {modulus}, density: {density}, curvature: {curvature:g}, "
+            f"youngs_modulus: {modulus}, density: {density}, curvature: {curvature:g} 1/m, "
             f"curved: {_of_length(curved)}, transmission: {_of_length(behind)}, end: {length / longest:.8g}}}"
         )
     return lines
+
+
+def _all_tubes(values: dict[str, Any]) -> tuple[float, float]:
+    """Return second moment and area of all sections of tubes together."""
+    sections = [*zip(values["outer"], values["inner"], strict=True)]
+    moment = sum(outer**4 - inner**4 for outer, inner in sections) * math.pi / 64.0
+    return moment, sum(outer**2 - inner**2 for outer, inner in sections) * math.pi / 4.0
 
 
 def _rod(values: dict[str, Any]) -> list[str]:
