@@ -247,7 +247,7 @@ def search_of(
 
 def sizes(point: SearchEnd) -> str:
     """Return the usual differences of each recording, in words."""
-    return ", ".join(f"{1e3 * size:.1f}" for size in point.scale[:, 0]) + " mm"
+    return "usual differences " + ", ".join(f"{1e3 * size:.2g}" for size in point.scale[:, 0]) + " mm"
 
 
 def _accepted(

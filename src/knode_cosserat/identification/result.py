@@ -172,7 +172,8 @@ class Identified:
         rows: list[tuple[str, ...]] = [
             ("effect", "number", "unit", "nominal", "estimate", "95 % interval", "")
         ]
-        for it in self.estimates:
+        # what is decided comes first
+        for it in sorted(self.estimates, key=lambda it: it.probability < SURE):
             low, value, high = (_text(at, it.error) for at in (it.interval[0], it.value, it.interval[1]))
             # a plain parameter is its own cause
             effect = "" if it.effect in (it.label, it.label.partition("[")[0]) else it.effect

@@ -466,9 +466,10 @@ def likely_cause(result: Result, system: System, settings: Settings, control: An
             "hold an end of it, or simulate its motion."
         )
     if result is Result.NOT_FINITE:
+        step = "" if settings.time is None else ", or too long a time step"
         return (
-            f"Likely too few nodes for so soft or loaded a rod ({system.nodes}): use more, "
-            "or a smaller time step."
+            f"Likely cause: too few nodes for so soft or loaded a rod ({system.nodes}){step}"
+            f"{_largest(system, np.asarray(control))}."
         )
     return (
         "Likely cause: the control changes too much in one step, the rod buckles or snaps, "
@@ -489,6 +490,16 @@ def other_unit(system: System, control: np.ndarray) -> str:
                 "this robot by its own length; is it meant in another unit?"
             )
     return ""
+
+
+def _largest(system: System, control: np.ndarray) -> str:
+    """Return the largest control in words, as another possible cause."""
+    sizes = [
+        (float(np.max(np.abs(system.control_layout.get(control, field.name)), initial=0.0)), field)
+        for field in system.control_layout.fields
+    ]
+    size, field = max(sizes, key=lambda it: it[0], default=(0.0, None))
+    return f", or too large a control ({field.name} is {size:.3g} {field.unit})" if field and size else ""
 
 
 def _scales_of_y(system: System) -> Any:
