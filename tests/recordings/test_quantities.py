@@ -263,6 +263,14 @@ def test_units_come_from_titles_and_have_to_agree():
         RecordingConfig.from_dict({"columns": columns})
 
 
+@pytest.mark.parametrize(("more", "factor"), [({"unit": "hPa"}, 100.0), ({"unit": "bar", "gain": 1.0}, 1e5)])
+def test_a_unit_that_contradicts_its_titles_is_refused(more, factor):
+    columns = {"time": "t", "pressure": ["P_A [mbar]", "P_B [mbar]"], "tip": ["X (mm)", "Y (mm)", "Z (mm)"]}
+    with pytest.raises(RecordingError, match="pressure: unit is bar, but the titles are in mbar"):
+        RecordingConfig.from_dict({"columns": columns, "pressure": {"unit": "bar"}})
+    assert RecordingConfig.from_dict({"columns": columns, "pressure": more}).pressure.factor == factor
+
+
 #: settings that are wrong, and what is said
 WRONG = [
     (

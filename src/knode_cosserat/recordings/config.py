@@ -338,6 +338,11 @@ class ControlSource(_RecordingSettings):
                 f"{name}: the titles are in {' and '.join(sorted(stated))}; required is one unit, or "
                 f"`unit` in {name}"
             )
+        if unit and self.gain is None and any(units.get(it) != units.get(unit) for it in stated):
+            raise RecordingError(
+                f"{name}: unit is {unit}, but the titles are in {' and '.join(sorted(stated))}; allowed is "
+                "that unit, or none; or `gain: 1` if the titles are wrong"
+            )
         unit = unit or next(iter(stated), QUANTITIES[name].unit)
         if unit not in units:
             other = next(quantity.name for quantity in QUANTITIES.values() if unit in quantity.units)
