@@ -409,3 +409,13 @@ def test_measurements_of_a_motion_have_all_controls():
     seen = Measurements.of(moved)
     assert seen.quantities == (("pressure", 3),)
     np.testing.assert_array_equal(seen.control[:-1], moved.held_control[:-1])
+
+
+def test_a_cell_that_is_no_number_is_named_and_its_column_is_not_left_out(tmp_path):
+    path = tmp_path / "bad.csv"
+    rows = [f"{0.05 * k},{1 + k},{'abc' if k == 1 else 2 + k},3,{0.001 * k},0,0.4" for k in range(40)]
+    path.write_text("\n".join(["t,T1,T2,T3,x,y,z", *rows]))
+    config = proposed_config(path)
+    assert config.tension.order == (1, 2, 3)
+    with pytest.raises(RecordingError, match="row 2: T2 is 'abc'; allowed is a finite number"):
+        kc.load_recording(path, config)

@@ -64,6 +64,8 @@ _TIME = re.compile(
     r"sec",
     re.IGNORECASE,
 )
+#: least part of the cells that are numbers in a column of numbers with errors
+LEAST_NUMBERS = 0.5
 #: names of numbers that were only commanded; and of those about motors' states, whose goals are no tensions
 _COMMAND = re.compile(r"cmd|command|desired|target|ref|set|soll|goal|ctrl|consign", re.IGNORECASE)
 _STATE = re.compile(r"current|position|velocity", re.IGNORECASE)
@@ -438,7 +440,7 @@ def _controls(
 ) -> tuple[dict[str, list[str]], dict[str, Any]]:
     """Return the columns that drive the robot by quantity, and of commands, and their sources."""
     once = [title for title in titles if titles.count(title) == 1]
-    families = _families([title for title in once if table.numbers[title].dtype.kind in "fiub"])
+    families = _families([title for title in once if _numbers_of(table, title) is not None])
     chosen: dict[str, _Family] = {}
     for family in families:
         # a single column is named in words: its unit is not enough
@@ -462,13 +464,22 @@ def _controls(
     return {name: list(family.titles) for name, family in chosen.items()}, sources
 
 
+def _numbers_of(table: Table, title: str) -> Any:
+    """Return a column's numbers (rows,), NaN for single cells that are none; None for a column of text."""
+    import pandas as pd
+
+    numbers = pd.to_numeric(table.numbers[title], errors="coerce").to_numpy(dtype=float, na_value=np.nan)
+    is_text = table.numbers[title].dtype.kind not in "fiub"
+    return None if is_text and np.mean(np.isfinite(numbers)) < LEAST_NUMBERS else numbers
+
+
 def _source(table: Table, name: str, family: _Family, remarks: list[str]) -> ControlSource:
     """Return the source of a family's columns, with remarks on its unit and gain."""
     kind = QUANTITIES[name if name != COMMAND else family.name or "tension"]
     plural = "commands" if name == COMMAND else kind.plural
     listed = ", ".join(family.titles)
     remarks.append(f"{plural} are taken to be the columns {listed}, in this order")
-    values = table.numbers[list(family.titles)].to_numpy(dtype=float)
+    values = np.stack([_numbers_of(table, title) for title in family.titles], axis=1)
     largest = float(np.nanmax(np.abs(values), initial=0.0))
     unit, gain = known_unit(family.unit), None
     if kind.name == "angle" and not unit and np.all(np.nan_to_num(values) % 1.0 == 0.0) and largest > 360.0:
