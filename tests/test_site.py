@@ -54,10 +54,12 @@ def test_the_reference_has_every_name_with_its_meaning():
     page = "\n".join(made() for name, made in tables.TABLES.items() if name.startswith("robot"))
     families = ends.End, loads.Load, surroundings.Obstacle, section.SectionChange, routing.Routing
     classes = [*KINDS.values(), *(cls for family in families for cls in kinds_of(family).values())]
+    # tests have parts of their own
+    classes = [cls for cls in classes if cls.__module__.startswith("knode_cosserat")]
     for cls in classes:
         for name, parameter in cls.parameters().items():
             assert f"| `{name}` | {parameter.meaning} | " in page
-    for kind in [*KINDS, *(kind for family in families for kind in kinds_of(family))]:
+    for kind in {cls.kind for cls in classes}:
         assert re.search(rf"^###? `{kind}`$", page, re.MULTILINE)
     rows = [line for line in page.splitlines() if line.startswith("| ")]
     assert {line.replace("\\|", "").count("|") for line in rows} == {7}

@@ -86,7 +86,7 @@ def parts(*named: str) -> str:
         for slot in slots_of(cls).values():
             if slot.family.__name__ not in families:
                 families[slot.family.__name__] = slot.family
-                holders += kinds_of(slot.family).values()
+                holders += _kinds(slot.family).values()
     texts = []
     elsewhere = {*LOADS, *TENDONS} - set(named)
     for name, family in families.items():
@@ -96,11 +96,17 @@ def parts(*named: str) -> str:
         if family is SlenderRod:
             texts.append("The kinds of robots of one rod, with [their entries](robot-kinds.md).")
             continue
-        for kind, cls in kinds_of(family).items():
-            if cls.__module__.startswith("knode_cosserat"):  # others are of whoever runs this
-                rows = _rows(cls, None)
-                texts += [f"### `{kind}`", _first(cls), HEAD + "\n".join(rows) if rows else "No parameters."]
+        for kind, cls in _kinds(family).items():
+            rows = _rows(cls, None)
+            texts += [f"### `{kind}`", _first(cls), HEAD + "\n".join(rows) if rows else "No parameters."]
     return "\n\n".join(texts)
+
+
+def _kinds(family: type) -> dict[str, type]:
+    """Return the kinds of a family that the package has; others are of whoever runs this."""
+    return {
+        kind: cls for kind, cls in kinds_of(family).items() if cls.__module__.startswith("knode_cosserat")
+    }
 
 
 def _first(cls: type) -> str:
@@ -119,7 +125,7 @@ def _rows(cls: type, only: set[str] | None, without: Any = ()) -> list[str]:
         rows[name] = _row(name, each.meaning, kind, "", words, _default(defaults[name]))
     for name, slot in slots_of(cls).items():
         kind = "list of mappings" if slot.many else "mapping"
-        words = ", ".join(f"`{word}`" for word in kinds_of(slot.family))
+        words = ", ".join(f"`{word}`" for word in _kinds(slot.family))
         rows[name] = _row(name, slot.meaning, kind, "", words, _part(defaults[name]))
     return [row for name, row in rows.items() if name not in without and (only is None or name in only)]
 
