@@ -283,7 +283,7 @@ def parsed_reference(text: str) -> Any:
                 f"{text} has no column {missing[0]}; a reference has t or time, x, y and perhaps z, with or "
                 "without units: t [s], x [mm]"
             )
-        rows = np.full((len(found.numbers), 4), np.nan)
+        rows: Any = np.full((len(found.numbers), 4), np.nan)
         for k, name in enumerate("txyz"):
             if name in places:
                 place, factor = places[name]
