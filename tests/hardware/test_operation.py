@@ -185,6 +185,14 @@ def test_a_loop_moves_the_robot_and_keeps_the_time(robot, controller, monkeypatc
     np.testing.assert_allclose(np.diff(stamps), DT, atol=0.021)
 
 
+def test_the_reported_tip_is_in_the_robots_frame(robot):
+    seen = ROD.replace(camera=kc.robots.Camera(position=(0.01, 0.0, 0.0)))
+    plant = HardwarePlant(robot, lambda: (robot.now(), np.array([0.03, 0.0, 0.6])), DT, robot=seen)
+    plant.start()
+    np.testing.assert_allclose(plant.measure(), [0.03, 0.0, 0.6])
+    np.testing.assert_allclose(plant.tip(), [0.02, 0.0, 0.6], atol=1e-12)
+
+
 def test_a_fault_ends_the_loop_and_the_log_is_kept(robot, controller):
     plant = plant_of(robot)
     robot.inject("slack:2", after=0.6)

@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat.control import Plant
+from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.places import OwnFrame
 from knode_cosserat_hardware.driver import Driver, DriverState, HardwareError, Reading, fault_message
 from knode_cosserat_hardware.safety import EmergencyStop, SafeRegion
 
@@ -38,6 +40,7 @@ class HardwarePlant(Plant):
         size: number of measured numbers; the last three are the tip's position (m).
         region: region of the tip; None: not checked.
         emergency: emergency stop that is checked in each period.
+        robot: robot whose `Camera` states the frame of the measurements; None: its own frame.
 
     Raises:
         HardwareError: the period is not a positive number.
@@ -52,12 +55,14 @@ class HardwarePlant(Plant):
         size: int = 3,
         region: SafeRegion | None = None,
         emergency: EmergencyStop | None = None,
+        robot: System | None = None,
     ):
         if not 0.0 < dt < math.inf:
             raise HardwareError(f"dt must be a positive number of seconds (got {dt!r})")
         self.driver, self.dt = driver, float(dt)
         self._source: Source | None = source
         self._size, self._region, self._emergency = size, region, emergency
+        self._frame = None if robot is None else OwnFrame.of(robot)
         self._clock = driver.now
         #: number of commands that the driver's limits reduced
         self.reduced = 0
@@ -135,8 +140,11 @@ class HardwarePlant(Plant):
         return (self.readings[-1].tension, age) if 0.0 <= age <= self.dt else None
 
     def tip(self) -> Float[np.ndarray, "3"]:
-        """Return the last measured position of the tip (m); NaN if there is none."""
-        return np.full(3, np.nan) if self._last is None else self._last[1][-3:]
+        """Return the last measured position of the tip (m), robot's frame; NaN if there is none."""
+        if self._last is None:
+            return np.full(3, np.nan)
+        measured = self._last[1][-3:]
+        return measured if self._frame is None else self._frame.tip(measured)
 
     def _wait_for_period(self) -> None:
         if math.isnan(self._begin):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import webbrowser
 from collections.abc import Callable
 from pathlib import Path
@@ -54,7 +55,8 @@ class _TaskOptions(NamedTuple):
 
     Options:
         reference (--reference NAME|CSV): Wanted tip: circle:radius=0.1,period=4, eight:radius=0.1,period=6,
-            or a CSV table. The centre is at x=, y=, z= (m), in plane=xy, yz or xz.
+            or a CSV table with the columns time [s], x [m], y [m] and perhaps z [m], or in ms and mm. The
+            centre is at x=, y=, z= (m), in plane=xy, yz or xz.
         seconds (--seconds S): Duration (s).
         plant (--plant ROBOT): Robot that is controlled, simulated. Default: the model itself.
         noise (--noise FACTOR): Noise of the tip sensor, in multiples of 0.2 mm.
@@ -238,23 +240,74 @@ def control(
     write_output(output.as_json, facts, lines, out=output.out, export=viewer.export)
 
 
+#: titles of a reference's columns: a name, and a unit in brackets, or after a space, stroke or underscore
+_TITLE = re.compile(
+    r"(?:(t|time)|([xyz])) *(?:\[(.*)\]|\((.*)\)|[ /_] *([mc]?m|[mun]?s))?", re.IGNORECASE | re.ASCII
+)
+
+
 def parsed_reference(text: str) -> Any:
-    """Return a reference by its text, or from a CSV file with the columns t, x, y and, if tracked, z."""
+    """Return a reference by its text, or from a CSV file with the columns t (or time), x, y and perhaps z.
+
+    Units in titles, such as `x [mm]`, are those of recordings; without one, they are s and m. Without z, and
+    where a cell is empty, the coordinate is free.
+    """
     from knode_cosserat.control import table
     from knode_cosserat.control.references import ReferenceFormatError, parse_reference
 
     if not text.endswith(".csv"):
         return parse_reference(text)
-    import pandas as pd  # type: ignore[import-untyped]
+    from knode_cosserat.recordings.findings import RecordingError
+    from knode_cosserat.recordings.formats.csv_table import read_csv
+    from knode_cosserat.recordings.table import columns_of
 
     if reason := size_excess(Path(text)):
         raise ReferenceFormatError(f"{text}: {reason}")
-    rows = pd.read_csv(text)
-    missing = [name for name in ("t", "x", "y") if name not in rows]
-    if missing:
+    try:
+        if not (data := Path(text).read_bytes()).strip():
+            raise ReferenceFormatError(f"{text} is empty; allowed is a table of t, x, y and perhaps z")
+        found = read_csv(data)
+        if found.findings:  # a line of units, or comments between the rows
+            what = "allowed is one line of titles, then numbers"
+            raise ReferenceFormatError(f"{text}: {found.findings[0].message}; {what}")
+        places: dict[str, tuple[int, float]] = {}
+        for place, title in enumerate(found.numbers.columns):
+            if (known := _named(text, str(title))) is None:
+                continue
+            if known[0] in places:
+                raise ReferenceFormatError(f"{text} has several columns for {known[0]}; allowed is one")
+            places[known[0]] = place, known[1]
+        missing = [name for name in "txy" if name not in places]
+        if missing:
+            raise ReferenceFormatError(
+                f"{text} has no column {missing[0]}; a reference has t or time, x, y and perhaps z, with or "
+                "without units: t [s], x [mm]"
+            )
+        rows: Any = np.full((len(found.numbers), 4), np.nan)
+        for k, name in enumerate("txyz"):
+            if name in places:
+                place, factor = places[name]
+                rows[:, k] = factor * columns_of(found.numbers, [place])[:, 0]
+    except RecordingError as error:
+        raise ReferenceFormatError(f"{text}: {error}") from None
+    return table(rows[:, 0], rows[:, 1:])
+
+
+def _named(path: str, title: str) -> tuple[str, float] | None:
+    """Return the name of a reference's column, t, x, y or z, and the factor to s or m; None for others."""
+    from knode_cosserat.control.references import ReferenceFormatError
+    from knode_cosserat.recordings.config import POSITION_UNITS, TIME_UNITS
+    from knode_cosserat.recordings.quantities import known_unit
+
+    match = _TITLE.fullmatch(title.strip())
+    if match is None:
+        return None
+    time, axis, *spellings = match.groups()
+    units = TIME_UNITS if time else POSITION_UNITS
+    unit = next((it.strip() for it in spellings if it), "s" if time else "m")
+    unit = unit if unit in units else known_unit(unit)
+    if unit not in units:
         raise ReferenceFormatError(
-            f"{text} has no column {missing[0]}; a reference has t (s), x, y and perhaps z (m)"
+            f"{path}: the column {title!r} has an unknown unit; allowed is {', '.join(units)}"
         )
-    if "z" not in rows:
-        rows["z"] = np.nan
-    return table(rows["t"].to_numpy(), rows[["x", "y", "z"]].to_numpy())
+    return ("t" if time else axis.lower()), units[unit]

@@ -19,6 +19,7 @@ from knode_cosserat.control.planning import Knots, Tracking, Weights
 from knode_cosserat.control.references import Reference
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.places import OwnFrame, without_camera
 from knode_cosserat.solvers.refinement import fix_grid
 from knode_cosserat.solvers.simulate import simulate
 
@@ -116,6 +117,7 @@ class KoopmanController(Controller):
         """
         qp.require_daqp()
         self.dt, self.limits, self.target = float(dt), limits.of(robot), TipPosition()
+        self._frame, robot = OwnFrame.of(robot), without_camera(robot)
         self.knots = Knots.spaced(horizon, knots)
         self._tracking = Tracking(self.knots, self.limits, weights, self.target.noise, self.dt)
         self.model = _LiftedModel(*_training_motions(robot, self.dt, self.target, self.limits, seed))
@@ -133,7 +135,7 @@ class KoopmanController(Controller):
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the first control of a new plan."""
-        measured = np.asarray(measured, dtype=float)
+        measured = self._frame.tip(measured)
         if not np.all(np.isfinite(measured)):
             if self._expected is None:
                 return self.fallback("nothing was measured yet")

@@ -149,8 +149,8 @@ class LoopLog:
     Attributes:
         time: (T,) s.
         reference: (T, p), wanted at each time.
-        measured: (T, m).
-        tip: (T, 3) true or measured positions of the tip (m).
+        measured: (T, m); positions are in the frame of the robot's `Camera`.
+        tip: (T, 3) true or measured positions of the tip (m, robot's frame).
         control: (T, c).
         status: origin of each control.
         reason: reason of each fallback, else empty.

@@ -17,6 +17,7 @@ from knode_cosserat.estimation.online import Belief, Spread, errors_along
 from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.rods.system import System
 from knode_cosserat.solvers.equilibrium import equilibrium
+from knode_cosserat.solvers.places import OwnFrame, without_camera
 from knode_cosserat.solvers.refinement import fix_grid
 
 #: preload of all controls, as a part of their range: tendons only pull, so that each needs room to let go
@@ -101,6 +102,7 @@ class LQR(Controller):
             SimulationError: there is no such equilibrium.
         """
         self.dt, self.limits, self.target = float(dt), limits.of(robot), TipPosition()
+        self._frame, robot = OwnFrame.of(robot), without_camera(robot)
         low, high = np.asarray(self.limits.low), np.asarray(self.limits.high)
         #: control and output of the equilibrium
         self._control_0 = low + PRELOAD * (high - low)
@@ -133,7 +135,7 @@ class LQR(Controller):
 
     def command(self, time: float, measured: Float[np.ndarray, " p"], reference: Reference) -> Command:
         """Return the regulator's control."""
-        measured = np.asarray(measured, dtype=float)
+        measured = self._frame.tip(measured)
         expected = self._output_0 + self._C @ self._state
         error = np.where(np.isfinite(measured), measured - expected, 0.0)
         self._state = self._state + self._filter @ error

@@ -16,10 +16,12 @@ from knode_cosserat.estimation.observer import KalmanObserver
 from knode_cosserat.estimation.online import errors_of
 from knode_cosserat.estimation.outputs import Output
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.places import without_camera
 
 
 @functools.partial(jax.jit, static_argnames="target")
 def _errors(system: System, target: Output, records: Any, reference: Any) -> Any:
+    system = without_camera(system)  # references are in the robot's frame
     return jax.vmap(lambda record: errors_of(system, target, record, reference))(records)
 
 

@@ -31,6 +31,7 @@ from knode_cosserat.estimation.outputs import Output, TipPosition
 from knode_cosserat.estimation.parameters import Adapted
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.system import System
+from knode_cosserat.solvers.places import without_camera
 
 #: periods in which an old plan goes on, and then the last control is held, before the robot goes safe
 SHIFTS, HOLDS = 5, 5
@@ -240,8 +241,11 @@ def _outputs(
     d_records: Any,
     reference: Any,
 ) -> Any:
-    """Return errors of the target and the limited outputs, with their tangents, and the tip's path."""
-    system, (steps, *_, count) = structure.system(numbers), d_records.shape
+    """Return errors of the target and the limited outputs, with their tangents, and the tip's path.
+
+    All are in the robot's frame, whatever measures it.
+    """
+    system, (steps, *_, count) = without_camera(structure.system(numbers)), d_records.shape
     error, slopes = errors_along(system, target, records, d_records, reference, columns=columns)
     values, moved = [jnp.zeros((steps, 0))], [jnp.zeros((count, steps, 0))]
     for output in limited:

@@ -92,7 +92,7 @@ class Plant(abc.ABC):
         return None
 
     def tip(self) -> Float[np.ndarray, "3"]:
-        """Return the true position of the tip (m), for the report; NaN if it is not known."""
+        """Return the true position of the tip (m, robot's frame), for the report; NaN if it is not known."""
         return np.full(3, np.nan)
 
 

@@ -12,6 +12,7 @@ from knode_cosserat.control.lqr import PRELOAD
 from knode_cosserat.control.references import Reference
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.settings import NewtonOptions
+from knode_cosserat.solvers.places import OwnFrame
 from knode_cosserat.statics.arguments import static_settings
 from knode_cosserat.statics.response import first_solved, respond, tip_pose
 
@@ -31,7 +32,7 @@ class _TipFeedback(Controller):
             SimulationError: there is no equilibrium there.
         """
         self.robot, self.dt = robot, float(dt)
-        self.limits = limits.of(robot)
+        self.limits, self._frame = limits.of(robot), OwnFrame.of(robot)
         self._settings = static_settings("lobatto2", NewtonOptions())
         low, high = np.asarray(self.limits.low), np.asarray(self.limits.high)
         self.preload = low + PRELOAD * (high - low)
@@ -63,7 +64,7 @@ class _TipFeedback(Controller):
 
     def _error(self, time: float, measured: Any, reference: Reference) -> Float[np.ndarray, "3"]:
         """Return the wanted less the measured position (m); zero where either is unknown or free."""
-        error = reference.at([time])[0, :3] - np.asarray(measured, dtype=float)[:3]
+        error = reference.at([time])[0, :3] - self._frame.tip(measured)
         return np.where(np.isfinite(error), error, 0.0)
 
     def _applied(self, control: Any, total: Float[np.ndarray, "3"]) -> Command:

@@ -7,9 +7,11 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.estimation.outputs import TipPosition, final_output
 from knode_cosserat.rods.loads import PointWrench
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
+from knode_cosserat.solvers.places import OwnFrame
 from knode_cosserat.solvers.stepper import Stepper
 from knode_cosserat.trajectory import Trajectory
 
@@ -52,6 +54,8 @@ class BoundaryObserver:
         self.damping = np.sqrt(self.stiffness * mass) if damping is None else float(damping)
         # the wrench acts a period late: BDF2 damps the fast modes that it would excite
         self._stepper = Stepper(self.robot, dt, time="bdf2", initial=initial)
+        #: rotation from the frame of the measurements to the robot's
+        self._turn = OwnFrame.of(robot).turn
         self._measured: Any = None
         self._force = np.zeros(3)
 
@@ -62,8 +66,8 @@ class BoundaryObserver:
 
     def update(self, measured: Float[np.ndarray, "3"]) -> None:
         """Set the wrench of the next period from a measured tip (m); a lost measurement (NaN) sets none."""
-        tip, dt = np.asarray(self._stepper.state.tip_position[-1]), self._stepper.dt
-        error = np.asarray(measured, dtype=float)[:3] - tip
+        tip, dt = final_output(self.robot, self._stepper.state, TipPosition()), self._stepper.dt
+        error = self._turn @ (np.asarray(measured, dtype=float)[:3] - tip)
         if not np.all(np.isfinite(error)):
             self._force, self._measured = np.zeros(3), None
             return

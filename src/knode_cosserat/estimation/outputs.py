@@ -97,7 +97,11 @@ class _AtFractions(Output):
 
 @dataclasses.dataclass(frozen=True)
 class BodyPositions(_AtFractions):
-    """Positions (m) of points on the rod at fractions of its length: the global or the camera's frame."""
+    """Positions (m) of points on the rod at fractions of its length.
+
+    They are in the frame of the robot's `Camera`, if it states one; controllers track and limit them in the
+    robot's own frame.
+    """
 
     #: standard deviation (m)
     sigma: float = 2e-4
@@ -114,7 +118,7 @@ class BodyPositions(_AtFractions):
 
 @dataclasses.dataclass(frozen=True)
 class TipPosition(BodyPositions):
-    """Position (m) of the tip, global frame."""
+    """Position (m) of the tip; see `BodyPositions`."""
 
     fractions: tuple[float, ...] = (1.0,)
 

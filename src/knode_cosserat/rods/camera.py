@@ -57,8 +57,12 @@ class Camera(Part):
         if tip is not None:
             turned = jnp.vectorize(lambda h: dot(rotation_matrix(h), self.marker), signature="(4)->(3)")(tip)
             p = jnp.concatenate([p[..., :-1, :], p[..., -1:, :] + turned[..., None, :]], axis=-2)
-        turn = rotation_matrix(quaternion_of(jnp.asarray(self.rotation)))
+        turn = self.turn()
         return jnp.vectorize(lambda at: dot(turn, at), signature="(3)->(3)")(p) + self.position
+
+    def turn(self) -> Float[Any, "3 3"]:
+        """Return the matrix C of the rotation."""
+        return rotation_matrix(quaternion_of(jnp.asarray(self.rotation)))
 
     def quaternions(self, h: Float[Any, "... 4"]) -> Float[Any, "... 4"]:
         """Return measured orientations from those in the robot's frame."""

@@ -72,6 +72,35 @@ def camera_of(robot: System) -> Camera | None:
     return getattr(nominal_model(robot), "camera", None)
 
 
+def without_camera(robot: System) -> System:
+    """Return a robot of which positions and orientations are measured in its own frame."""
+    return robot if camera_of(robot) is None else robot.replace(camera=None)
+
+
+class OwnFrame(NamedTuple):
+    """Transformation of measured positions of the tip (m) to the tip in the robot's own frame."""
+
+    turn: Float[np.ndarray, "3 3"]
+    shift: Float[np.ndarray, "3"]
+
+    @classmethod
+    def of(cls, robot: System) -> OwnFrame:
+        """Return the inverse of the robot's `Camera`; the marker is where it is on the unstressed robot."""
+        camera, shift = camera_of(robot), np.zeros(3)
+        if camera is None:
+            return cls(np.eye(3), shift)
+        with contextlib.suppress(AttributeError):
+            h = Drawing.of(robot).attached(robot.rest(jnp.asarray(robot.length))[0])
+            shift = np.asarray(rotation_matrix(h)) @ np.asarray(camera.marker)
+        turn = np.asarray(camera.turn()).T
+        return cls(turn, -turn @ np.asarray(camera.position) - shift)
+
+    def tip(self, measured: Float[Any, " p"]) -> Float[np.ndarray, "3"]:
+        """Return the tip (m) in the robot's frame; NaN for coordinates on which a lost number bears."""
+        parts = self.turn * np.asarray(measured, dtype=float)[:3]
+        return np.where(self.turn == 0.0, 0.0, parts).sum(axis=1) + self.shift
+
+
 def positions_at(
     robot: System, y: Float[Any, "T N y"], places: Places, z: Float[Any, "T N z"] | None = None
 ) -> Float[Any, "T M 3"]:

@@ -212,7 +212,9 @@ def run(
     with motion_capture(machine, capture) as poses, connected(machine, yes, motion) as driver:
         with _kept_log(out), emergency_stop(driver) as emergency:
             source = tip_source(machine, poses)
-            plant = HardwarePlant(driver, source, controller.dt, region=region, emergency=emergency)
+            plant = HardwarePlant(
+                driver, source, controller.dt, region=region, emergency=emergency, robot=system
+            )
             log = kcc.run_loop(controller, plant, wanted, seconds)
             driver.disarm()
         latency = driver.latency
