@@ -92,6 +92,49 @@ def titles(layout: Layout) -> list[str]:
     return [f"{name} [{unit}]" for name, unit in zip(labels(layout), units(layout), strict=True)]
 
 
+# limits
+
+#: limits of a tension (N) and its rate (N/s) where none are given
+TENSION_LIMITS = {"low": 0.0, "high": 10.0, "rate": 40.0}
+
+
+def completed_limits(layout: Layout, given: Mapping[str, Any], options: bool = False) -> dict[str, Any]:
+    """Return limits by name: those given, else those that the robot states, else the usual ones of tensions.
+
+    Args:
+        layout: the robot's controls, of c numbers.
+        given: numbers or (c,), or None, for the wanted ones of `low`, `high` (units of the controls) and
+            `rate` (per s). Those that are None become (c,).
+        options: True if the message names options of the command line.
+
+    Raises:
+        ControlsError: a limit that is neither given, nor stated, nor of tensions.
+    """
+    limits, missing = dict(given), []
+    for name in (name for name, value in given.items() if value is None):
+        # a robot states no rates
+        stated = [getattr(field, name, np.inf) for field in layout.fields]
+        usual = [
+            TENSION_LIMITS[name] if field.name.rpartition("_")[2] == "tension" else np.nan
+            for field in layout.fields
+        ]
+        sizes = [field.size for field in layout.fields]
+        limits[name] = np.repeat(np.where(np.isfinite(stated), stated, usual), sizes)
+        if np.any(np.isnan(limits[name])):
+            missing.append(f"--{name}" if options else name)
+    if missing:
+        names = ", ".join(f"{field.name} ({field.unit})" for field in layout.fields)
+        *most, last = missing
+        listed = (f"{', '.join(most)} and {last}" if most else last) + (
+            "" if options else " of ControlLimits"
+        )
+        raise ControlsError(
+            f"limits are needed for the controls {names}: give {listed}, one number for all, or one for each "
+            f"of {layout.size}"
+        )
+    return limits
+
+
 # signals
 
 

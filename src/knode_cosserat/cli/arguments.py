@@ -170,6 +170,18 @@ def parse_limits(option: str, text: str, count: int) -> float | list[float]:
     return numbers[0] if len(numbers) == 1 else numbers
 
 
+def limits_of(robot: System, **texts: str | None) -> dict[str, Any]:
+    """Return limits of a robot's controls by name from the texts of their options; None: not given."""
+    from knode_cosserat.controls import completed_limits
+
+    layout = robot.control_layout
+    given = {
+        name: None if text is None else parse_limits(f"--{name}", text, layout.size)
+        for name, text in texts.items()
+    }
+    return completed_limits(layout, given, options=True)
+
+
 # robots and models
 
 
