@@ -70,6 +70,15 @@ def test_step_of_other_tendons():
     assert tensions.tolist() == [[3, 3, 3], [3, 3, 3], [3, 1, 3], [3, 1, 3]]
 
 
+@pytest.mark.parametrize("signal", [controls.step, controls.ramp])
+@pytest.mark.parametrize(("count", "named"), [(1, [0]), (2, [0, 1]), (3, [0, 2]), (4, [0, 3]), (6, [0, 5])])
+def test_the_first_and_the_last_tendon_are_named_by_default(signal, count, named):
+    tensions = signal(2.0, 60, DT, count=count)
+    assert np.flatnonzero(np.ptp(tensions, axis=0)).tolist() == named
+    word = "step:2" if signal is controls.step else "ramp:2"
+    assert np.array_equal(controls.parse(word, 60, DT, count), tensions)
+
+
 def test_ramp():
     tensions = controls.ramp(2.0, 8, 0.5, start=1.0, end=3.0, tendons=(2,), sampled="end")
     assert tensions[:, 2] == pytest.approx([5, 5, 5.5, 6, 6.5, 7, 7, 7])
@@ -311,6 +320,7 @@ def test_a_link_stays_one_and_a_pipe_too(tmp_path):
         ("sine:1.5,base=8,amplitude=2", lambda: controls.sine(1.5, 40, DT, base=8, amplitude=2)),
         ("step:1.5", lambda: controls.step(1.5, 40, DT)),
         ("step:2, at=0.5, tendons=2+3", lambda: controls.step(2, 40, DT, at=0.5, tendons=(1, 2))),
+        ("ramp:2,tendons=2, 3,base=4", lambda: controls.ramp(2, 40, DT, base=4, tendons=(1, 2))),
         ("ramp:2", lambda: controls.ramp(2, 40, DT)),
         ("ramp:2,start=1,end=1.5", lambda: controls.ramp(2, 40, DT, start=1, end=1.5)),
         ("random:7", lambda: controls.random(40, seed=7)),
@@ -354,8 +364,10 @@ def test_a_file_as_specification(tmp_path):
         ("constant:5,base=5", ["'base=5' is not understood", "nothing"]),
         ("random:1.5", ["seed is '1.5'", "a whole number"]),
         ("random:1,hold=x", ["hold is 'x'", "a whole number"]),
-        ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1+4"]),
+        ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1,4"]),
         ("step:1,tendons=5", ["tendons is 5", "numbers from 1 to 4"]),
+        ("step:1,tendons=0,1", ["tendons is 0,1", "numbers from 1 to 4, such as 1,4"]),
+        ("step:1,2,tendons=1", ["'2' is not understood"]),
         ("constant:-1", ["'constant:-1'", "a tension is -1 N"]),
         ("constant:nan", ["tension is nan"]),
         ("x" * 5000, ["no such signal or file"]),

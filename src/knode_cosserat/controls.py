@@ -180,11 +180,14 @@ def step(
     *,
     base: float = 5.0,
     at: float = 1.5,
-    tendons: Sequence[int] = (0, 3),
+    tendons: Sequence[int] | None = None,
     count: int = 4,
     sampled: Sampled = "middle",
 ) -> Tensions:
-    """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
+    """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s).
+
+    The named tendons are by default the first and the last, as in the paper's studies of four.
+    """
     check_arguments(step, locals(), ControlsError)
     _require_numbers(height=height, base=base, at=at)
     t = step_times(steps, dt, sampled)
@@ -199,13 +202,14 @@ def ramp(
     base: float = 5.0,
     start: float = 0.0,
     end: float | None = None,
-    tendons: Sequence[int] = (0, 3),
+    tendons: Sequence[int] | None = None,
     count: int = 4,
     sampled: Sampled = "middle",
 ) -> Tensions:
     """Return `base` (N) in `count` tendons, with a linear rise by `height` (N) in the named tendons.
 
-    The rise is from `start` to `end` (s), by default until the last step. The tension is constant after.
+    The rise is from `start` to `end` (s), by default until the last step. The tension is constant after. The
+    named tendons are by default the first and the last.
     """
     check_arguments(ramp, locals(), ControlsError)
     t = step_times(steps, dt, sampled)
@@ -255,8 +259,11 @@ def ramp_values(t: Any, height: Any, base: Any, start: Any, end: Any) -> Any:
     return base + height * np.clip((t - start) / (end - start), 0.0, 1.0)
 
 
-def _in_tendons(signal: str, values: np.ndarray, base: float, tendons: Sequence[int], count: int) -> Tensions:
+def _in_tendons(
+    signal: str, values: np.ndarray, base: float, tendons: Sequence[int] | None, count: int
+) -> Tensions:
     _require_counts(count=count)
+    tendons = (0, count - 1) if tendons is None else tendons
     if not set(tendons) <= set(range(count)):
         raise ControlsError(f"{signal}: tendons is {tendons!r}; allowed is numbers from 0 to {count - 1}")
     tensions = np.full((len(values), count), float(base))
@@ -508,7 +515,7 @@ def parse(
 
     Words of tensions are for all tendons: `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`, that
     is, the signal and its first number (period in s, height in N, height in N, seed, tension in N). Other
-    arguments have names: `sine:1.5,base=8,amplitude=2`, `step:1.5,at=2,tendons=1+4` (tendons from 1).
+    arguments have names: `sine:1.5,base=8,amplitude=2`, `step:1.5,at=2,tendons=1,4` (tendons from 1).
 
     For any controls of a robot, the word has signals by name: `tension_4=ramp:2`, or
     `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
@@ -633,8 +640,11 @@ def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
     """Return the arguments of a signal from the text after its colon: `1.5,base=8`."""
     first, *others = text.split(",")
     kinds: dict[str, Any] = {signal.main: int if signal.main == "seed" else float, **signal.options}
-    texts = {signal.main: first}
+    texts, key = {signal.main: first}, signal.main
     for other in others:
+        if key == "tendons" and "=" not in other:
+            texts[key] += f"+{other}"
+            continue
         key, _, value = (part.strip() for part in other.partition("="))
         if key not in signal.options or key in texts:
             allowed = ", ".join(f"{option}=…" for option in signal.options) or "nothing"
@@ -645,7 +655,7 @@ def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
         try:
             arguments[key] = kinds[key](word)
         except ValueError:
-            allowed = {int: "a whole number", _tendons: "tendons like 1+4"}.get(kinds[key], "a number")
+            allowed = {int: "a whole number", _tendons: "tendons like 1,4"}.get(kinds[key], "a number")
             raise ControlsError(f"{key} is {word!r}; allowed is {allowed}") from None
     return arguments
 
@@ -663,9 +673,9 @@ def _tension_signal(name: str, text: str, steps: int, times: tuple[float, Sample
         raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
     arguments = _arguments(signal, text)
     if not set(raised := arguments.get("tendons", ())) <= set(range(tendons)):
-        listed = "+".join(str(k + 1) for k in raised)
+        listed = ",".join(str(k + 1) for k in raised)
         raise ControlsError(
-            f"tendons is {listed}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
+            f"tendons is {listed}; allowed is numbers from 1 to {tendons}, such as 1,{tendons}"
         )
     parameters = _parameters_of(signal.make)
     arguments |= {"steps": steps, "count" if "count" in parameters else "tendons": tendons}

@@ -47,8 +47,9 @@ class _SimulationOptions(NamedTuple):
 
     Options:
         controls (--controls CONTROLS): Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or
-            step:HEIGHT,at=S), ramp:HEIGHT (N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV
-            file. Any controls by name: NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat
+            step:HEIGHT,at=S), ramp:HEIGHT (N; in the first and last tendon, or
+            ramp:HEIGHT,tendons=1,3), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any
+            controls by name: NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat
             info ROBOT` lists the names), the others zero; or none.
         steps (--steps N): Number of time steps; required unless a file gives the controls.
         dt (--dt S): Time step (s). Default: 0.05, or the file's.
