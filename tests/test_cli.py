@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.cli.program import joined_vectors
+from knode_cosserat.cli.robots import Held
 from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
@@ -224,6 +226,20 @@ def test_equilibrium_estimates_its_error_and_warns_of_a_coarse_grid():
 def test_vectors_may_be_separated_by_commas_or_spaces(given):
     control = told("equilibrium", ROBOT, *given)["control"]
     assert control == [7.0, 5.0, 5.0, 7.0]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("rotation_1=180deg,insertion_1=-2mm", "rotation_3=0.25 rev"),
+        ("insertion_1 = -2 mm; rotation_1 = 180 deg  rotation_3 = 90 °",),
+        ("180deg, -2 mm, 0, 0, 90 deg, 0",),
+    ],
+)
+def test_controls_may_have_units(given):
+    control = joined_vectors(["--control", *given])[1]
+    found = Held(control=control).of(kc.load_robot("three-tube-robot"))
+    np.testing.assert_allclose(found, [np.pi, -0.002, 0.0, 0.0, np.pi / 2, 0.0], rtol=1e-15)
 
 
 def test_parameters_that_are_vectors():

@@ -521,6 +521,22 @@ def test_tendons_have_names_too_and_the_others_are_slack(word, expected):
     np.testing.assert_array_equal(controls.parse(word, 4, 0.05, ROBOT.control_layout), found)
 
 
+@pytest.mark.parametrize(
+    ("robot", "word", "plain"),
+    [
+        (ROD, "base_z=20mm;base_ry=180 deg", "base_z=0.02;base_ry=3.141592653589793"),
+        (ROD, "base_z=ramp:20 mm,base=-1cm,end=150ms", "base_z=ramp:0.02,base=-0.01,end=0.15"),
+        (ROD, "base_ry=sine:400ms,amplitude=10deg,phase=0.25rev",
+         "base_ry=sine:0.4,amplitude=0.17453292519943295,phase=1.5707963267948966"),
+        (ROBOT, "tension_2=500 gf", "tension_2=4.905"),
+        (ROBOT, "step:100gf,base=5N,at=50ms", "step:0.981,base=5,at=0.05"),
+    ],
+)  # fmt: skip
+def test_numbers_of_signals_may_have_units(robot, word, plain):
+    found = controls.parse(word, 8, DT, robot)
+    np.testing.assert_allclose(found, controls.parse(plain, 8, DT, robot), rtol=1e-14)
+
+
 def test_signals_of_the_paper_are_still_for_all_tendons():
     for word in ("sine:0.2,base=8", "ramp:2,tendons=4", "7,5,5,7"):
         np.testing.assert_array_equal(controls.parse(word, 4, 0.05, ROBOT), kc.controls.parse(word, 4, 0.05))
@@ -539,6 +555,9 @@ REELS = kc.load_robot("delrin-routed-tendon-robot").replace(drive="reel")
         (ROD, "base_z=sine:1e-320", ["'base_z=sine:1e-320'", "a value is nan", "finite"]),
         (ROD, "base_z=constant:1; base_ry=ramp:1e308,base=1e308", ["'base_ry=ramp:", "a value is inf"]),
         (ROD, "base_z=sine:0", ["period is 0.0"]),
+        (ROD, "base_z=3 kPa", ["value is '3 kPa'", "kPa is no unit of a number in m"]),
+        (ROD, "base_z=3 furlong", ["the unit 'furlong' is not known"]),
+        (ROD, "base_z=sine:1 mm", ["period is '1 mm'", "mm is no unit of a number in s"]),
         (ROD, "base_z=step:1,at=nan", ["at is 'nan'", "a number"]),
         (ROD, "base_z=ramp:1; base_x=ramp:1;base_z=constant:2",
          ["'base_z=constant:2': base_z is given already, by 'base_z=ramp:1'", "each control once"]),

@@ -27,7 +27,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
-from knode_cosserat._units import factors_of
+from knode_cosserat._units import UnitError, factors_of, in_unit
 from knode_cosserat.errors import KnodeCosseratError
 
 if TYPE_CHECKING:
@@ -498,6 +498,9 @@ _TENSIONS = {
     "constant": _Signal(constant, "tension", {}),
 }
 
+#: units of the numbers of signals that are not in that of the control
+_UNITS = {"period": "s", "at": "s", "start": "s", "end": "s", "phase": "rad"}
+
 _SPECIFICATIONS = (
     ", ".join(f"{name}:{signal.main.upper()}" for name, signal in _TENSIONS.items())
     + ", one number for each tendon, or a CSV file"
@@ -521,7 +524,7 @@ def parse(
     `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
     control is given at most once, and the others are zero; `none` stands for zeros. Signals are a number or
     `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
-    `sine:PERIOD[,base=,amplitude=,phase=]`.
+    `sine:PERIOD[,base=,amplitude=,phase=]`. Numbers are in SI units, or have one: `rotation_1=180deg`.
 
     Numbers are a constant control, one for each: `7,5,5,7` or `constant:7,5,5,7`. Anything else is a CSV file
     of tensions, as for `load`, or with the columns `time [s]` and any names of controls with their units; it
@@ -636,8 +639,8 @@ def _from_file(path: str, layout: Layout, steps: int | None, dt: float) -> Array
     return rows[:steps]
 
 
-def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
-    """Return the arguments of a signal from the text after its colon: `1.5,base=8`."""
+def _arguments(signal: _Signal, text: str, unit: str) -> dict[str, Any]:
+    """Return the arguments of a signal of controls in a unit from the text after its colon: `1.5,base=8`."""
     first, *others = text.split(",")
     kinds: dict[str, Any] = {signal.main: int if signal.main == "seed" else float, **signal.options}
     texts, key = {signal.main: first}, signal.main
@@ -653,7 +656,10 @@ def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
     arguments = {}
     for key, word in texts.items():
         try:
-            arguments[key] = kinds[key](word)
+            number = None if kinds[key] in (int, _tendons) else in_unit(word, _UNITS.get(key, unit))
+            arguments[key] = kinds[key](word) if number is None else number
+        except UnitError as error:
+            raise ControlsError(f"{key} is {word!r}: {error}") from None
         except ValueError:
             allowed = {int: "a whole number", _tendons: "tendons like 1,4"}.get(kinds[key], "a number")
             raise ControlsError(f"{key} is {word!r}; allowed is {allowed}") from None
@@ -671,7 +677,7 @@ def _tension_signal(name: str, text: str, steps: int, times: tuple[float, Sample
     if not text.partition(",")[0].strip():
         example = f"{name}:{ {'seed': '0', 'tension': '5'}.get(signal.main, '1.5') }"
         raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
-    arguments = _arguments(signal, text)
+    arguments = _arguments(signal, text, "N")
     if not set(raised := arguments.get("tendons", ())) <= set(range(tendons)):
         listed = ",".join(str(k + 1) for k in raised)
         raise ControlsError(
@@ -725,7 +731,7 @@ def parse_signals(
         # a very short period, for example, overflows: the check below refuses it without a NumPy warning
         try:
             with np.errstate(all="ignore"):
-                values = _signal(text, times[sampled], sampled)
+                values = _signal(text, times[sampled], sampled, units(layout)[columns[0]])
         except ControlsError as error:
             raise ControlsError(f"controls {entry!r}: {error}") from None
         if not np.all(np.isfinite(values)):
@@ -783,14 +789,17 @@ _SIGNALS = {
 }
 
 
-def _signal(word: str, t: Float[np.ndarray, " steps"], sampled: Sampled) -> Float[np.ndarray, " steps"]:
-    name, _, text = word.partition(":") if numbers_in(word) is None else ("constant", "", word)
+def _signal(
+    word: str, t: Float[np.ndarray, " steps"], sampled: Sampled, unit: str
+) -> Float[np.ndarray, " steps"]:
+    is_number = numbers_in(word) is not None or re.fullmatch(r"[-+.\d][^,;:=]*", word)
+    name, _, text = ("constant", "", word) if is_number else word.partition(":")
     if name not in _SIGNALS:
         raise ControlsError(
             f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}{did_you_mean(name, _SIGNALS)}"
         )
     signal = _SIGNALS[name]
-    arguments = _arguments(signal, text)
+    arguments = _arguments(signal, text, unit)
     values = np.asarray(signal.make(t, **arguments))
     if len(t) > 1 and name != "constant" and np.all(np.isfinite(values)):
         stated = {**(signal.make.__kwdefaults__ or {}), **arguments}
