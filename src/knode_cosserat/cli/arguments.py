@@ -194,9 +194,10 @@ def _parse_limits_with_units(option: str, text: str, units: Sequence[str], per: 
             in_si = [in_unit(word, f"{unit or 1}{per}") for word, unit in zip(words, units, strict=True)]
         except UnitError as error:
             raise ValueError(f"{option} is {text!r}: {error}") from None
-        text = ",".join(
+        plain = ",".join(
             word if number is None else repr(number) for word, number in zip(words, in_si, strict=True)
         )
+        text = text if numbers_in(plain) is None else plain
     return parse_limits(option, text, len(units))
 
 
