@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.cli.arguments import limits_of
+from knode_cosserat.cli.program import joined_vectors
+from knode_cosserat.cli.robots import Held
 from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
@@ -224,6 +227,42 @@ def test_equilibrium_estimates_its_error_and_warns_of_a_coarse_grid():
 def test_vectors_may_be_separated_by_commas_or_spaces(given):
     control = told("equilibrium", ROBOT, *given)["control"]
     assert control == [7.0, 5.0, 5.0, 7.0]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        ("rotation_1=180deg,insertion_1=-2mm", "rotation_3=0.25 rev"),
+        ("insertion_1 = -2 mm; rotation_1 = 180 deg  rotation_3 = 90 °",),
+        ("180deg, -2 mm, 0, 0, 90 deg, 0",),
+    ],
+)
+def test_controls_may_have_units(given):
+    control = joined_vectors(["--control", *given])[1]
+    found = Held(control=control).of(kc.load_robot("three-tube-robot"))
+    np.testing.assert_allclose(found, [np.pi, -0.002, 0.0, 0.0, np.pi / 2, 0.0], rtol=1e-15)
+
+
+def test_limits_may_have_units():
+    tubes, tendons = kc.load_robot("three-tube-robot"), kc.load_robot(ROBOT)
+    found = limits_of(
+        tubes, low="0,-50 mm,0,-3cm,0,-0.02", high="1rev,0,360deg,0,6.283185307179586,0", rate="1"
+    )
+    assert found["low"] == [0.0, -0.05, 0.0, -0.03, 0.0, -0.02] and found["rate"] == 1.0
+    np.testing.assert_allclose(found["high"], [2 * np.pi, 0.0] * 3, rtol=1e-15)
+    assert limits_of(tendons, high="500 gf")["high"] == [4.905] * 4
+    assert limits_of(tendons, rate="10 N/s", low=None) == {
+        "rate": [10.0] * 4,
+        "low": pytest.approx([0.0] * 4),
+    }
+    for wrong, message in (
+        ({"high": "20 mm"}, "--high is '20 mm': mm is no unit of a number in N"),
+        ({"rate": "20 N"}, "--rate is '20 N': N is no unit of a number in N/s"),
+        ({"low": "1 N,b,2,3"}, r"--low must be one number for all controls, or 4"),
+        ({"low": "1 N,2"}, r"--low must be one number .* \(got '1 N,2'\)"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            limits_of(tendons, **wrong)
 
 
 def test_parameters_that_are_vectors():

@@ -70,6 +70,15 @@ def test_step_of_other_tendons():
     assert tensions.tolist() == [[3, 3, 3], [3, 3, 3], [3, 1, 3], [3, 1, 3]]
 
 
+@pytest.mark.parametrize("signal", [controls.step, controls.ramp])
+@pytest.mark.parametrize(("count", "named"), [(1, [0]), (2, [0, 1]), (3, [0, 2]), (4, [0, 3]), (6, [0, 5])])
+def test_the_first_and_the_last_tendon_are_named_by_default(signal, count, named):
+    tensions = signal(2.0, 60, DT, count=count)
+    assert np.flatnonzero(np.ptp(tensions, axis=0)).tolist() == named
+    word = "step:2" if signal is controls.step else "ramp:2"
+    assert np.array_equal(controls.parse(word, 60, DT, count), tensions)
+
+
 def test_ramp():
     tensions = controls.ramp(2.0, 8, 0.5, start=1.0, end=3.0, tendons=(2,), sampled="end")
     assert tensions[:, 2] == pytest.approx([5, 5, 5.5, 6, 6.5, 7, 7, 7])
@@ -311,6 +320,7 @@ def test_a_link_stays_one_and_a_pipe_too(tmp_path):
         ("sine:1.5,base=8,amplitude=2", lambda: controls.sine(1.5, 40, DT, base=8, amplitude=2)),
         ("step:1.5", lambda: controls.step(1.5, 40, DT)),
         ("step:2, at=0.5, tendons=2+3", lambda: controls.step(2, 40, DT, at=0.5, tendons=(1, 2))),
+        ("ramp:2,tendons=2, 3,base=4", lambda: controls.ramp(2, 40, DT, base=4, tendons=(1, 2))),
         ("ramp:2", lambda: controls.ramp(2, 40, DT)),
         ("ramp:2,start=1,end=1.5", lambda: controls.ramp(2, 40, DT, start=1, end=1.5)),
         ("random:7", lambda: controls.random(40, seed=7)),
@@ -354,8 +364,10 @@ def test_a_file_as_specification(tmp_path):
         ("constant:5,base=5", ["'base=5' is not understood", "nothing"]),
         ("random:1.5", ["seed is '1.5'", "a whole number"]),
         ("random:1,hold=x", ["hold is 'x'", "a whole number"]),
-        ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1+4"]),
+        ("step:1,tendons=a", ["tendons is 'a'", "tendons like 1,4"]),
         ("step:1,tendons=5", ["tendons is 5", "numbers from 1 to 4"]),
+        ("step:1,tendons=0,1", ["tendons is 0,1", "numbers from 1 to 4, such as 1,4"]),
+        ("step:1,2,tendons=1", ["'2' is not understood"]),
         ("constant:-1", ["'constant:-1'", "a tension is -1 N"]),
         ("constant:nan", ["tension is nan"]),
         ("x" * 5000, ["no such signal or file"]),
@@ -509,6 +521,22 @@ def test_tendons_have_names_too_and_the_others_are_slack(word, expected):
     np.testing.assert_array_equal(controls.parse(word, 4, 0.05, ROBOT.control_layout), found)
 
 
+@pytest.mark.parametrize(
+    ("robot", "word", "plain"),
+    [
+        (ROD, "base_z=20mm;base_ry=180 deg", "base_z=0.02;base_ry=3.141592653589793"),
+        (ROD, "base_z=ramp:20 mm,base=-1cm,end=150ms", "base_z=ramp:0.02,base=-0.01,end=0.15"),
+        (ROD, "base_ry=sine:400ms,amplitude=10deg,phase=0.25rev",
+         "base_ry=sine:0.4,amplitude=0.17453292519943295,phase=1.5707963267948966"),
+        (ROBOT, "tension_2=500 gf", "tension_2=4.905"),
+        (ROBOT, "step:100gf,base=5N,at=50ms", "step:0.981,base=5,at=0.05"),
+    ],
+)  # fmt: skip
+def test_numbers_of_signals_may_have_units(robot, word, plain):
+    found = controls.parse(word, 8, DT, robot)
+    np.testing.assert_allclose(found, controls.parse(plain, 8, DT, robot), rtol=1e-14)
+
+
 def test_signals_of_the_paper_are_still_for_all_tendons():
     for word in ("sine:0.2,base=8", "ramp:2,tendons=4", "7,5,5,7"):
         np.testing.assert_array_equal(controls.parse(word, 4, 0.05, ROBOT), kc.controls.parse(word, 4, 0.05))
@@ -527,6 +555,9 @@ REELS = kc.load_robot("delrin-routed-tendon-robot").replace(drive="reel")
         (ROD, "base_z=sine:1e-320", ["'base_z=sine:1e-320'", "a value is nan", "finite"]),
         (ROD, "base_z=constant:1; base_ry=ramp:1e308,base=1e308", ["'base_ry=ramp:", "a value is inf"]),
         (ROD, "base_z=sine:0", ["period is 0.0"]),
+        (ROD, "base_z=3 kPa", ["value is '3 kPa'", "kPa is no unit of a number in m"]),
+        (ROD, "base_z=3 furlong", ["the unit 'furlong' is not known"]),
+        (ROD, "base_z=sine:1 mm", ["period is '1 mm'", "mm is no unit of a number in s"]),
         (ROD, "base_z=step:1,at=nan", ["at is 'nan'", "a number"]),
         (ROD, "base_z=ramp:1; base_x=ramp:1;base_z=constant:2",
          ["'base_z=constant:2': base_z is given already, by 'base_z=ramp:1'", "each control once"]),

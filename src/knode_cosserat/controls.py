@@ -27,7 +27,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
-from knode_cosserat._units import factors_of
+from knode_cosserat._units import UnitError, factors_of, in_unit
 from knode_cosserat.errors import KnodeCosseratError
 
 if TYPE_CHECKING:
@@ -92,6 +92,49 @@ def titles(layout: Layout) -> list[str]:
     return [f"{name} [{unit}]" for name, unit in zip(labels(layout), units(layout), strict=True)]
 
 
+# limits
+
+#: limits of a tension (N) and its rate (N/s) where none are given
+TENSION_LIMITS = {"low": 0.0, "high": 10.0, "rate": 40.0}
+
+
+def completed_limits(layout: Layout, given: Mapping[str, Any], options: bool = False) -> dict[str, Any]:
+    """Return limits by name: those given, else those that the robot states, else the usual ones of tensions.
+
+    Args:
+        layout: the robot's controls, of c numbers.
+        given: numbers or (c,), or None, for the wanted ones of `low`, `high` (units of the controls) and
+            `rate` (per s). Those that are None become (c,).
+        options: True if the message names options of the command line.
+
+    Raises:
+        ControlsError: a limit that is neither given, nor stated, nor of tensions.
+    """
+    limits, missing = dict(given), []
+    for name in (name for name, value in given.items() if value is None):
+        # a robot states no rates
+        stated = [getattr(field, name, np.inf) for field in layout.fields]
+        usual = [
+            TENSION_LIMITS[name] if field.name.rpartition("_")[2] == "tension" else np.nan
+            for field in layout.fields
+        ]
+        sizes = [field.size for field in layout.fields]
+        limits[name] = np.repeat(np.where(np.isfinite(stated), stated, usual), sizes)
+        if np.any(np.isnan(limits[name])):
+            missing.append(f"--{name}" if options else name)
+    if missing:
+        names = ", ".join(f"{field.name} ({field.unit})" for field in layout.fields)
+        *most, last = missing
+        listed = (f"{', '.join(most)} and {last}" if most else last) + (
+            "" if options else " of ControlLimits"
+        )
+        raise ControlsError(
+            f"limits are needed for the controls {names}: give {listed}, one number for all, or one for each "
+            f"of {layout.size}"
+        )
+    return limits
+
+
 # signals
 
 
@@ -137,11 +180,14 @@ def step(
     *,
     base: float = 5.0,
     at: float = 1.5,
-    tendons: Sequence[int] = (0, 3),
+    tendons: Sequence[int] | None = None,
     count: int = 4,
     sampled: Sampled = "middle",
 ) -> Tensions:
-    """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s)."""
+    """Return `base` (N) in `count` tendons, and base + height in the named tendons from t = at (s).
+
+    The named tendons are by default the first and the last, as in the paper's studies of four.
+    """
     check_arguments(step, locals(), ControlsError)
     _require_numbers(height=height, base=base, at=at)
     t = step_times(steps, dt, sampled)
@@ -156,13 +202,14 @@ def ramp(
     base: float = 5.0,
     start: float = 0.0,
     end: float | None = None,
-    tendons: Sequence[int] = (0, 3),
+    tendons: Sequence[int] | None = None,
     count: int = 4,
     sampled: Sampled = "middle",
 ) -> Tensions:
     """Return `base` (N) in `count` tendons, with a linear rise by `height` (N) in the named tendons.
 
-    The rise is from `start` to `end` (s), by default until the last step. The tension is constant after.
+    The rise is from `start` to `end` (s), by default until the last step. The tension is constant after. The
+    named tendons are by default the first and the last.
     """
     check_arguments(ramp, locals(), ControlsError)
     t = step_times(steps, dt, sampled)
@@ -212,8 +259,11 @@ def ramp_values(t: Any, height: Any, base: Any, start: Any, end: Any) -> Any:
     return base + height * np.clip((t - start) / (end - start), 0.0, 1.0)
 
 
-def _in_tendons(signal: str, values: np.ndarray, base: float, tendons: Sequence[int], count: int) -> Tensions:
+def _in_tendons(
+    signal: str, values: np.ndarray, base: float, tendons: Sequence[int] | None, count: int
+) -> Tensions:
     _require_counts(count=count)
+    tendons = (0, count - 1) if tendons is None else tendons
     if not set(tendons) <= set(range(count)):
         raise ControlsError(f"{signal}: tendons is {tendons!r}; allowed is numbers from 0 to {count - 1}")
     tensions = np.full((len(values), count), float(base))
@@ -448,6 +498,9 @@ _TENSIONS = {
     "constant": _Signal(constant, "tension", {}),
 }
 
+#: units of the numbers of signals that are not in that of the control
+_UNITS = {"period": "s", "at": "s", "start": "s", "end": "s", "phase": "rad"}
+
 _SPECIFICATIONS = (
     ", ".join(f"{name}:{signal.main.upper()}" for name, signal in _TENSIONS.items())
     + ", one number for each tendon, or a CSV file"
@@ -465,13 +518,13 @@ def parse(
 
     Words of tensions are for all tendons: `sine:1.5`, `step:1.5`, `ramp:2`, `random:0`, `constant:5`, that
     is, the signal and its first number (period in s, height in N, height in N, seed, tension in N). Other
-    arguments have names: `sine:1.5,base=8,amplitude=2`, `step:1.5,at=2,tendons=1+4` (tendons from 1).
+    arguments have names: `sine:1.5,base=8,amplitude=2`, `step:1.5,at=2,tendons=1,4` (tendons from 1).
 
     For any controls of a robot, the word has signals by name: `tension_4=ramp:2`, or
     `base_z=ramp:0.1;reel_1=sine:2,amplitude=0.01`. The name of a field stands for all its numbers. Each
     control is given at most once, and the others are zero; `none` stands for zeros. Signals are a number or
     `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
-    `sine:PERIOD[,base=,amplitude=,phase=]`.
+    `sine:PERIOD[,base=,amplitude=,phase=]`. Numbers are in SI units, or have one: `rotation_1=180deg`.
 
     Numbers are a constant control, one for each: `7,5,5,7` or `constant:7,5,5,7`. Anything else is a CSV file
     of tensions, as for `load`, or with the columns `time [s]` and any names of controls with their units; it
@@ -586,12 +639,15 @@ def _from_file(path: str, layout: Layout, steps: int | None, dt: float) -> Array
     return rows[:steps]
 
 
-def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
-    """Return the arguments of a signal from the text after its colon: `1.5,base=8`."""
+def _arguments(signal: _Signal, text: str, unit: str) -> dict[str, Any]:
+    """Return the arguments of a signal of controls in a unit from the text after its colon: `1.5,base=8`."""
     first, *others = text.split(",")
     kinds: dict[str, Any] = {signal.main: int if signal.main == "seed" else float, **signal.options}
-    texts = {signal.main: first}
+    texts, key = {signal.main: first}, signal.main
     for other in others:
+        if key == "tendons" and "=" not in other:
+            texts[key] += f"+{other}"
+            continue
         key, _, value = (part.strip() for part in other.partition("="))
         if key not in signal.options or key in texts:
             allowed = ", ".join(f"{option}=…" for option in signal.options) or "nothing"
@@ -600,9 +656,12 @@ def _arguments(signal: _Signal, text: str) -> dict[str, Any]:
     arguments = {}
     for key, word in texts.items():
         try:
-            arguments[key] = kinds[key](word)
+            number = None if kinds[key] in (int, _tendons) else in_unit(word, _UNITS.get(key, unit))
+            arguments[key] = kinds[key](word) if number is None else number
+        except UnitError as error:
+            raise ControlsError(f"{key} is {word!r}: {error}") from None
         except ValueError:
-            allowed = {int: "a whole number", _tendons: "tendons like 1+4"}.get(kinds[key], "a number")
+            allowed = {int: "a whole number", _tendons: "tendons like 1,4"}.get(kinds[key], "a number")
             raise ControlsError(f"{key} is {word!r}; allowed is {allowed}") from None
     return arguments
 
@@ -618,11 +677,11 @@ def _tension_signal(name: str, text: str, steps: int, times: tuple[float, Sample
     if not text.partition(",")[0].strip():
         example = f"{name}:{ {'seed': '0', 'tension': '5'}.get(signal.main, '1.5') }"
         raise ControlsError(f"{signal.main} is missing; allowed is {name}:NUMBER, such as {example}")
-    arguments = _arguments(signal, text)
+    arguments = _arguments(signal, text, "N")
     if not set(raised := arguments.get("tendons", ())) <= set(range(tendons)):
-        listed = "+".join(str(k + 1) for k in raised)
+        listed = ",".join(str(k + 1) for k in raised)
         raise ControlsError(
-            f"tendons is {listed}; allowed is numbers from 1 to {tendons}, such as 1+{tendons}"
+            f"tendons is {listed}; allowed is numbers from 1 to {tendons}, such as 1,{tendons}"
         )
     parameters = _parameters_of(signal.make)
     arguments |= {"steps": steps, "count" if "count" in parameters else "tendons": tendons}
@@ -672,7 +731,7 @@ def parse_signals(
         # a very short period, for example, overflows: the check below refuses it without a NumPy warning
         try:
             with np.errstate(all="ignore"):
-                values = _signal(text, times[sampled], sampled)
+                values = _signal(text, times[sampled], sampled, units(layout)[columns[0]])
         except ControlsError as error:
             raise ControlsError(f"controls {entry!r}: {error}") from None
         if not np.all(np.isfinite(values)):
@@ -730,14 +789,17 @@ _SIGNALS = {
 }
 
 
-def _signal(word: str, t: Float[np.ndarray, " steps"], sampled: Sampled) -> Float[np.ndarray, " steps"]:
-    name, _, text = word.partition(":") if numbers_in(word) is None else ("constant", "", word)
+def _signal(
+    word: str, t: Float[np.ndarray, " steps"], sampled: Sampled, unit: str
+) -> Float[np.ndarray, " steps"]:
+    is_number = numbers_in(word) is not None or re.fullmatch(r"[-+.\d][^,;:=]*", word)
+    name, _, text = ("constant", "", word) if is_number else word.partition(":")
     if name not in _SIGNALS:
         raise ControlsError(
             f"the signal {word!r} is unknown; allowed is {', '.join(_SIGNALS)}{did_you_mean(name, _SIGNALS)}"
         )
     signal = _SIGNALS[name]
-    arguments = _arguments(signal, text)
+    arguments = _arguments(signal, text, unit)
     values = np.asarray(signal.make(t, **arguments))
     if len(t) > 1 and name != "constant" and np.all(np.isfinite(values)):
         stated = {**(signal.make.__kwdefaults__ or {}), **arguments}

@@ -85,6 +85,11 @@ def test_references_begin_at_their_centre_and_reach_their_radius():
     [
         (circle(0.1, 4.0, plane="yz", centre=[0.28, 0.0, 0.02]), 0, [0.28, 0.0, 0.02]),
         (parse_reference("circle:radius=0.1,period=4,plane=yz,x=0.28,z=0.02"), 0, [0.28, 0.0, 0.02]),
+        (
+            parse_reference("circle:radius=10cm,period=4000 ms,rise=2s,plane=xz,z=300mm"),
+            1,
+            [0.0, np.nan, 0.3],
+        ),
         (parse_reference("circle:radius=0.1,period=4,plane=xz,z=0.3"), 1, [0.0, np.nan, 0.3]),
         (parse_reference("eight:radius=0.1,period=4,plane=zy,y=-0.1"), 0, [np.nan, -0.1, 0.0]),
         (parse_reference("circle:radius=0.1,period=4,x=0.05,z=0.5"), 2, [0.05, 0.0, 0.5]),
@@ -111,6 +116,8 @@ def test_a_plane_has_two_axes(plane):
         ("square", "there is no reference 'square'; there are circle, eight"),
         ("circle:radius=0.1", "circle needs period"),
         ("circle:radius=a,period=1", "radius is 'a'; allowed is a number"),
+        ("circle:radius=60kPa,period=1", "radius is '60kPa': kPa is no unit of a number in m"),
+        ("circle:radius=60mm,period=1 deg", "period is '1 deg': deg is no unit of a number in s"),
         ("circle:speed=1", "circle has no option 'speed'"),
         ("circle:radius=-1,period=1", "radius is -1.0; allowed is a positive number"),
     ],

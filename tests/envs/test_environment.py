@@ -164,7 +164,8 @@ def test_wrong_randomisations_are_refused(wrong):
 
 
 def test_a_robot_without_tensions_needs_limits():
-    with pytest.raises(envs.TaskError, match="limits are needed for the controls"):
+    message = "limits are needed for the controls .*: give low, high and rate of ControlLimits"
+    with pytest.raises(envs.TaskError, match=message):
         envs.make("follow", "six-legged-robot")
 
 

@@ -111,6 +111,49 @@ def test_wrong_arguments_end_in_one_line(arguments, message):
     assert ran.exit_code == 2 and message in ran.stderr and ran.stderr.count("\n") == 1
 
 
+ARM = """
+format: 2
+kind: slender-rod
+parameters:
+  {length: 180 mm, radius: 11 mm, youngs_modulus: 300 kPa, density: 1080 kg/m3, bending_damping: 3.7e-5,
+   effects: [{kind: chambers, angles: [0.0, 2.0, 4.0], offset: 7 mm, radius: 3 mm}]}
+"""
+
+
+@pytest.mark.parametrize(
+    ("command", "options"),
+    [
+        (("reach", "--position", 0, 0, 0.1), "--low and --high"),
+        (("workspace", "--out", "w.nc", "--low", -10), "--high"),
+        (("control", "--reference", "circle:radius=0.03,period=4"), "--low, --high and --rate"),
+        (("control", "--reference", "circle:radius=0.03,period=4", "--low", 0, "--high", 2e4), "--rate"),
+    ],
+)
+def test_controls_that_are_no_tensions_need_limits(tmp_path, monkeypatch, command, options):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "arm.yaml").write_text(ARM)
+    ran = run(command[0], "arm.yaml", *command[1:])
+    assert ran.exit_code == 2 and ran.stderr.count("\n") == 1
+    assert (
+        f"limits are needed for the controls pressure (Pa): give {options}, one number for all, or one for "
+        "each of 3" in ran.stderr
+    )
+
+
+def test_a_workspace_is_within_the_limits_that_a_robot_states(tmp_path):
+    (tmp_path / "arm.yaml").write_text(
+        ARM.replace("radius: 3 mm}", "radius: 3 mm, lowest: -1 kPa, highest: 20 kPa}")
+    )
+    out = tmp_path / "w.nc"
+    assert told("workspace", tmp_path / "arm.yaml", "--count", 64, "--out", out)["unsolved"] == 0
+    with xarray.open_dataset(out, engine="h5netcdf") as read:
+        pressures = read["control"].values
+    assert -1e3 <= pressures.min() < 0.0 and 19e3 < pressures.max() <= 20e3
+    assert told("workspace", tmp_path / "arm.yaml", "--count", 8, "--out", out, "--low", 5e3)["unsolved"] == 0
+    with xarray.open_dataset(out, engine="h5netcdf") as read:
+        assert read["control"].values.min() >= 5e3
+
+
 @pytest.mark.slow
 def test_modes_are_printed_and_drawn(rod, tmp_path):
     arguments = ("modes", rod, "--set", "gravity=0,0,9.81", "--count", 3)

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from knode_cosserat._numbers import numbers_in
+from knode_cosserat._units import UnitError, in_unit
 from knode_cosserat.recordings.formats import read_suffixes
 from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.wrapped import nominal_model
@@ -170,6 +171,36 @@ def parse_limits(option: str, text: str, count: int) -> float | list[float]:
             f"{option} must be one number for all controls, or {count}, one for each (got {text!r})"
         )
     return numbers[0] if len(numbers) == 1 else numbers
+
+
+def limits_of(robot: System, **texts: str | None) -> dict[str, Any]:
+    """Return limits of a robot's controls by name from the texts of their options; None: not given.
+
+    Numbers may have units; those of a `rate` are per second, such as 20 kPa/s.
+    """
+    from knode_cosserat.controls import completed_limits, units
+
+    given: dict[str, Any] = dict(texts)
+    for name, text in texts.items():
+        if text is not None:
+            per = "/s" if name == "rate" else ""
+            given[name] = _parse_limits_with_units(f"--{name}", text, units(robot.control_layout), per)
+    return completed_limits(robot.control_layout, given, options=True)
+
+
+def _parse_limits_with_units(option: str, text: str, units: Sequence[str], per: str) -> float | list[float]:
+    words = [word.strip() for word in text.split(",")]
+    if numbers_in(text) is None and len(words) in (1, len(units)):
+        words = words * len(units) if len(words) == 1 else words
+        try:
+            in_si = [in_unit(word, f"{unit or 1}{per}") for word, unit in zip(words, units, strict=True)]
+        except UnitError as error:
+            raise ValueError(f"{option} is {text!r}: {error}") from None
+        plain = ",".join(
+            word if number is None else repr(number) for word, number in zip(words, in_si, strict=True)
+        )
+        text = text if numbers_in(plain) is None else plain
+    return parse_limits(option, text, len(units))
 
 
 # robots and models

@@ -12,7 +12,7 @@ import numpy as np
 import typer
 
 from knode_cosserat._files.csv_rows import size_excess
-from knode_cosserat.cli.arguments import Json, Nominal, load_system, option, parse_limits, require_writable
+from knode_cosserat.cli.arguments import Json, Nominal, limits_of, load_system, option, require_writable
 from knode_cosserat.cli.output import write_output
 from knode_cosserat.cli.program import app
 from knode_cosserat.recordings.formats import written_suffixes
@@ -85,9 +85,12 @@ class _ControlMethod(NamedTuple):
     Options:
         dt (--dt S): Period of the control (s).
         realtime (--realtime): Choose the longest prediction that this computer computes in 60 % of a period.
-        low (--low NUMBERS): Least control: one number, or one for each.
-        high (--high NUMBERS): Greatest control: one number, or one for each.
-        rate (--rate PER_S): Greatest change of a control in 1 s.
+        low (--low NUMBERS): Least control: one number, or one for each. Default: that of the robot's file;
+            0 N for tensions.
+        high (--high NUMBERS): Greatest control: one number, or one for each. Default: that of the robot's
+            file; 10 N for tensions.
+        rate (--rate NUMBERS): Greatest change of a control in 1 s: one number, or one for each. Default: 40 N
+            for tensions.
         lag (--lag S): Time constant of the motors that the controller expects (s).
         adapt (--adapt NAME): Adapt this parameter of the model while running; may be repeated.
         deviation (--tip-deviation M): Standard deviation of the measured tip for the observer (m): noise and
@@ -97,9 +100,9 @@ class _ControlMethod(NamedTuple):
     method: Method = "predictive"
     dt: float = 0.05
     realtime: bool = False
-    low: str = "0"
-    high: str = "10"
-    rate: float = 40.0
+    low: str | None = None
+    high: str | None = None
+    rate: str | None = None
     lag: float = 0.0
     adapt: list[str] | None = None
     deviation: float = 2e-4
@@ -113,12 +116,11 @@ class _ControlMethod(NamedTuple):
 
         return f"{self.method}{',' if ':' in self.method else ':'}realtime={SHARE}"
 
-    def limits(self, size: int) -> ControlLimits:
-        """Return the limits of `size` controls."""
+    def limits(self, robot: System) -> ControlLimits:
+        """Return the limits of a robot's controls."""
         from knode_cosserat.control import ControlLimits
 
-        low, high = parse_limits("--low", self.low, size), parse_limits("--high", self.high, size)
-        return ControlLimits(low, high, self.rate, lag=self.lag)
+        return ControlLimits(**limits_of(robot, low=self.low, high=self.high, rate=self.rate), lag=self.lag)
 
 
 class _LoopFiles(NamedTuple):
@@ -184,7 +186,7 @@ def control(
     from knode_cosserat.estimation import TipPosition
 
     model = nominal.load()
-    length, limits = float(nominal_model(model).length), method.limits(model.control_layout.size)
+    length, limits = float(nominal_model(model).length), method.limits(model)
     controller = kcc.controller_named(
         method.name, model, method.dt, limits, method.adapt or (), TipPosition(sigma=method.deviation)
     )

@@ -15,7 +15,7 @@ from knode_cosserat.cli.arguments import (
     Report,
     Space,
     figures,
-    parse_limits,
+    limits_of,
     parse_numbers,
     require_writable,
 )
@@ -34,19 +34,18 @@ class _Limits(NamedTuple):
     """Limits of the controls.
 
     Options:
-        low (--low LIMITS): Lower limits of the controls in their units (tensions: N): one number, or one per
-            control.
-        high (--high LIMITS): Upper limits of the controls in their units (tensions: N): one number, or one
-            per control, such as 8,8,10,10.
+        low (--low LIMITS): Lower limits of the controls in their units: one number, or one per control.
+            Default: those of the robot's file; 0 N for tensions.
+        high (--high LIMITS): Upper limits of the controls in their units: one number, or one per control,
+            such as 8,8,10,10. Default: those of the robot's file; 10 N for tensions.
     """
 
-    low: str = "0"
-    high: str = "10"
+    low: str | None = None
+    high: str | None = None
 
-    def of(self, system: System) -> tuple[float | list[float], float | list[float]]:
-        """Return the lower and the upper limits of a robot's controls."""
-        size = system.control_layout.size
-        return parse_limits("--low", self.low, size), parse_limits("--high", self.high, size)
+    def of(self, system: System) -> dict[str, Any]:
+        """Return the lower and the upper limits of a robot's controls, by name."""
+        return limits_of(system, low=self.low, high=self.high)
 
 
 #: largest plausible distance of a target, in lengths of the robot
@@ -102,12 +101,10 @@ def reach(
     from knode_cosserat.controls import labels, units
 
     system = model.load()
-    low, high = limits.of(system)
     found = kc.inverse_kinematics(
         system,
         *target.pose(float(system.length)),
-        low=low,
-        high=high,
+        **limits.of(system),
         tolerance=target.tolerance,
         space=space,
     )
@@ -233,10 +230,11 @@ def workspace(
     import knode_cosserat as kc
 
     system = model.load()
+    within = limits.of(system)
     began = perf_counter()
     found = best_so_far(
         lambda: kc.workspace(
-            system, *limits.of(system), count, seed=seed, space=space, progress=report.shows_progress
+            system, **within, count=count, seed=seed, space=space, progress=report.shows_progress
         )
     )
     count = len(found.controls)

@@ -44,6 +44,7 @@ VECTOR_OPTIONS = frozenset(
         "--control",
         "--low",
         "--high",
+        "--rate",
         "--masses",
         "--position",
         "--quaternion",

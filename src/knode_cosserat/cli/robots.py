@@ -47,8 +47,9 @@ class _SimulationOptions(NamedTuple):
 
     Options:
         controls (--controls CONTROLS): Tensions: sine:PERIOD (s), step:HEIGHT (N; at 1.5 s, or
-            step:HEIGHT,at=S), ramp:HEIGHT (N), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV
-            file. Any controls by name: NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat
+            step:HEIGHT,at=S), ramp:HEIGHT (N; in the first and last tendon, or
+            ramp:HEIGHT,tendons=1,3), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any
+            controls by name: NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat
             info ROBOT` lists the names), the others zero; or none.
         steps (--steps N): Number of time steps; required unless a file gives the controls.
         dt (--dt S): Time step (s). Default: 0.05, or the file's.
@@ -141,7 +142,8 @@ class Held(NamedTuple):
     Options:
         tension (--tension N,N,…): Tensions of all tendons (N), such as 7,5,5,7.
         control (--control CONTROL): All controls in order, such as 7,5,5,7; or some by name, such as
-            base_z=0.1,base_ry=0.2, and the others zero. `knode-cosserat info ROBOT` lists names and units.
+            base_z=20mm,base_ry=0.2, and the others zero. Numbers may have units. `knode-cosserat info
+            ROBOT` lists names and units.
     """
 
     tension: str | None = None
@@ -298,16 +300,18 @@ def schema(
 def _control_words(control: str, names: list[str]) -> list[str]:
     """Return the signals `NAME=constant:VALUE` of a control given by numbers in order, or by names."""
     if "=" not in control:
-        values = numbers_in(control)
-        if values is None or len(values) != len(names):
+        numbers = numbers_in(control)
+        # numbers with units are separated by commas only
+        values = re.split(r"[,;]", control) if numbers is None else [repr(number) for number in numbers]
+        if len(values) != len(names):
             raise ValueError(
                 f"--control must be {len(names)} numbers, in the order {', '.join(names)}, or NAME=VALUE,…, "
                 f"such as {names[0] if names else 'NAME'}=0.1 (got {control!r})"
             )
-        return [f"{name}=constant:{value!r}" for name, value in zip(names, values, strict=True)]
+        return [f"{name}=constant:{value.strip()}" for name, value in zip(names, values, strict=True)]
     words = []
-    # separated by commas, semicolons or spaces, but not by spaces around an equals sign
-    for each in re.split(r"[\s,;]+", re.sub(r"\s*=\s*", "=", control.strip())):
+    # separated by commas, semicolons or spaces, but not by spaces around an equals sign or before a unit
+    for each in re.split(r"\s*[,;]\s*|\s+(?=\w+=)", re.sub(r"\s*=\s*", "=", control.strip())):
         name, equals, value = each.partition("=")
         if not (name and equals and value):
             raise ValueError(

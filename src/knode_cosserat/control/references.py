@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from knode_cosserat._arguments import check_arguments, numbers_of
+from knode_cosserat._units import UnitError, in_unit
 from knode_cosserat.errors import KnodeCosseratError
 
 
@@ -173,6 +174,8 @@ def _require_positive(**numbers: float) -> None:
 #: references by name, for the command line, and their options
 NAMED: dict[str, Callable[..., Reference]] = {"circle": circle, "eight": figure_eight}
 OPTIONS = ("radius", "period", "rise", "plane", "x", "y", "z")
+#: units of options that are not in m
+_UNITS = {"period": "s", "rise": "s"}
 
 
 def parse_reference(text: str) -> Reference:
@@ -180,7 +183,7 @@ def parse_reference(text: str) -> Reference:
 
     Options are radius and period, rise, plane, and the coordinates of the centre: x, y and z (m). The centre
     is at zero in the plane, and free across it, unless they are given: `circle:radius=0.05,period=4,plane=yz,
-    x=0.28`.
+    x=0.28`. Numbers are in m and s, or have a unit: `circle:radius=60mm,period=4`.
 
     Raises:
         ReferenceFormatError: a name or option that does not exist, or a value that is not a number.
@@ -196,7 +199,10 @@ def parse_reference(text: str) -> Reference:
         if key not in OPTIONS:
             raise ReferenceFormatError(f"{name} has no option {key!r}; there are {', '.join(OPTIONS)}")
         try:
-            options[key] = value if key == "plane" else float(value)
+            number = None if key == "plane" else in_unit(value, _UNITS.get(key, "m"))
+            options[key] = value if key == "plane" else float(value) if number is None else number
+        except UnitError as error:
+            raise ReferenceFormatError(f"{key} is {value!r}: {error}") from None
         except ValueError:
             raise ReferenceFormatError(f"{key} is {value!r}; allowed is a number") from None
     for key in ("radius", "period"):

@@ -15,7 +15,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from knode_cosserat.control import ControlLimits
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.envs.tasks import Survey, Task, Tip
 from knode_cosserat.estimation.online import split_record
@@ -32,8 +31,6 @@ from knode_cosserat.solvers.run import TimeIntegration
 
 Actions = Literal["tension", "increment"]
 
-#: limits of tensions (N) and their rate (N/s) by default
-TENSIONS = ControlLimits(0.0, 10.0, 40.0)
 #: number of measurements in an observation, the newest first: their differences are velocities
 MEASURED = 3
 #: periods ahead at which an observation has the target

@@ -13,11 +13,12 @@ from jaxtyping import Float
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._reprs import robot_text
 from knode_cosserat.control import ControlLimits, Reference
+from knode_cosserat.controls import ControlsError, completed_limits
 from knode_cosserat.engine.loops import motions_of
 from knode_cosserat.engine.motions import Motions
 from knode_cosserat.engine.pattern import Pattern, packed
 from knode_cosserat.envs import dynamics
-from knode_cosserat.envs.dynamics import TENSIONS, Actions, Arrays, EpisodeState, Spec, Transition
+from knode_cosserat.envs.dynamics import Actions, Arrays, EpisodeState, Spec, Transition
 from knode_cosserat.envs.tasks import TASKS, Randomisation, Task, TaskError
 from knode_cosserat.estimation.outputs import BodyPositions
 from knode_cosserat.rods.robot_file import load_robot
@@ -61,7 +62,7 @@ class Environment:
             task: the task.
             robot: the nominal robot, or a learned model of it.
             randomisation: of the episodes; None: the task's own.
-            limits: of the controls; None: tensions of 0 to 10 N, 40 N/s.
+            limits: of the controls; None: tensions of 0 to 10 N, or those of the robot's file, 40 N/s.
             dt: period (s).
             duration: time limit of an episode (s).
             actions: "tension": actions of -1 to 1 are controls within their limits; "increment": changes of
@@ -90,11 +91,13 @@ class Environment:
         if steps < 1:
             raise TaskError(f"duration is {duration!r} s; allowed is at least one period, {dt:g} s")
         controls = robot.control_layout
-        if limits is None and set(controls.names) != {"tension"}:
-            names = ", ".join(f"{field.name} ({field.unit})" for field in controls.fields)
-            raise TaskError(f"limits are needed for the controls {names}: give kc.control.ControlLimits")
+        if limits is None:
+            try:
+                limits = ControlLimits(**completed_limits(controls, dict.fromkeys(("low", "high", "rate"))))
+            except ControlsError as error:
+                raise TaskError(str(error)) from None
         try:
-            within = (limits or TENSIONS).of(robot)
+            within = limits.of(robot)
         except ValueError as error:
             raise TaskError(f"limits: {error}") from None
         turn = float(largest_turns(robot, np.minimum(within.rate * dt, within.high - within.low)))
