@@ -271,10 +271,10 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
         from knode_cosserat.rods.robot_file import warn_of_paper_tendons
 
         warn_of_paper_tendons(nominal, "--set tendon_offset")
-    stated = [name for name in STIFFNESSES if getattr(nominal, name, None) is not None]
-    if "youngs_modulus" in values and stated and values.keys().isdisjoint(stated):
+    own = [name for name in STIFFNESSES if getattr(nominal, name, None) is not None]
+    if "youngs_modulus" in values and own and values.keys().isdisjoint(own):
         warnings.warn(
-            f"--set youngs_modulus has no effect: the robot states its {' and '.join(stated)}; set these",
+            f"--set youngs_modulus has no effect: the robot states its {' and '.join(own)}; set these",
             stacklevel=2,
         )
     return changed

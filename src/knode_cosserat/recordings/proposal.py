@@ -466,7 +466,7 @@ def _controls(
 
 def _numbers_of(table: Table, title: str) -> Any:
     """Return a column's numbers (rows,), NaN for single cells that are none; None for a column of text."""
-    import pandas as pd
+    import pandas as pd  # type: ignore[import-untyped]
 
     numbers = pd.to_numeric(table.numbers[title], errors="coerce").to_numpy(dtype=float, na_value=np.nan)
     is_text = table.numbers[title].dtype.kind not in "fiub"
