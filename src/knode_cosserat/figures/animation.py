@@ -177,7 +177,7 @@ def _frames(
     ]
     if any(motions):
         legend_above(seen.axes)
-    clock = figure.text(0.01, 0.99, "", ha="left", va="top", animated=True)
+    clock = figure.text(0.01, 0.01, "", ha="left", va="bottom", animated=True)
     canvas.draw()
     # draw again after the layout has fixed the axes
     figure.set_layout_engine("none")

@@ -15,6 +15,7 @@ from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.grid import grid_of
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.guess import turns_between
 from knode_cosserat.solvers.rest import unloaded_shape
 from knode_cosserat.solvers.run import TimeIntegration, run_batch
@@ -87,8 +88,10 @@ def _positions(system: System, record: np.ndarray) -> np.ndarray:
     return np.asarray(Drawing.of(system).positions(record[:, : system.y_layout.size]))
 
 
-def _first_guesses(system, space, controls, records):  # type: ignore[no-untyped-def]
-    """Return first guesses of y at all points that need no other row, and the row of each."""
+def _first_guesses(
+    system: System, space: SpaceScheme, controls: np.ndarray, records: np.ndarray
+) -> tuple[Int[np.ndarray, " G"], Float[np.ndarray, "G M y"]]:
+    """Return the rows of first guesses that need no other row, and their y at all points."""
     layout, grid, count = strand_of(system).y_layout, grid_of(system, space), len(controls)
     rest = unloaded_shape(system, space)
     along = grid.along[: len(rest)]
