@@ -9,6 +9,7 @@ code by `Function.evaluate`.
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import dataclasses
 import functools
 import itertools
@@ -54,12 +55,20 @@ LIBRARY = {
 COMPARISONS = {"lt": "olt", "le": "ole", "gt": "ogt", "ge": "oge", "eq": "oeq", "ne": "une"}
 
 
-@functools.cache
+#: numbers of a vector where code is written for another computer
+LANES: contextvars.ContextVar[int | None] = contextvars.ContextVar("LANES", default=None)
+
+
 def vector_lanes() -> int:
-    """Return the numbers of a vector: those of this computer's registers.
+    """Return the numbers of a vector: those of this computer's registers, or of another one's (`LANES`).
 
     Vectors that take two registers need twice as long to compile, and steps are up to 1.3 times as slow.
     """
+    return LANES.get() or _own_lanes()
+
+
+@functools.cache
+def _own_lanes() -> int:
     import llvmlite.binding as llvm  # later than the package, which is to be imported fast
 
     return 8 if llvm.get_host_cpu_features().get("avx512f") else 4

@@ -108,10 +108,13 @@ class Core(EliminationCode):
         self.tangents = StateArrays(a(ny, "ends"), a(ny, "used between"), a(nz, "used"), a(ny, "used"))
         self.dfe = a(ny, "pieces") if self.near else self.tangents.f
         self._write()
-        self._functions = self.module.compile()
+        self._functions = self._compiled()
         guesses = stage_extrapolations(settings) if settings.stages > 1 else EXTRAPOLATIONS[None]
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
+
+    def _compiled(self) -> Any:
+        return self.module.compile()
 
     @functools.cached_property
     def states(self) -> tuple[_Packed, _Packed]:
@@ -654,14 +657,15 @@ class Core(EliminationCode):
         """Runs of vectors of robots in turn, each from its state, which is replaced by the state after it.
 
         Results are rows, numbers of stages, the number of solved steps and the length (m). The state of a
-        robot whose first step failed remains; that of a single robot remains if any step failed.
+        robot whose first step failed remains; that of a single robot remains if any step failed. If `n_kept`
+        is not zero, the factors in memory are those of the last step before the state, and are used again.
         """
         e, P, L = self.equations, self.P, self.L
         names = ["memory", "motions", "parameters", "controls", "coefficients", "extrapolations", "results"]
-        names += ["n_size", "n_vectors", "n_steps", "n_stages", "n_estimates"]
+        names += ["n_size", "n_vectors", "n_steps", "n_stages", "n_estimates", "n_kept"]
         f = self._now = self.module.function("run", names, exported=True)
         memory, motions, parameters, controls, coefficients, extrapolations, results = f.arguments[:7]
-        size, vectors, steps, stages, estimates = f.arguments[7:]
+        size, vectors, steps, stages, estimates, kept = f.arguments[7:]
         solves, is_moving = steps * stages, self._is_moving(coefficients)
         rows = solves * (self._count("nodes") * (self.strands * e.numbers * P))
         infos = solves * ((8 + e.k) * P)
@@ -676,7 +680,8 @@ class Core(EliminationCode):
             with f.loop(self.params.size * P, 0, P) as i:
                 value = f.load(parameters, k * (self.params.size * P) + i.value, P)
                 f.store(value, self._pointer(self.params, 0), i.value, P)
-            self._put(0.0, self.outcome, USABLE)
+            with f.if_(f.compare("eq", kept, 0)):
+                self._put(0.0, self.outcome, USABLE)
             f.call(self.setup, memory)
             result = f.pointer(results, k * (rows + infos + 2 * P))
             info, acting = f.pointer(result, rows), f.pointer(controls, k * (solves * (e.nc * P)))

@@ -99,12 +99,14 @@ class GridCounts(Counts):
         self.lengths = np.tile(np.append(grid.lengths, 0.0), strands)[:-1]
 
 
-_counts = functools.lru_cache(maxsize=256)(GridCounts)
+@functools.lru_cache(maxsize=256)
+def _counts(grid: Grid, strands: int, space: SpaceScheme, lanes: int) -> GridCounts:
+    return GridCounts(grid, strands, space)
 
 
 def counts_of(system: System, space: SpaceScheme) -> GridCounts:
     """Return the counts of a system's grid."""
-    return _counts(grid_of(system, space), strand_count(system), space)
+    return _counts(grid_of(system, space), strand_count(system), space, vector_lanes())
 
 
 def in_room(system: System) -> Any:

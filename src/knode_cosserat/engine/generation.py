@@ -23,12 +23,16 @@ def machine_of(level: int) -> llvm.TargetMachine:
 
 
 def generate(text: str, level: int) -> bytes:
-    """Return a module in LLVM's assembly language as machine code.
+    """Return a module in LLVM's assembly language as machine code of this computer."""
+    return emit(llvm.parse_assembly(text), machine_of(level))
+
+
+def emit(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> bytes:
+    """Return a module as machine code.
 
     Programs come without repetition, and loops are written with their vectors: LLVM's general passes take
     three times as long and make steps no faster. Variables are turned into registers.
     """
-    module, machine = llvm.parse_assembly(text), machine_of(level)
     passes = llvm.create_new_module_pass_manager()
     passes.add_sroa_pass()
     passes.run(module, llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options()))

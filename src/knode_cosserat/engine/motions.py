@@ -32,6 +32,9 @@ class Motions:
     Vectors of robots take turns in one memory.
     """
 
+    #: true if the factors in memory are those of the last step of one robot, for the next step
+    _continues = False
+
     def __init__(self, core: Core, parameters: np.ndarray, states: Any, steps: StepCoefficients):
         """Put robots into memory: parameters (n,) of all, or (robots, n), and states (robots, ...)."""
         self.core, self.steps, self.size, self._kind = core, steps, len(states[0]), type(states)
@@ -60,7 +63,7 @@ class Motions:
 
     def put(self, states: Any, places: np.ndarray) -> None:
         """Write the states (n, ...) of robots at places (n,); the last one is that of all places beyond."""
-        core = self.core
+        core, self._continues = self.core, False
         vectors, lanes = np.divmod(places, core.P)
         for arrays, values in zip(self._arrays, states, strict=True):
             values = np.asarray(values, float)
@@ -70,6 +73,10 @@ class Motions:
             # the last place is repeated in the lanes beyond it
             for where, own in ((slice(count), values), (slice(count, None), values[..., -1:, :])):
                 target[vectors, lanes, :, where] = own
+
+    def restore(self, motions: np.ndarray) -> None:
+        """Return to earlier states: a copy of `motions`."""
+        self.motions, self._continues = motions, False
 
     def set_times(self, t0: Float[np.ndarray, " robots"]) -> None:
         """Set the times (s) of row 0."""
@@ -179,8 +186,10 @@ class Motions:
         own = (each[first:] for each in (self.motions, self._parameters, acting))
         arrays = self._memory, *own, table, core._guesses, results
         counts = self._packed_size, len(results), count, stages, self._estimates
-        core._functions.run("run", *arrays, *counts)
-        if not core.batch and 0 < (done := int(results[0, -2])) < count:
+        core._functions.run("run", *arrays, *counts, int(self._continues))
+        done = count if core.batch else int(results[0, -2])
+        self._continues = done == count and not core.batch
+        if 0 < done < count:
             # again, for the state before the step that failed
             again = np.zeros((1, sum(map(math.prod, self._shapes_of(done, stages)))))
             self._run(0, np.ascontiguousarray(acting[:, :done]), table, again)
@@ -213,6 +222,7 @@ class Motions:
         table[:] = every[min(i, len(every) - 1)]
         table[:, -1] = (i + ends) * self.steps.dt
         after, results = before.copy(), np.zeros(size)
+        self._continues = False
         self.core._functions["run"](
             self._memory.ctypes.data,
             after.ctypes.data,
@@ -223,6 +233,7 @@ class Motions:
             1,
             len(acting),
             self._estimates,
+            0,
         )
         if not results[-2]:
             return before, None, NOT_SOLVED

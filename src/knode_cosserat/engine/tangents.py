@@ -58,7 +58,10 @@ class _TangentCode(StepMap):
         self.shared = list[tuple[Array, Any]]()
         self._reserve_products()
         self._write()
-        self._functions = self.module.compile()
+        self._functions = self._compiled()
+
+    def _compiled(self) -> Any:
+        return self.module.compile()
 
     def _reserve_products(self) -> None:
         """Reserve arrays of the products of derivatives by the system."""

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from tqdm import tqdm
 
 from knode_cosserat.engine import loops as engine
-from knode_cosserat.engine.motions import Motions
+from knode_cosserat.engine.motions import Motions, StaticState
 from knode_cosserat.rods.kept import kept
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.section import INWARD
@@ -105,10 +105,13 @@ class TimeIntegration:
         return found
 
     def motions(self, system: System, state: Any) -> Motions:
-        """Return the motion of one robot from a state, for steps one by one."""
-        return engine.motions_of(
-            system, self.coefficients, jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
-        )
+        """Return the motion of one robot, or its equilibria, from a state, for steps one by one."""
+        return engine.motions_of(system, self.coefficients, self.one_of(state))
+
+    def one_of(self, state: Any) -> Any:
+        """Return the state of one robot as states (1, ...) of `Motions`."""
+        state = StaticState(state) if self.settings.time is None else state
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[None], state)
 
     def recover(self, system: System, state: Any, controls: Any, i: int, budget: Budget) -> SolvedStep:
         """Recover step i; `controls` are the previous step's and its own."""
@@ -141,9 +144,8 @@ def run_one(
     """Return all steps of one robot, with recovery, the last state, and the likely cause of a failure.
 
     They start from a state and the control before it. To watch for signals, the compiled loop returns about
-    every `RESPONSE` seconds; a progress bar shows it. Pieces change the result within the tolerance: if it
-    has to be the same bits in each run, nothing is watched, and there is one piece. Rows are written to
-    `rows` if they are given: those of steps that are not reached.
+    every `RESPONSE` seconds; a progress bar shows it. The result is the same bits in pieces of any length.
+    Rows are written to `rows` if they are given: those of steps that are not reached.
     """
     total, (state, before) = task.steps, start
     piece = FIRST_STEPS if watch else total
@@ -153,15 +155,16 @@ def run_one(
     # equilibria are already in small parts
     angles = turns_within(system, controls, before) if task.settings.time else np.zeros(total)
     far, watched = (np.flatnonzero(angles > limit) for limit in (LARGEST_JUMP, LARGEST_TURN))
-    first_state = state
+    first_state, motions = state, task.motions(system, state)
     with _bar(watch, total, "step") as advance:
         while done < total and not cause:
             began = time.perf_counter()
             stop = min(total, done + piece)
             reached, last = done, min([stop, *(int(k) for k in far if k >= done)])
             while last > done:
-                span, earlier = slice(done, last), state
-                reached, state, _ = task.solve(system, controls, earlier, (done, last), _pick(rows, span))
+                earlier, part = motions.motions.copy(), _pick(rows, (None, slice(done, last)))
+                [reached], part = motions.solve(controls[None], (done, last), StepRows(*part))
+                mark_unseen(system, part)
                 if not len(watched) or reached <= watched[0]:
                     break
                 previous = rows.records[done - 1] if done else _nodes(system, first_state)
@@ -169,7 +172,8 @@ def run_one(
                 if last == reached:
                     break
                 # again, up to the step that loses turns
-                reached, state = done, earlier
+                reached = done
+                motions.restore(earlier)
             elapsed = time.perf_counter() - began
             budget.ran(elapsed)
             if watch:
@@ -177,15 +181,22 @@ def run_one(
                 piece = max(piece, int((reached - done) * RESPONSE / max(elapsed, 1e-6)))
             if reached < stop:
                 pair = (controls[reached - 1] if reached else before), controls[reached]
-                solved = task.recover(system, state, pair, reached, budget)
-                state, cause = solved.state, solved.cause
+                solved = task.recover(system, _state_of(motions), pair, reached, budget)
+                cause = solved.cause
+                motions.put(task.one_of(solved.state), np.zeros(1, dtype=int))
                 log.info("step %d: %s", reached + 1, Result(int(solved.row.result)).message)
                 for every, value in zip(rows, solved.row, strict=True):
                     every[reached] = value
                 reached += not cause
             advance(reached - done)
             done = reached
-    return rows, state, cause
+    return rows, _state_of(motions), cause
+
+
+def _state_of(motions: Motions) -> Any:
+    """Return the state of one robot: a history, or y of an equilibrium."""
+    state = jax.tree.map(lambda leaf: leaf[0], motions.states)
+    return state.y if isinstance(state, StaticState) else state
 
 
 def refuse_far_turns(system: System, results: Any, controls: Any, before: Any) -> Any:
