@@ -31,7 +31,7 @@ ORDER = (
         "solvers",
         "metrics",
     ),
-    *("estimation", "recordings", "statics", "control", "learning", "loading", "figures"),
+    *("estimation", "recordings", "statics", "control", "learning", "loading", "figures", "native"),
     *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli", "__main__"),
 )
 LAYERS = (BASE.split(), *([name] for name in ORDER))

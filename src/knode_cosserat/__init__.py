@@ -2,7 +2,8 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `recordings`, `statics`,
-`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `envs` and `sweeps`.
+`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `envs`, `sweeps` and
+`native`.
 Drivers of robots are a distribution of their own, `knode_cosserat_hardware`. Events are logged to the logger
 "knode_cosserat", which is quiet unless a handler is added.
 """
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
         identification,
         learning,
         metrics,
+        native,
         recordings,
         robots,
         solvers,
@@ -35,6 +37,7 @@ if TYPE_CHECKING:
     from knode_cosserat.identification.identify import identify
     from knode_cosserat.learning import KNODE, FitConfig, load_model
     from knode_cosserat.loading import load_trajectory
+    from knode_cosserat.native import export
     from knode_cosserat.recordings import estimate_states, load_recording
     from knode_cosserat.rods.robot_file import catalog, load_robot, save_robot
     from knode_cosserat.rods.system import System
@@ -60,6 +63,7 @@ __all__ = [
     "equilibrium",
     "estimate_states",
     "estimation",
+    "export",
     "figures",
     "fit",
     "identification",
@@ -71,6 +75,7 @@ __all__ = [
     "load_robot",
     "load_trajectory",
     "metrics",
+    "native",
     "recordings",
     "robots",
     "save_robot",
@@ -91,6 +96,7 @@ make_lazy(
         "knode_cosserat.identification": "fit identify",
         "knode_cosserat.learning": "KNODE FitConfig load_model",
         "knode_cosserat.loading": "load_trajectory",
+        "knode_cosserat.native": "export",
         "knode_cosserat.recordings": "estimate_states load_recording",
         "knode_cosserat.rods.robot_file": "catalog load_robot save_robot",
         "knode_cosserat.rods.system": "System",

@@ -54,6 +54,11 @@ def computer() -> str:
     return f"{llvm.get_default_triple()} {llvm.get_host_cpu_name()} {features} {version}"
 
 
+def level_of_code() -> int:
+    """Return the level of the code generator: final, unless `KNODE_COSSERAT_CODE` asks for quick code."""
+    return generation.QUICK if os.environ.get("KNODE_COSSERAT_CODE") == "quick" else generation.FINAL
+
+
 class MachineCode:
     """Exported functions of a module: pointers and whole numbers in, results in memory.
 
@@ -69,8 +74,7 @@ class MachineCode:
     @classmethod
     def of(cls, text: str, kinds: Mapping[str, str]) -> MachineCode:
         """Return the code of a module: quick, final, or first one and then the other."""
-        wanted = os.environ.get("KNODE_COSSERAT_CODE")
-        level = generation.QUICK if wanted == "quick" else generation.FINAL
+        wanted, level = os.environ.get("KNODE_COSSERAT_CODE"), level_of_code()
         name = f"engine-{hashlib.sha256(f'{text}{computer()}{level}'.encode()).hexdigest()}"
         code, later = stored(name), None
         if code is None:

@@ -17,7 +17,8 @@ import numpy as np
 from knode_cosserat.engine.codegen import LANES, literal
 from knode_cosserat.engine.core import Core
 from knode_cosserat.engine.counts import counts_of
-from knode_cosserat.engine.generation import FINAL, emit, machine_of
+from knode_cosserat.engine.generation import emit, machine_of
+from knode_cosserat.engine.machine_code import level_of_code
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.engine.tangents import TangentCore
 from knode_cosserat.errors import KnodeCosseratError
@@ -46,10 +47,10 @@ class Target:
 #: computers by their names
 TARGETS = {
     "native": Target("", ""),
-    "x86-64": Target("x86_64-unknown-linux-gnu", "x86-64", 4, fuses=False),
+    "x86-64": Target("x86_64-unknown-linux-gnu", "x86-64", 2, fuses=False),
     "x86-64-v3": Target("x86_64-unknown-linux-gnu", "x86-64-v3", 4),
     "x86-64-v4": Target("x86_64-unknown-linux-gnu", "x86-64-v4", 8),
-    "aarch64": Target("aarch64-unknown-linux-gnu", "generic", 4),
+    "aarch64": Target("aarch64-unknown-linux-gnu", "generic", 2),
 }
 
 
@@ -125,7 +126,7 @@ class NativeCode:
             self._renamed(code._functions, names, suffix)
             for (code, names), suffix in zip(functions, ("", "_tangents"), strict=True)
         ]
-        machine = self._machine()
+        machine = self._machine(level_of_code())
         first, *others = map(llvm.parse_assembly, [*texts, _tables(self.name, tables)])
         for each in others:
             first.link_in(each)
@@ -141,24 +142,16 @@ class NativeCode:
             text = text.replace(line, line.replace(f"define void @{own}(", f"define {linkage} void @{new}("))
         return text if self.target.fuses else text.replace("@llvm.fma.", "@llvm.fmuladd.")
 
-    def _machine(self) -> Any:
+    def _machine(self, level: int) -> Any:
         if not self.target.triple:
-            return _position_independent(machine_of(FINAL))
+            return machine_of(level, reloc="pic")
         llvm.initialize_all_targets()
         llvm.initialize_all_asmprinters()
         try:
             found = llvm.Target.from_triple(self.target.triple)
         except RuntimeError as error:
             raise TargetError(f"target: this LLVM has no {self.target.triple} ({error})") from None
-        return found.create_target_machine(cpu=self.target.cpu, opt=FINAL, reloc="pic")
-
-
-def _position_independent(machine: Any) -> Any:
-    """Return this computer as a target, for code at any address."""
-    target, features = llvm.Target.from_triple(machine.triple), llvm.get_host_cpu_features().flatten()
-    return target.create_target_machine(
-        cpu=llvm.get_host_cpu_name(), features=features, opt=FINAL, reloc="pic"
-    )
+        return found.create_target_machine(cpu=self.target.cpu, opt=level, reloc="pic")
 
 
 def _tables(prefix: str, tables: Mapping[str, np.ndarray]) -> str:

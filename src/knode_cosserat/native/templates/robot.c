@@ -87,6 +87,10 @@ static int turns_far(const double *before, const double *control) {
     return 0;
 }
 
+size_t ${name}_robot_size(void) { return sizeof(${name}_robot); }
+
+size_t ${name}_prediction_size(void) { return sizeof(${name}_prediction); }
+
 void ${name}_start(${name}_robot *robot) {
     memset(robot, 0, offsetof(${name}_robot, results));
     robot->version = ${NAME}_VERSION;

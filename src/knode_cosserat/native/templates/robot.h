@@ -83,6 +83,10 @@ typedef struct ${name}_prediction {
     ${NAME}_ALIGNED double numbers[$tangent_numbers];
 } ${name}_prediction;
 
+/* Bytes of the two structures, for other languages than C; their address is a multiple of 64. */
+size_t ${name}_robot_size(void);
+size_t ${name}_prediction_size(void);
+
 /* Start at time 0 where `simulate` starts: $start. */
 void ${name}_start(${name}_robot *robot);
 
