@@ -3,6 +3,7 @@
 import ctypes
 import subprocess
 
+import jax
 import numpy as np
 import pytest
 from native import STRICT, Library, has
@@ -78,16 +79,13 @@ def test_tangents_of_equilibria_and_of_steps_are_differences(arm):
     for steps in (0, 1, 4):
         own = controls[: max(steps, 1)]
         before = arm.robot.copy()
-        result, tips, tangents = arm.predict(steps, own)
-        assert result == 0
+        result, _, tangents = arm.predict(steps, own)
+        assert result >= 0
         np.testing.assert_array_equal(arm.robot, before)
         for k in range(4):
             change = 1e-4 * np.eye(4)[k]
-            ends = [arm.predict(steps, np.maximum(own + sign * change, 0.0))[1] for sign in (1.0, -1.0)]
-            room = 2e-4 if np.all(own[:, k] >= 1e-4) else np.nan
-            difference = (ends[0] - ends[1]) / room
-            if np.isfinite(room):
-                np.testing.assert_allclose(tangents[:, :, k], difference, rtol=1e-5, atol=1e-9)
+            ahead, behind = (arm.predict(steps, own + sign * change)[1] for sign in (1.0, -1.0))
+            np.testing.assert_allclose(tangents[:, :, k], (ahead - behind) / 2e-4, rtol=1e-5, atol=1e-8)
 
 
 def test_predicted_tips_are_those_of_the_steps(arm):
@@ -115,7 +113,7 @@ def test_a_saved_state_goes_on_and_another_models_state_is_refused(arm, motion):
 def test_wrong_input_gives_a_code_and_changes_nothing(arm):
     arm.step(CONTROL)
     before = arm.robot.copy()
-    for wrong in (np.nan, np.inf, -1.0):
+    for wrong in (np.nan, np.inf, -np.inf):
         assert arm.step([wrong, 0.0, 0.0, 0.0]) == -10
         assert arm.equilibrium([wrong, 0.0, 0.0, 0.0]) == -10
     assert arm.step(CONTROL, dt=0.01) == -11
@@ -167,7 +165,7 @@ def test_the_examples_run_without_python(library, motion):
 
 def test_what_cannot_be_exported_says_why(robot, tmp_path):
     with pytest.raises(kc.native.ExportError, match="batch"):
-        kc.export(robot.replace(length=np.array([0.5, 0.6])), tmp_path, DT)
+        kc.export(jax.tree.map(lambda leaf: np.stack([leaf, leaf]), robot), tmp_path, DT)
     with pytest.raises(kc.native.ExportError, match="name is '1arm'"):
         kc.export(robot, tmp_path, DT, name="1arm")
     with pytest.raises(kc.KnodeCosseratError, match="target is 'arm'; allowed is native"):

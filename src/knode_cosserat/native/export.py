@@ -247,6 +247,7 @@ class _NativeModel:
             "y_at": past[0].offset, "y_apart": past[0].component, "y_size": e.ny,
             "record_at": records[0].offset, "record_apart": records[0].component,
             "records": len(records), "record_rows": e.numbers, "used": counts["used"],
+            "history_at": core.H.offset, "history_size": core.H.size * core.H.component,
             "time_at": time[0].offset, "memory_time_at": core.t0.offset, "points": _listed(points),
             "order": _listed(order), "tip_rod": rod, "position": at,
             "orientation": _first(strand.y_layout, "h"), "force": _first(strand.y_layout, "n"),

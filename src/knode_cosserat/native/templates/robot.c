@@ -33,6 +33,7 @@ enum {
     Y = $y_at, Y_APART = $y_apart,      /* y in a motion, and the distance between its numbers */
     Z = $record_at, Z_APART = $record_apart, Y_SIZE = $y_size,
     RECORDS = $records, RECORD_ROWS = $record_rows, RECORD_USED = $used,
+    HISTORY = $history_at, HISTORY_SIZE = $history_size, /* history terms in memory: an equilibrium has none */
     TIME = $time_at,                    /* time of row 0 in a motion */
     POSITION = $position, ORIENTATION = $orientation, STRETCH = $stretch,
     FORCE = $force, MOMENT = $moment,   /* numbers of y; -1: none */
@@ -164,6 +165,7 @@ static int solve_shape(${name}_robot *robot, const double *control, double *shap
     table[WIDTH - 1] = ${name}_time(robot);
     double t0 = robot->memory[$memory_time_at];
     robot->memory[$memory_time_at] = 0.0;
+    for (int k = 0; k < HISTORY_SIZE; k++) robot->memory[HISTORY + k] = 0.0;
     for (size_t k = 0; k < sizeof robot->results / sizeof(double); k++) robot->results[k] = 0.0;
     ${name}_run(robot->memory, shape, robot->parameters, control, table, ${name}_guesses, robot->results, SHAPE, 1, 1,
                 1, ESTIMATES > 1 ? 1 : ESTIMATES, 0);
