@@ -8,6 +8,6 @@ from knode_cosserat.cli.program import app, main
 
 # the order of the imports is the order of the commands in the help
 from knode_cosserat.cli import init, robots, view, kinematics, learn, control  # noqa: F401  isort: skip
-from knode_cosserat.cli import compare, recordings, health, sweep  # noqa: F401  isort: skip
+from knode_cosserat.cli import native, compare, recordings, health, sweep  # noqa: F401  isort: skip
 
 __all__ = ["app", "main"]

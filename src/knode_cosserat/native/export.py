@@ -25,7 +25,7 @@ from knode_cosserat.engine.native import NativeCode
 from knode_cosserat.engine.pattern import packed
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.aspects import Drawing, Ends
-from knode_cosserat.rods.layout import Layout
+from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import SEEN_TURN, System
 from knode_cosserat.rods.trained_range import without_range
@@ -280,7 +280,7 @@ class _NativeModel:
         layout = self.system.control_layout
         fields = [field for field in layout.fields for _ in range(field.size)]
         lines = [
-            f" * {k}: {label} ({field.unit}), {field.low:g} to {field.high:g}: {field.meaning}"
+            f" * {k}: {label} ({field.unit}){_range_text(field)}: {field.meaning}"
             for k, (label, field) in enumerate(zip(layout.labels, fields, strict=True))
         ]
         turning = _turning(self.system)
@@ -309,6 +309,12 @@ class _NativeModel:
             "ends": _listed(repr(float(end)) for end in np.reshape(self.motions.steps.ends, -1)),
             "start": "in equilibrium" if Ends.of(self.system).held else "unstressed: nothing holds it",
         }  # fmt: skip
+
+
+def _range_text(field: Field) -> str:
+    """Return the limits of a control, those that are finite."""
+    low, high = (f"{end:g}" if np.isfinite(end) else "" for end in (field.low, field.high))
+    return f", {low or 'any'} to {high or 'any'}" if low or high else ""
 
 
 def _listed(values: Iterable[Any]) -> str:

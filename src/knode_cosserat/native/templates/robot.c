@@ -41,7 +41,7 @@ enum {
     TANGENT_STATES = $tangent_states, TANGENT_PARAMETERS_AT = $tangent_parameters_at
 };
 static const double ends[STAGES] = {$ends};
-static const double low[CONTROLS + 1] = {$low}, high[CONTROLS + 1] = {$high};
+const double ${name}_low[CONTROLS + 1] = {$low}, ${name}_high[CONTROLS + 1] = {$high};
 static const int moves[CONTROLS + 1] = {$moves};
 /* the control that is each axis of an end that turns; -1: none */
 static const int turning[$turns + 1][3] = {$turning};
@@ -72,7 +72,7 @@ static int is_started(const ${name}_robot *robot) {
 /* false for NaN, too */
 static int are_allowed(const double *control) {
     int allowed = control != NULL || CONTROLS == 0;
-    for (int k = 0; allowed && k < CONTROLS; k++) allowed = control[k] >= low[k] && control[k] <= high[k];
+    for (int k = 0; allowed && k < CONTROLS; k++) allowed = control[k] >= ${name}_low[k] && control[k] <= ${name}_high[k];
     return allowed;
 }
 

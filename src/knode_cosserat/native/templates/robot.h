@@ -51,6 +51,7 @@ enum ${name}_result {
 
 /* Controls: name, unit, least and largest value. */
 $control_table
+extern const double ${name}_low[${NAME}_CONTROLS + 1], ${name}_high[${NAME}_CONTROLS + 1];
 
 /* Parameters: a value that is zero in this file stays zero in the code. To change others, let
  * robot->parameters point to a copy of ${name}_parameters that you have changed, then call ${name}_equilibrium.
