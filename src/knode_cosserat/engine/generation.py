@@ -14,13 +14,13 @@ import llvmlite.binding as llvm
 QUICK, FINAL = 0, 1
 
 
-def machine_of(level: int, reloc: str = "default") -> llvm.TargetMachine:
-    """Return this computer as a target of the code generator."""
+def machine_of(level: int, **options: str) -> llvm.TargetMachine:
+    """Return this computer as a target of the code generator, with its options."""
     llvm.initialize_native_target()
     llvm.initialize_native_asmprinter()
     cpu, features = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     target = llvm.Target.from_default_triple()
-    return target.create_target_machine(cpu=cpu, features=features, opt=level, reloc=reloc)
+    return target.create_target_machine(cpu=cpu, features=features, opt=level, **options)
 
 
 def generate(text: str, level: int) -> bytes:

@@ -44,6 +44,8 @@ class Target:
     fuses: bool = True
 
 
+#: code that a linker puts at any address
+LINKED = {"reloc": "pic", "codemodel": "small"}
 #: computers by their names
 TARGETS = {
     "native": Target("", ""),
@@ -144,14 +146,14 @@ class NativeCode:
 
     def _machine(self, level: int) -> Any:
         if not self.target.triple:
-            return machine_of(level, reloc="pic")
+            return machine_of(level, **LINKED)
         llvm.initialize_all_targets()
         llvm.initialize_all_asmprinters()
         try:
             found = llvm.Target.from_triple(self.target.triple)
         except RuntimeError as error:
             raise TargetError(f"target: this LLVM has no {self.target.triple} ({error})") from None
-        return found.create_target_machine(cpu=self.target.cpu, opt=level, reloc="pic")
+        return found.create_target_machine(cpu=self.target.cpu, opt=level, **LINKED)
 
 
 def _tables(prefix: str, tables: Mapping[str, np.ndarray]) -> str:
