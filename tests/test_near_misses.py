@@ -129,6 +129,7 @@ FUNCTIONS: dict[Any, dict[str, str]] = {
     kc.load_robot: {"name_or_path": "name"},
     kc.robots.check: {"part": "part"},
     kc.save_robot: {"robot": "robot", "path": "path"},
+    kc.export: {"model": "robot", "folder": "path", "dt": "number"},
     kc.load_trajectory: {"path": "path"},
     kc.load_model: {"path": "path"},
     kc.learning.load_ensemble: {"folder": "path"},

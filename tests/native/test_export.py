@@ -75,7 +75,9 @@ def test_an_equilibrium_is_that_of_the_package_and_a_motion_goes_on_from_it(robo
 
 def test_tangents_of_equilibria_and_of_steps_are_differences(arm):
     arm.move(np.tile(CONTROL, (3, 1)))
-    controls = np.array([[1.5, 0.0, 0.2, 0.0], [2.0, 0.1, 0.0, 0.0], [1.0, 0.3, 0.0, 0.5], [0.5, 0.5, 0.5, 0.5]])
+    controls = np.array(
+        [[1.5, 0.0, 0.2, 0.0], [2.0, 0.1, 0.0, 0.0], [1.0, 0.3, 0.0, 0.5], [0.5, 0.5, 0.5, 0.5]]
+    )
     for steps in (0, 1, 4):
         own = controls[: max(steps, 1)]
         before = arm.robot.copy()

@@ -1,5 +1,7 @@
-"""Exported models of all kinds and for all computers: against `simulate`, without Python, under sanitizers."""
+"""Exported models of all kinds, for all computers: against `simulate`, without Python, under sanitizers."""
 
+import dataclasses
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,6 +11,9 @@ import pytest
 from native import STRICT, has
 
 import knode_cosserat as kc
+from knode_cosserat.learning.knode import KNODE
+from knode_cosserat.learning.structured.residual import CURVED, Load, Structured, expansion, loaded
+from knode_cosserat.rods.aspects import Observed
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "engine"))
 from networks import with_network
@@ -48,15 +53,38 @@ def run_in_c(model, folder, controls, compiler=("cc",), runs=(), **options):
 
 
 def with_structured_residual():
-    """Return the paper's robot with a structured residual."""
-    from knode_cosserat.learning.structured.residual import Structured
+    """Return the paper's robot with laws and loads of random numbers, as in tests of model files."""
+    robot, rng = kc.load_robot("delrin-tendon-robot"), np.random.default_rng(5)
+    seen = Observed.of(robot).layout
+    layout = kc.robots.Layout(*((name, 3, "", name) for name in ("v", "u", "v_t", "u_t")))
+    law, load = (
+        dataclasses.replace(found, weights=size * rng.normal(size=np.shape(found.weights)))
+        for found, size in (
+            (expansion(layout, rng.normal(size=(50, 12)), {"u": CURVED}, 6), 1e-5),
+            (expansion(seen, rng.normal(size=(9, seen.size)), {}, loaded(robot).size), 1e-5),
+        )
+    )
+    return KNODE(robot, Structured(np.array(0.02), law, Load(load, None), None))
 
-    return Structured
+
+def with_friction():
+    """Return the paper's rod with routed tendons that rub."""
+    robot = kc.load_robot("delrin-tendon-robot")
+    friction = kc.robots.tendons.TendonFriction(wobble=0.6, curvature=0.1)
+    return kc.robots.RoutedTendonRobot.like(robot, friction=friction)
 
 
-@pytest.mark.parametrize("name", [*CATALOG, "network of 512"])
+#: models beside those of the catalog
+OTHERS = {
+    "network of 512": lambda: with_network(512),
+    "structured residual": with_structured_residual,
+    "friction": with_friction,
+}
+
+
+@pytest.mark.parametrize("name", [*CATALOG, *OTHERS])
 def test_1000_steps_are_those_of_simulate(name, tmp_path):
-    model = with_network(512) if name == "network of 512" else kc.load_robot(name)
+    model = OTHERS[name]() if name in OTHERS else kc.load_robot(name)
     controls = smooth_controls(model, 1000)
     wanted = kc.simulate(model, controls, DT)
     exported, rows = run_in_c(model, tmp_path, controls)
@@ -106,8 +134,6 @@ def test_no_compiler_warns_and_nothing_is_allocated(folder, compiler):
 
 def test_wrong_input_never_crashes(folder):
     """10 s here; `FUZZ_SECONDS=600` for longer."""
-    import os
-
     seconds = os.environ.get("FUZZ_SECONDS", "10")
     command = ["cc", "-std=c11", "-g", "-O1", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     subprocess.run(

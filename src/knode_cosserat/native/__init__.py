@@ -1,4 +1,4 @@
-"""Models outside of Python: C code around machine code of the engine, for controllers and other simulators."""
+"""Models outside of Python: C code around machine code of the engine, for controllers and simulators."""
 
 from knode_cosserat.native.export import Exported, ExportError, export
 

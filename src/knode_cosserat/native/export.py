@@ -233,7 +233,7 @@ class _NativeModel:
         }  # fmt: skip
 
     def _places(self) -> dict[str, Any]:
-        """Where the numbers are in a motion and in memories."""
+        """Places of numbers in a motion and in memories."""
         core, tangents = self.code.core, self.code.tangents
         e, counts = core.equations, core.counts
         records, _, past, _, time, *_ = core.states[0][1]
@@ -297,7 +297,7 @@ class _NativeModel:
         }
 
     def _outcomes(self) -> dict[str, Any]:
-        """How results are judged."""
+        """Judgement of results, and the start."""
         settings, core = self.settings, self.code.core
         unseen = turn_of_segments(self.system) > SEEN_TURN
         start = max(int(self.start.result), int(Result.COARSE) * unseen)

@@ -110,8 +110,8 @@ int ${name}_pose_at(const ${name}_robot *robot, int rod, double place, double *p
 /* Position (m) of the tip. */
 int ${name}_tip(const ${name}_robot *robot, double *position);
 
-/* Internal force (N) and moment (N m) of the rod at its base, in the base's frame: what the rod passes on to
- * its base, tendons and chambers not included. */
+/* Force (N) and moment (N m) of a rod on its base, about the base's point, global frame. The pull of routed
+ * tendons at the base is part of it. */
 int ${name}_base_wrench(const ${name}_robot *robot, int rod, double *force, double *moment);
 
 /* Predict the tip (steps, 3) after each of a number of steps from the robot's state under controls
