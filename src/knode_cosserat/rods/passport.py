@@ -112,7 +112,11 @@ class Excess(NamedTuple):
 
     def __str__(self) -> str:
         unit = "" if self.unit in ("", "1") else f" {self.unit}"
-        return f"{self.name} is {self.value:.4g}{unit} (learned {self.low:.4g} to {self.high:.4g})"
+        for digits in range(4, 13):  # as many as show the difference
+            value, low, high = (f"{it:.{digits}g}" for it in (self.value, self.low, self.high))
+            if value not in (low, high):
+                break
+        return f"{self.name} is {value}{unit} (learned {low} to {high})"
 
 
 class _Facts:
