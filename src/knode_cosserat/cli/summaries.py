@@ -208,7 +208,7 @@ def passport_summary(system: System, recordings: Sequence[Path] = ()) -> tuple[d
 
 
 def _verdict(path: Path, origins: Sequence[Origin]) -> str:
-    """Return whether a recording or trajectory is one of the origins of a model, in words."""
+    """Return the use of a recording or trajectory in the learning of a model, in words."""
     from knode_cosserat._files.reading import file_hash
     from knode_cosserat.cli.arguments import files_of, is_recording, load_trajectory_file
     from knode_cosserat.learning.training.checkpoint import data_hash

@@ -17,7 +17,7 @@ def origin_of(data: Any, name: str, *, learned: bool = True, held_out_error: flo
 
     Args:
         data: the trajectory, `Measurements` or `Experiment`.
-        name: its file or description.
+        name: its description, in place of which files have their names.
         learned: false if the model was only tested on it.
         held_out_error: error (m) of a prediction of it by a model that was not learned from it.
     """
@@ -28,7 +28,9 @@ def origin_of(data: Any, name: str, *, learned: bool = True, held_out_error: flo
     elif isinstance(data, Measurements):
         sensed = (it.values for it in data.sensors)
         arrays = data.time, data.control, data.position, data.quaternion, *sensed
-        sha256, rows = data.sha256 or hashed(*arrays), len(data.time)
+        sha256, rows = hashed(*arrays), len(data.time)
+        if data.files:
+            name, sha256 = ("+".join(part) for part in zip(*data.files, strict=True))
         seconds = 0.0 if data.static else float(data.time[-1] - data.time[0])
     else:
         sha256, rows = hashed(data.control, data.data), len(data.data)

@@ -65,12 +65,18 @@ def load_recording(
     if not isinstance(path, str | Path):
         paths = _listed(path)
         recording = _recording_of_files(paths, config)
-        return dataclasses.replace(recording, sha256="+".join(map(file_hash, paths)))
+        return dataclasses.replace(recording, files=_hashes(paths))
     path = Path(path)
     with naming(path):
         wanted = topics_read(config or RecordingConfig.paper_robot())
         recording = _recording(format_of(path).read(path, wanted), config, path.name)
-    return dataclasses.replace(recording, sha256=file_hash(path))
+    return dataclasses.replace(recording, files=_hashes([path]))
+
+
+def _hashes(paths: Sequence[Path]) -> tuple[tuple[str, str], ...]:
+    """Return name and hash of each file; none if one can be read once only."""
+    found = tuple((path.name, file_hash(path)) for path in paths)
+    return found if all(sha256 for _, sha256 in found) else ()
 
 
 def load_example() -> Recording:

@@ -51,8 +51,7 @@ class Recording:
         sensors: sensors beside motion capture.
         uses: use of each column of a table, or topic of a bag; empty text: it is not read.
         clock_deviation: standard deviation of the time between controls and poses (s), of several files.
-        sha256: of the file, as `sha256sum` prints it; of several files, joined by "+"; of a folder, of the
-            bytes of its files in order of their names.
+        files: name and SHA-256 (as `sha256sum` prints it) of each file; of a folder, of its files in order.
     """
 
     source: str
@@ -68,7 +67,7 @@ class Recording:
     sensors: tuple[Sensor, ...] = ()
     uses: Mapping[str, str] = dataclasses.field(default_factory=dict)
     clock_deviation: float = 0.0
-    sha256: str = ""
+    files: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
@@ -178,7 +177,7 @@ class Recording:
             deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
             quantities=driver.quantities,
             clock_deviation=0.0 if self.config.static else self.clock_deviation,
-            sha256=self.sha256,
+            files=self.files,
         )
 
     def _initial_control(

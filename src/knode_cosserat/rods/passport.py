@@ -50,7 +50,7 @@ class Origin(ValidatedSettings):
     """Recording or trajectory that a model was learned from, or that was held out.
 
     Attributes:
-        name: file or description.
+        name: file, or description.
         sha256: of the file, as `sha256sum` prints it (several files of one recording are joined by "+"), or
             of the rows if they were read from no file.
         rows: number of rows used.
@@ -135,7 +135,7 @@ class _Facts:
 @jax.tree_util.register_pytree_node_class
 @dataclasses.dataclass(frozen=True, eq=False, repr=False)
 class Passport:
-    """What a model was learned from, and the range of its controls and strains there.
+    """Recordings that a model was learned from, and the range of its controls and strains there.
 
     Files of robots and models hold it. `print` shows it in a few lines.
 
