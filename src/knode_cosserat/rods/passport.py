@@ -308,17 +308,28 @@ class Passport:
     def _over(self, system: System, **numbers: Any) -> Iterator[tuple[Any, ...]]:
         """Yield for each part its layout, the distance beyond the range, its tolerance, values and range."""
         for part, layout, values in _values(system, **numbers):
-            # batches of robots have leading axes in the bounds: the axes of rows and nodes are inserted
-            low, high = (it[..., None, None, :] for it in self.bounds(part, layout))  # type: ignore[arg-type]
-            numeric = array_module((values, low))
-            width = [
-                numeric.repeat(layout.get(high - low, it.name).max(axis=-1, keepdims=True), it.size, axis=-1)
-                for it in layout.fields
-            ]
-            slack = MARGIN * numeric.concatenate([low[..., :0], *width], axis=-1)
-            slack = slack + ROUNDING * numeric.maximum(numeric.abs(low), numeric.abs(high))
-            over = numeric.maximum(values - high, low - values)
+            low, high, slack = self._limits(part, layout)
+            over = array_module((values, low)).maximum(values - high, low - values)
             yield part, layout, over, slack, values, low, high
+
+    def _limits(self, part: Any, layout: Layout) -> tuple[Any, Any, Any]:
+        """Return the range of a part and its tolerance (…, 1, 1, n), kept unless they are traced."""
+        known = vars(self).setdefault("_kept", {})
+        if (part, layout) in known:
+            limits: tuple[Any, Any, Any] = known[part, layout]
+            return limits
+        # batches of robots have leading axes in the bounds: the axes of rows and nodes are inserted
+        low, high = (it[..., None, None, :] for it in self.bounds(part, layout))
+        numeric = array_module((low, high))
+        width = [
+            numeric.repeat(layout.get(high - low, it.name).max(axis=-1, keepdims=True), it.size, axis=-1)
+            for it in layout.fields
+        ]
+        slack = MARGIN * numeric.concatenate([low[..., :0], *width], axis=-1)
+        slack = slack + ROUNDING * numeric.maximum(numeric.abs(low), numeric.abs(high))
+        if numeric is np:
+            known[part, layout] = low, high, slack
+        return low, high, slack
 
 
 def named(excesses: Iterable[Excess]) -> str:

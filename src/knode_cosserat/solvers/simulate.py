@@ -223,7 +223,7 @@ def stack_robots(robot: Any) -> tuple[System, int | None]:
         raise ValueError(f"robot is {type(robot).__name__}; allowed is a robot or a non-empty list of robots")
     if has_chosen(robots):
         robots = on_grid(robots, ChosenNodes(nodes_of(robots)))
-    if any(one.passport is None for one in robots):  # it is not known of all where they extrapolate
+    if len({one.passport is None for one in robots}) > 1:  # it is not known of all where they extrapolate
         robots = [with_passport(one, None) for one in robots]
     if len({jax.tree.structure(one) for one in robots}) > 1:
         raise ValueError("the robots of a batch must be of one class, with the same nodes and options given")
