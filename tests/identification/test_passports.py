@@ -53,7 +53,8 @@ def test_an_identified_robot_of_any_kind_has_a_passport(found, given):
     passport = found.robot.passport
     assert passport.command == "identify" and [it.learned for it in passport.origins] == [True, True]
     for origin, it in zip(passport.origins, given, strict=True):
-        assert ((origin.name, origin.sha256),) == it.files and origin.rows == len(it.time) and origin.dt == pytest.approx(DT)
+        assert ((origin.name, origin.sha256),) == it.files and origin.rows == len(it.time)
+        assert origin.dt == pytest.approx(DT)
     low, high = passport.bounds("controls", ARM.control_layout)
     every = np.concatenate([it.control[:-1] for it in given])
     np.testing.assert_allclose(high, every.max(axis=0), rtol=1e-6)

@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
@@ -173,8 +173,8 @@ def fit(
         text = re.sub(r"\btrajectory (\d+)\b", lambda match: names.get(int(match[1]), match[0]), str(error))
         raise ValueError(text) from None
     seconds = perf_counter() - began
-    files = [*data.trajectories, *(data.held_out or ())]
-    named = [_with_names(model, files) for model in (result if several else [result])]
+    sources = [*data.trajectories, *(data.held_out or ())]
+    named: list[Any] = [_with_names(model, sources) for model in (result if several else [result])]
     result = type(result)(named) if several else named[0]
     result.save(out)
     if drawing:
@@ -203,7 +203,7 @@ def fit(
     )  # fmt: skip
 
 
-def _with_names(model: System, files: list[Path]) -> System:
+def _with_names(model: System, files: list[Path]) -> Any:
     """Return a model whose passport names the files of its trajectories."""
     from knode_cosserat.rods.passport import with_passport
 

@@ -145,7 +145,7 @@ def _fit_recordings(
     except SearchError as error:
         raise FitError(str(error)) from None
     errors = [*learned.without], [*learned.with_residual]
-    facts = {
+    facts: dict[str, Any] = {
         "given": given,
         "steps": [*learned.steps],
         "residual": learned.kept,

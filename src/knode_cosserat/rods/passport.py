@@ -231,7 +231,9 @@ class Passport:
         _require("passport.origins", origins, list, "a list")
         for k, one in enumerate(origins):
             _require(f"passport.origins.{k}", one, dict, "a mapping")
-        ranges = {part: _read_ranges(f"passport.{part}", values.get(part, {})) for part in PARTS}
+        ranges: dict[str, Any] = {
+            part: _read_ranges(f"passport.{part}", values.get(part, {})) for part in PARTS
+        }
         return cls(**texts, versions=versions, origins=tuple(map(Origin.from_dict, origins)), **ranges)
 
     def __str__(self) -> str:
@@ -299,7 +301,7 @@ class Passport:
                 own = part_over[..., k]
                 if not own.size or np.max(own) == -np.inf:
                     continue
-                at = (*np.unravel_index(int(np.argmax(own)), own.shape), k)
+                at: Any = (*np.unravel_index(int(np.argmax(own)), own.shape), k)
                 numbers_there = (float(np.broadcast_to(it, over.shape)[at]) for it in (values, low, high))
                 relative = float(over[at]) / max(float(np.broadcast_to(slack, over.shape)[at]), 1e-300)
                 found.append((relative, Excess(word + label, f"{unit}{per}", *numbers_there)))
