@@ -58,7 +58,7 @@ kc.figures.error(truth, {"before": before, "after": after})
 #
 # ## Save the model
 #
-# The file holds weights, the nominal model and the provenance. Reading it runs no code.
+# The file holds weights, the nominal model and the passport. Reading it runs no code.
 
 # %%
 model.save("model")

@@ -29,7 +29,7 @@ def stand_in(model: Any, seed: int = 0) -> Any:
         friction=TendonFriction(wobble=0.5, curvature=0.1),
         youngs_modulus=0.9 * float(model.youngs_modulus),
         tendon_compliance=1.2 * float(model.tendon_compliance),
-        trained=None,
+        passport=None,
     )
 
 

@@ -26,6 +26,7 @@ from knode_cosserat.rods import robot_file
 from knode_cosserat.rods.aspects import Drawing
 from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.parameters import Parameter, ParameterError, names_of, parameters_of, slots_of
+from knode_cosserat.rods.passport import compared_numbers, named
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import ChosenNodes, System, array_module, is_traced, nodes_text
 from knode_cosserat.schemes.history import CONSTANT, GUESS_STATES, SolverState, StateHistory
@@ -229,15 +230,19 @@ class Trajectory:
 
     @property
     def extrapolation(self) -> str:
-        """Message on the rows in which the model extrapolates; empty if there are none, or no known range."""
+        """Message on the rows in which the model extrapolates, and how far; empty if there are none."""
         if self.extrapolated is None or not np.any(self.extrapolated):
             return ""
         rows = np.asarray(self.extrapolated)
         first = float(np.asarray(self.time)[int(np.argmax(rows.reshape(-1, rows.shape[-1]).any(axis=0)))])
-        return (
-            f"{np.count_nonzero(rows)} of {rows.size} rows are outside the range that the model was trained "
-            f"in (controls, strains or strain rates), first at {first:g} s"
-        )
+        words = f"{np.count_nonzero(rows)} of {rows.size} rows are outside what the model learned from"
+        return f"{words}, first at {first:g} s" + f": {self.farthest}" * bool(self.farthest)
+
+    @property
+    def farthest(self) -> str:
+        """Controls and strains that leave the range that the model learned from, in words; may be empty."""
+        passport = self.system.passport
+        return "" if passport is None else named(passport.excesses(self.system, **compared_numbers(self)))
 
     @property
     def verdict(self) -> str:
@@ -377,7 +382,7 @@ _ROWS = {
     "iterations": ("1", "Newton corrections"),
     "position_error": ("m", "estimated discretisation error of positions, the largest over the nodes"),
     "time_error": ("m", "estimated error of positions by the time steps, the largest over the nodes"),
-    "extrapolated": ("1", "1 in rows outside the range that the model was trained in"),
+    "extrapolated": ("1", "1 in rows outside the range that the model learned from"),
     "stability": ("1", "stability of an equilibrium; below zero: not tested"),
 }
 _CODES = {"result": Result, "stability": Verdict}

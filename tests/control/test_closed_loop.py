@@ -32,6 +32,7 @@ from knode_cosserat.estimation import Curvatures, KalmanObserver, TipPosition
 from knode_cosserat.estimation.online import split_record
 from knode_cosserat.identification import evaluate
 from knode_cosserat.learning.residual import Nothing
+from knode_cosserat.rods.passport import LearnedRange, Passport, with_passport
 
 pytestmark = pytest.mark.slow
 
@@ -124,6 +125,21 @@ def test_a_loop_has_the_estimated_states_as_a_trajectory(tmp_path):
     assert_allclose(found.control[1:], log.control[:-1], rtol=0, atol=1e-12)
     pid = PID(ROBOT, DT, LIMITS)
     assert run_loop(pid, robot, circle(0.1, 4.0), 0.5).estimated is None
+
+
+def test_a_log_says_where_the_model_extrapolates():
+    """By the controls alone, or by estimated strains too."""
+    known = {"tension": LearnedRange("N", np.zeros(4), np.full(4, 2.0))}
+    strains = {"u": LearnedRange("1/m", np.full(3, -1e-3), np.full(3, 1e-3))}
+    model = with_passport(ROBOT, Passport("identify", controls=known, strains=strains))
+    words = [
+        run_loop(each, plant(), circle(0.1, 1.5), 1.0).extrapolation
+        for each in (PID(model, DT, LIMITS), controller(model), controller())
+    ]
+    assert "of 20 periods are outside what the model learned from: tension_" in words[0]
+    assert " N (learned 0 to 2)" in words[0] and "strain" not in words[0]
+    assert "strain u_" in words[1] and " 1/m (learned -0.001 to 0.001)" in words[1]
+    assert words[2] == ""
 
 
 def test_a_reference_of_other_numbers_is_not_taken_for_positions():

@@ -55,9 +55,17 @@ def test_what_the_library_lacks_is_found_from_the_tip_alone(tmp_path):
     assert facts["unseen_error"] == {"equilibria 1": pytest.approx(after)}
     assert np.mean(facts["held_out_error"]["with"]) < 0.5 * np.mean(facts["held_out_error"]["without"])
     assert "equilibria 0: 36 rows" in facts["given"][0]
+    learned, tested = model.passport.origins
+    assert (learned.name, learned.rows, learned.dt) == ("equilibria 0", 36, 0.0)
+    assert (tested.name, tested.learned) == ("equilibria 1", False)
+    assert tested.held_out_error == pytest.approx(after)
+    errors = np.array(facts["held_out_error"]["with"])
+    assert errors.min() <= learned.held_out_error <= errors.max()
+    assert not evaluate(model, given).extrapolated and not model.passport.rates
     # a model file holds it all
     model.save(tmp_path / "model")
     same = kc.load_model(tmp_path / "model")
+    assert same.passport.to_dict() == model.passport.to_dict()
     assert evaluate(same, unseen).tip_rmse == after
     # an interrupted fit resumes: the searches are not repeated, and the result is the same
     again = fit(ROBOT, [given], checkpoint=tmp_path)

@@ -1,7 +1,6 @@
 """Rows outside the range that a model was trained in are marked, wherever trajectories go."""
 
 import dataclasses
-import types
 
 import jax
 import numpy as np
@@ -11,8 +10,7 @@ import knode_cosserat as kc
 from knode_cosserat.engine import pattern
 from knode_cosserat.learning.config import FitConfig
 from knode_cosserat.learning.knode import KNODE
-from knode_cosserat.rods.parameters import ParameterError
-from knode_cosserat.rods.trained_range import MARGIN, TrainedRange, trained_range, without_range
+from knode_cosserat.rods.passport import MARGIN, Passport, with_passport, without_passport
 from tests.learning.bar import BAR, WRONG, pulled
 
 PAPER = {"time": "bdf2", "start": "paper", "initial": "unstressed"}
@@ -47,16 +45,13 @@ def predicted(model, beyond):
 
 
 def test_the_range_is_that_of_the_trajectories(model, seen):
-    trained = trained_range(model)
-    for low, high, values in (
-        (trained.strain_low, trained.strain_high, np.concatenate([each.z for each in seen]).reshape(-1, 1)),
-        (trained.control_low, trained.control_high, np.concatenate([each.control[1:] for each in seen])),
-        (
-            trained.rate_low,
-            trained.rate_high,
-            np.concatenate([np.diff(each.z, axis=0) / each.dt for each in seen]).reshape(-1, 1),
-        ),
+    rates = np.concatenate([np.diff(each.z, axis=0) / each.dt for each in seen])
+    for part, layout, values in (
+        ("strains", BAR.z_layout, np.concatenate([each.z for each in seen]).reshape(-1, 1)),
+        ("controls", BAR.control_layout, np.concatenate([each.control[1:] for each in seen])),
+        ("rates", BAR.z_layout, rates.reshape(-1, 1)),
     ):
+        low, high = model.passport.bounds(part, layout)
         np.testing.assert_allclose(low, values.min(axis=0), atol=1e-12)
         np.testing.assert_allclose(high, values.max(axis=0), atol=1e-12)
 
@@ -71,17 +66,21 @@ def test_nothing_is_marked_in_what_it_learned_from(model, seen):
 
 
 def test_rows_beyond_are_marked_and_said(model, seen, predicted):
-    trained = trained_range(model)
-    slack = MARGIN * (trained.control_high - trained.control_low).max()
-    driven = (predicted.control > trained.control_high + slack).any(axis=1)
-    driven |= (predicted.control < trained.control_low - slack).any(axis=1)
+    low, high = model.passport.bounds("controls", BAR.control_layout)
+    slack = MARGIN * (high - low).max()
+    driven = (predicted.control > high + slack).any(axis=1)
+    driven |= (predicted.control < low - slack).any(axis=1)
     assert driven.any() and not driven.all()
     # wherever the control is beyond, and where strains or rates are
     assert np.all(predicted.extrapolated[1:][driven[1:]]) and not predicted.extrapolated.all()
     count = int(predicted.extrapolated.sum())
     assert f"EXTRAPOLATION: {count} of {len(predicted.time)} rows" in str(predicted)
     first = predicted.time[np.argmax(predicted.extrapolated)]
-    assert f"first at {first:g} s" in predicted.extrapolation
+    assert f"first at {first:g} s: " in predicted.extrapolation
+    # and how far in which control
+    over = np.maximum(predicted.control - high, low - predicted.control)[1:, 0]
+    most = predicted.control[1 + np.argmax(over), 0]
+    assert f"pull is {most:.4g} N (learned {low[0]:.4g} to {high[0]:.4g})" in predicted.extrapolation
 
 
 @pytest.mark.slow
@@ -94,7 +93,7 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     loaded = kc.load_trajectory(tmp_path / "predicted.nc", system=model)
     assert loaded.extrapolated.dtype == bool
     np.testing.assert_array_equal(loaded.extrapolated, marks)
-    assert trained_range(loaded.system) is not None
+    assert loaded.extrapolation == predicted.extrapolation != ""
     half = len(controls) // 2
     first = kc.simulate(model, controls[:half], beyond.dt, **PAPER)
     second = kc.simulate(model, controls[half:], beyond.dt, **PAPER | {"initial": first})
@@ -107,7 +106,7 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
     np.testing.assert_array_equal(
         prediction.extrapolated, prediction.members[0].extrapolated | prediction.members[1].extrapolated
     )
-    top = 2.0 * np.asarray(trained_range(model).control_high)
+    top = 2.0 * model.passport.bounds("controls", BAR.control_layout)[1]
     rest = kc.equilibrium(model, top)
     assert rest.extrapolated.shape == (1,) and rest.extrapolated[0]
     traced = jax.jit(lambda part: kc.simulate(model, part * controls, beyond.dt, **PAPER).extrapolated)(1.0)
@@ -116,59 +115,24 @@ def test_marks_survive_slices_files_continuing_batches_and_equilibria(
 
 def test_a_range_needs_no_program_of_its_own(model, beyond):
     bare = KNODE(model.knowledge, model.residual, model.about)
-    assert jax.tree.structure(without_range(model)) == jax.tree.structure(bare)
+    assert jax.tree.structure(without_passport(model)) == jax.tree.structure(bare)
     kc.simulate(bare, beyond.held_control[:-1], beyond.dt, **PAPER)
     cores = set(pattern._CODES)
     kc.simulate(model, beyond.held_control[:-1], beyond.dt, **PAPER)
     assert set(pattern._CODES) == cores
 
 
-def test_files_keep_the_range(model, tmp_path):
+def test_files_keep_the_passport(model, ensemble, tmp_path):
     model.save(tmp_path / "model")
     again = kc.load_model(tmp_path / "model", knowledge=WRONG)
-    assert jax.tree.all(jax.tree.map(np.array_equal, again.trained, model.trained))
-    trained = TrainedRange(
-        np.array([-1e-5, -1e-5, 0.999, -3.0, -2.0, -0.1]),
-        np.array([1e-5, 1e-5, 1.0, 3.0, 2.0, 0.1]),
-        -np.ones(6),
-        np.ones(6),
-        np.zeros(4),
-        np.full(4, 9.5),
-    )
-    robot = kc.load_robot("delrin-routed-tendon-robot").replace(trained=trained)
-    kc.save_robot(robot, tmp_path / "robot.yaml")
-    found = kc.load_robot(tmp_path / "robot.yaml")
-    assert jax.tree.all(jax.tree.map(np.array_equal, found.trained, trained))
-    # a model of an identified robot has that robot's range until it is trained itself
-    assert trained_range(KNODE(robot, model.residual)) is robot.trained
-
-
-def test_each_kind_of_number_is_judged_with_a_margin():
-    robot = kc.load_robot("delrin-routed-tendon-robot")
-    zero, one = np.zeros(6), np.ones(6)
-    trained = TrainedRange(-one, one, -one, one, np.zeros(4), np.full(4, 10.0))
-    time, control, z = np.arange(4.0) / 100, np.zeros((4, 4)), np.zeros((4, 3, 6))
-
-    def rows(**changes):
-        given = {"time": time, "control": control, "z": z} | changes
-        return trained.outside(robot, **given).tolist()
-
-    assert rows() == [False] * 4
-    strained = z.copy()
-    strained[2:, 1, 4] = 1.0 + 2.0 * MARGIN + 1e-6  # and so fast: row 2 for both, row 3 for the strain
-    assert rows(z=strained, time=100 * time) == [False, False, True, True]
-    strained[2:, 1, 4] = 1.0 + 2.0 * MARGIN - 1e-6
-    assert rows(z=strained, time=1e4 * time) == [False] * 4
-    assert rows(z=strained) == [False, False, True, False]
-    pulling = control.copy()
-    pulling[[0, 2], 3] = 10.0 + 10.0 * MARGIN + 1e-6
-    # the first row's control acted before
-    assert rows(control=pulling) == [False, False, True, False]
-    assert rows(z=np.full((4, 3, 6), np.nan)) == [False] * 4
-    with pytest.raises(ParameterError, match="strain_low is above strain_high"):
-        TrainedRange(one, zero, -one, one)
-    with pytest.raises(ParameterError, match="allowed is one number for each component"):
-        TrainedRange(one, one, -one, one, np.zeros(4))
+    assert again.passport.to_dict() == model.passport.to_dict()
+    ensemble.save(tmp_path / "models")
+    members = kc.learning.load_ensemble(tmp_path / "models", knowledge=WRONG)
+    assert all(it.passport.to_dict() == model.passport.to_dict() for it in members)
+    # a model of an identified robot has that robot's passport until it is trained itself
+    known = with_passport(BAR, model.passport)
+    assert KNODE(known, model.residual).passport is known.passport
+    assert KNODE(known, model.residual, None, Passport("fit")).passport.command == "fit"
 
 
 @pytest.mark.parametrize("down", [(0.0, 0.0, -9.81), (9.81, 0.0, 0.0)], ids=["upright", "lying"])
@@ -177,11 +141,8 @@ def test_tendons_that_pull_together_are_outside_where_each_is_within(down):
     robot = kc.load_robot("delrin-routed-tendon-robot").replace(gravity=down, nodes=5)
     angle = 2.0 * np.pi * np.arange(24) / 24
     turns = 4.0 + 3.0 * np.stack([np.cos(angle + 0.5 * np.pi * k) for k in range(4)], axis=1)
-    rows = kc.equilibrium(robot, turns)
-    seen = types.SimpleNamespace(
-        time=np.arange(24.0), z=rows.z[:, 0], control=turns, result=rows.result[:, 0]
-    )
-    robot = robot.replace(trained=TrainedRange.of([seen]))
+    seen = kc.solvers.equilibria(robot, turns)
+    robot = with_passport(robot, Passport.of("identify", [], robot, [seen]))
     again = kc.equilibrium(robot, np.concatenate([turns, np.full((1, 4), 6.9)]))
     assert again.extrapolated[:, 0].tolist() == [False] * 24 + [True]
     assert "1 of 25 rows" in again.extrapolation

@@ -48,10 +48,14 @@ def test_a_model_and_what_is_known_of_it(bars, unseen):
     assert tip_rmse(model, unseen, initial="unstressed") < 0.1 * tip_rmse(WRONG, unseen)
     facts = model.about.facts
     assert facts["seed"] == 0 and FitConfig.from_dict(json.loads(json.dumps(facts["config"]))) == SMALL
-    assert [each["sha256"] for each in facts["trajectories"]] == [data_hash(each) for each in bars]
-    assert facts["held_out"] == [{"sha256": data_hash(unseen), "rows": 21, "dt": pytest.approx(0.1)}]
-    assert facts["versions"]["jax"] == importlib.metadata.version("jax")
-    assert facts["date"].startswith("20") and facts["seconds"] > 0.0
+    *learned, tested = model.passport.origins
+    assert [each.sha256 for each in learned] == [data_hash(each) for each in bars]
+    assert all(each.learned for each in learned) and not tested.learned
+    assert (tested.sha256, tested.rows, tested.dt) == (data_hash(unseen), 21, pytest.approx(0.1))
+    assert tested.held_out_error == facts["held_out_error"]
+    assert model.passport.command == "fit"
+    assert model.passport.versions["jax"] == importlib.metadata.version("jax")
+    assert model.passport.date.startswith("20") and facts["seconds"] > 0.0
     segments = facts["segments"]
     assert segments["loss"].shape == segments["learning_rate"].shape == (500,)
     assert segments["loss"][-1] < 2e-2 * segments["loss"][0]
@@ -63,7 +67,7 @@ def test_a_model_and_what_is_known_of_it(bars, unseen):
 
 def test_a_model_is_what_its_knowledge_is():
     """A model delegates the whole interface of a system, except what follows from the other members."""
-    derived = {"nodes"}
+    derived = {"nodes", "passport"}
     assert {name for name in vars(kc.System) if not name.startswith("_")} - set(vars(Wrapped)) == derived
     loose = kc.robots.SlenderRod(
         length=0.5, radius=0.005, density=1e3, youngs_modulus=5e7, base_end=kc.robots.ends.Free()

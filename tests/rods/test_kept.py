@@ -9,7 +9,7 @@ import pytest
 import knode_cosserat as kc
 from knode_cosserat.rods import kept as module
 from knode_cosserat.rods.kept import kept
-from knode_cosserat.rods.trained_range import without_range
+from knode_cosserat.rods.passport import without_passport
 
 ROBOT = kc.load_robot("delrin-tendon-robot")
 
@@ -43,12 +43,12 @@ def test_a_simulation_after_a_change_in_place():
 
 def test_nothing_is_kept_for_robots_that_are_gone_or_traced():
     robot = ROBOT.replace(radius=0.002)
-    without_range(robot)
+    without_passport(robot)
     key = id(robot)
     assert key in module._ENTRIES
     del robot
     gc.collect()
     assert key not in module._ENTRIES
     before = len(module._ENTRIES)
-    jax.jit(lambda radius: without_range(ROBOT.replace(radius=radius)).radius)(0.002)
+    jax.jit(lambda radius: without_passport(ROBOT.replace(radius=radius)).radius)(0.002)
     assert len(module._ENTRIES) == before

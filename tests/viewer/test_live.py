@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 import knode_cosserat as kc
+from knode_cosserat.rods.passport import Origin, Passport
 from knode_cosserat.viewer import view_live
 from knode_cosserat.viewer.live import MOST_PER_SECOND, Session, require_websockets, usual_step
 from knode_cosserat.viewer.pages import MOST_PAGES
@@ -180,10 +181,8 @@ def test_a_control_outside_its_range_is_said_and_the_session_goes_on(session):
 def test_a_model_moves_at_the_step_it_learned_at(robot):
     model = kc.KNODE(robot, None)
     assert usual_step(robot) == usual_step(model) == 0.05
-    model.about.facts["trajectories"] = [{"dt": 0.02, "rows": 30}]
-    assert usual_step(model) == 0.02
-    model.about.facts["trajectories"] = "none of yours"
-    assert usual_step(model) == 0.05
+    known = Passport("fit", (Origin("a", "0", 9, learned=False), Origin("b", "1", 31, 0.6)))
+    assert usual_step(kc.KNODE(robot, None, passport=known)) == pytest.approx(0.02)
 
 
 @pytest.mark.parametrize(

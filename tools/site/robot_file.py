@@ -47,7 +47,6 @@ FAMILIES = {
     "RibSpacing": "Rib spacing: `rib_spacing`",
     "Relaxation": "Relaxation of the material: `relaxation`",
     "Reels": "Reels: `reels`",
-    "TrainedRange": "Trained range: `trained`",
     "EarlyAnchors": "Early anchors: `anchors`",
     "Camera": "Frame and marker of the measurements: `camera`",
 }
@@ -57,7 +56,7 @@ FAMILIES = {
 LOADS = ("Load", "Obstacle", "Effect")
 TENDONS = (
     "Routing", "Reels", "TendonFriction", "Vibration", "RibSpacing", "Relaxation", "EarlyAnchors",
-    "LoadCells", "TrainedRange",
+    "LoadCells",
 )  # fmt: skip
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import stat
 from pathlib import Path
@@ -56,3 +57,19 @@ def read_text(path: str | Path, limit: int, encoding: str = "utf-8") -> str:
         return read_bytes(path, limit).decode(encoding)
     except UnicodeDecodeError:
         raise ReadError("it is not UTF-8 text") from None
+
+
+def file_hash(path: str | Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal; of a folder, of its files in order of their names.
+
+    It is empty for what can be read once only, such as a pipe.
+    """
+    digest, path = hashlib.sha256(), Path(path)
+    files = sorted(it for it in path.rglob("*") if it.is_file()) if path.is_dir() else [path]
+    if not all(it.is_file() for it in files):
+        return ""
+    for one in files:
+        with one.open("rb") as file:
+            while part := file.read(1 << 20):
+                digest.update(part)
+    return digest.hexdigest()

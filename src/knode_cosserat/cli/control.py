@@ -238,6 +238,7 @@ def control(
         f"{facts['missed']} took longer than the period of {1e3 * method.dt:g} ms",
         *([f"{choice}; the same again: --method predictive:{again}"] if choice else []),
         *(f"{name}: {values[-1]:.4g}" for name, values in log.parameters.items()),
+        *([f"EXTRAPOLATION: {log.extrapolation}"] if log.extrapolation else []),
     ]
     write_output(output.as_json, facts, lines, out=output.out, export=viewer.export)
 

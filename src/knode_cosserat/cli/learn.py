@@ -9,7 +9,7 @@ import re
 import sys
 from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
@@ -173,6 +173,9 @@ def fit(
         text = re.sub(r"\btrajectory (\d+)\b", lambda match: names.get(int(match[1]), match[0]), str(error))
         raise ValueError(text) from None
     seconds = perf_counter() - began
+    sources = [*data.trajectories, *(data.held_out or ())]
+    named: list[Any] = [_with_names(model, sources) for model in (result if several else [result])]
+    result = type(result)(named) if several else named[0]
     result.save(out)
     if drawing:
         drawing.residual(next(iter(result)) if several else result, training[0]).savefig(figure)
@@ -198,6 +201,16 @@ def fit(
         out=out,
         figure=figure,
     )  # fmt: skip
+
+
+def _with_names(model: System, files: list[Path]) -> Any:
+    """Return a model whose passport names the files of its trajectories."""
+    from knode_cosserat.rods.passport import with_passport
+
+    assert model.passport is not None
+    pairs = zip(model.passport.origins, files, strict=True)
+    origins = tuple(dataclasses.replace(origin, name=file.name) for origin, file in pairs)
+    return with_passport(model, dataclasses.replace(model.passport, origins=origins))
 
 
 def _fit_recordings(

@@ -25,6 +25,7 @@ from knode_cosserat.cli.arguments import (
     Space,
     coarse_grid_in_output,
     figures,
+    load_ensemble_folder,
     load_system,
     parse_numbers,
     require_trajectory_name,
@@ -218,7 +219,7 @@ def equilibrium(
     if rest.result[0] == kc.Result.OTHER_TURNS:
         lines.append(f"OTHER TURNS: {facts['result']}")
     if rest.extrapolation:
-        lines.append("EXTRAPOLATION: controls or strains are outside the model's training range")
+        lines.append(f"EXTRAPOLATION: {rest.farthest}")
     if rest.result[0] == kc.Result.COARSE:
         lines.append(COARSE)
     elif facts["result"] != "converged" and rest.result[0] not in (kc.Result.UNSTABLE, kc.Result.OTHER_TURNS):
@@ -233,26 +234,39 @@ def info(
     ] = None,
     changes: Changes = None,
     nodes: Nodes = None,
+    recordings: Annotated[
+        list[Path] | None,
+        typer.Option(
+            "--recording",
+            metavar="FILE",
+            help="Compare this recording, or trajectory, with those of the passport; may be repeated.",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Show a robot's parameters and controls, or the catalog.
 
-    For a model, show the residual as well.
+    For a model, or the folder of an ensemble, show the residual as well. What was learned has a passport:
+    recordings, held-out errors, ranges of controls and strains.
 
     Examples:
         info
         info delrin-tendon-robot --set length=0.4
         info model
+        info found.yaml --recording a.csv
     """
     import knode_cosserat as kc
 
     robots = kc.catalog()
     if robot is None:
-        if changes or nodes:
-            raise ValueError("--set and --nodes need a robot: name it, such as delrin-tendon-robot")
+        if changes or nodes or recordings:
+            raise ValueError(
+                "--set, --nodes and --recording need a robot: name it, such as delrin-tendon-robot"
+            )
         write_output(as_json, {"catalog": robots}, table(list(robots.items())))
         return
-    system = load_system(robot, changes, nodes)
+    ensemble = load_ensemble_folder(robot, changes)
+    system = load_system(robot, changes, nodes) if ensemble is None else ensemble[0]
     parts = {"parameters": summaries.parameters(system), "derived": summaries.derived(system)}
     rows = []
     for title, quantities in parts.items():
@@ -268,7 +282,12 @@ def info(
         rows.append(["  none", "", "", "the robot has no controls"])
     more = summaries.more_lines(system)
     heading = f"{robot}: {robots[robot]}" if robot in robots else robot
+    if ensemble is not None:
+        heading += f": ensemble of {len(ensemble)} models; the first"
     facts, lines = summaries.residual_summary(system)
+    learned, words = summaries.passport_summary(system, recordings or ())
+    facts |= learned
+    lines += [*([""] if lines and words else []), *words]
     write_output(
         as_json,
         {"robot": robot, "kind": type(system).__name__, **parts, "controls": drives, "parts": more, **facts},

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +13,7 @@ from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.schemes.result import Result, Verdict
 
 if TYPE_CHECKING:
+    from knode_cosserat.rods.passport import Origin
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
@@ -174,6 +177,59 @@ def more_lines(system: System) -> list[str]:
 def _quantity(value: Any, unit: str, meaning: str) -> dict[str, Any]:
     plain = value if value is None or isinstance(value, int) else np.asarray(value, dtype=float).tolist()
     return {"value": plain, "unit": unit, "meaning": meaning}
+
+
+def passport_summary(system: System, recordings: Sequence[Path] = ()) -> tuple[dict[str, Any], list[str]]:
+    """Return the passport of a model, and of the robot within it, as values and as text.
+
+    Recordings or trajectories are compared with those that it names.
+    """
+    passports = [system.passport] if system.passport is not None else []
+    inner = getattr(system, "knowledge", None)
+    while inner is not None:
+        known = inner.passport
+        if known is not None and all(known.to_dict() != it.to_dict() for it in passports):
+            passports.append(known)
+        inner = getattr(inner, "knowledge", None)
+    if not passports and recordings:
+        raise ValueError("--recording is for what was learned; this robot has no passport")
+    facts: dict[str, Any] = {} if not passports else {"passport": passports[0].to_dict()}
+    lines = []
+    for k, passport in enumerate(passports):
+        first, *others = str(passport).splitlines()
+        lines += [f"passport{' of the robot within' if k else ''}: {first}", *others]
+    verdicts = {
+        str(path): _verdict(path, [it for one in passports for it in one.origins]) for path in recordings
+    }
+    if verdicts:
+        facts["recordings"] = verdicts
+        lines += [f"{path}: {verdict}" for path, verdict in verdicts.items()]
+    return facts, lines
+
+
+def _verdict(path: Path, origins: Sequence[Origin]) -> str:
+    """Return the use of a recording or trajectory in the learning of a model, in words."""
+    from knode_cosserat._files.reading import file_hash
+    from knode_cosserat.cli.arguments import files_of, is_recording, load_trajectory_file
+    from knode_cosserat.learning.training.checkpoint import data_hash
+
+    files = files_of(path)
+    missing = next((file for file in files if not file.exists()), None)
+    if missing is not None:
+        raise ValueError(f"{missing}: no such file")
+    if all(is_recording(str(file)) or file.is_dir() for file in files):
+        whole = "+".join(map(file_hash, files))
+        hashes = {origin.rows: whole for origin in origins}
+    else:
+        motion = load_trajectory_file(path)
+        hashes = {origin.rows: data_hash(motion[: origin.rows]) for origin in origins}
+    for origin in origins:
+        if origin.sha256 == hashes[origin.rows]:
+            return "learned from, unchanged" if origin.learned else "held out, unchanged"
+    names = [file.name for file in files]
+    if any(name in origin.name for origin in origins for name in names):
+        return "not what the model learned from: a recording of this name had other content"
+    return "not among these recordings"
 
 
 def residual_summary(system: System) -> tuple[dict[str, Any], list[str]]:

@@ -25,6 +25,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.passport import named
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
@@ -163,6 +164,8 @@ class LoopLog:
         compiled: number of programs that were compiled during the loop; each may have delayed a period.
         initial_control: (c,) control before the first row, if the log begins at the start.
         settings: settings of the controller that were chosen or given, as plain numbers by name.
+        extrapolation: periods in which controls or estimated strains are outside what the model learned from,
+            and how far, in words; empty if there are none.
         out_of_reach: largest distance (m) from the reference to the nearest tip at rest within the limits;
             0 if it is below 0.2 % of the length, or the tip follows as closely; None: not known.
         estimated: estimated states, a trajectory that can be saved, drawn and viewed; None without an
@@ -186,6 +189,7 @@ class LoopLog:
     settings: dict[str, int] = dataclasses.field(default_factory=dict)
     estimated: Trajectory | None = None
     out_of_reach: float | None = None
+    extrapolation: str = ""
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -219,6 +223,7 @@ class LoopLog:
             "preparation_ms": 1e3 * float(np.median(self.preparation)),
             "cycle_p99_ms": 1e3 * float(np.percentile(self.feedback + self.preparation, 99)),
             "settings": self.settings,
+            "extrapolation": self.extrapolation,
             "parameters": {name: float(values[-1]) for name, values in self.parameters.items()},
         }
 
@@ -282,6 +287,7 @@ class LoopLog:
                 if self.out_of_reach
                 else ""
             )
+            + (f"\nEXTRAPOLATION: {self.extrapolation}" if self.extrapolation else "")
         )
 
 
@@ -453,12 +459,14 @@ class Loop:
         columns: Any = Period._make(zip(*rows, strict=True))
         commands: Any = Command._make(zip(*columns.command, strict=True))
         states = [state for state in columns.estimated if state is not None]
+        estimated = join_rows(states, columns.time) if states else None
+        control = np.array(commands.control)
         return LoopLog(
             time=np.array(columns.time),
             reference=np.array(columns.reference),
             measured=np.array(columns.measured),
             tip=np.array(columns.tip),
-            control=np.array(commands.control),
+            control=control,
             status=tuple(status.value for status in commands.status),
             reason=commands.reason,
             violation=np.array(commands.violation),
@@ -472,8 +480,22 @@ class Loop:
             compiled=_COMPILATIONS.count - self._compiled_before,
             initial_control=self._initial if rows[0].time == 0.0 else None,
             settings=self.controller.settings,
-            estimated=join_rows(states, columns.time) if states else None,
+            estimated=estimated,
+            extrapolation=_extrapolation(getattr(self.controller, "robot", None), control, estimated),
         )
+
+
+def _extrapolation(robot: Any, control: Float[np.ndarray, "T c"], estimated: Trajectory | None) -> str:
+    """Return the periods in which controls or estimated strains leave what a model learned from, in words."""
+    passport = getattr(robot, "passport", None)
+    if passport is None:
+        return ""
+    numbers = {"control": control, "z": None if estimated is None else estimated.z}
+    outside = passport.outside(robot, **numbers)
+    if not outside.any():
+        return ""
+    words = f"{np.count_nonzero(outside)} of {len(outside)} periods are outside what the model learned from"
+    return f"{words}: {named(passport.excesses(robot, **numbers))}"
 
 
 def run_loop(

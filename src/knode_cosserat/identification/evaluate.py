@@ -140,7 +140,7 @@ class Comparison:
         turned: measured orientations, as the predicted ones would be.
         trajectory: the prediction, at the times of the compared rows; of an ensemble, its member nearest to
             the mean.
-        extrapolated: True in rows outside the range that the robot was identified in; None: not known.
+        extrapolated: True in rows outside what the robot learned from; None: not known.
         band: band of an ensemble's predictions, or None.
     """
 
@@ -198,7 +198,7 @@ class Evaluation:
         pose_mse: the paper's mean square error of positions and Euler angles of all bodies, times 1000, or
             None. Euler angles jump at ±π: robots are compared by `rotation_rmse`.
         failed: why there is no prediction, or None.
-        extrapolated: part of the rows outside the range that the robot was identified in; None: not known.
+        extrapolated: part of the rows outside what the robot learned from; None: not known.
         sensors: root mean square error of each sensor beside motion capture, by its name and unit.
         several: rows of equilibria that have several, and errors without them; None if none was found.
         comparison: the rows that were compared; None if there was nothing to simulate.
@@ -261,7 +261,10 @@ class Evaluation:
                 f"models{lost}"
             )
         if self.extrapolated:
-            parts.append(f"{self.extrapolated:.0%} of the rows extrapolated")
+            moved = None if self.comparison is None else self.comparison.trajectory
+            farthest = "" if moved is None else moved.farthest
+            share = f"{self.extrapolated:.0%} of the rows extrapolated"
+            parts.append(f"{share} ({farthest})" if farthest else share)
         if self.several:
             parts.append(str(self.several))
         return (

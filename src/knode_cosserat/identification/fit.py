@@ -21,10 +21,12 @@ from knode_cosserat.identification.experiments import (
     poses_of_nodes,
 )
 from knode_cosserat.identification.journal import Journal, OutOfTimeError, SearchError
+from knode_cosserat.identification.passports import passport_of
 from knode_cosserat.identification.residual import LearnedResidual, learn_residual
 from knode_cosserat.identification.result import Identified
 from knode_cosserat.learning.config import FitConfig, FitError, StructuredOptions
 from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.origins import origin_of
 from knode_cosserat.learning.residual import Nothing
 from knode_cosserat.learning.states import BEST, fit_states
 from knode_cosserat.recordings.measurements import Measurements
@@ -143,7 +145,7 @@ def _fit_recordings(
     except SearchError as error:
         raise FitError(str(error)) from None
     errors = [*learned.without], [*learned.with_residual]
-    facts = {
+    facts: dict[str, Any] = {
         "given": given,
         "steps": [*learned.steps],
         "residual": learned.kept,
@@ -152,9 +154,16 @@ def _fit_recordings(
         "seed": config.seed,
         "config": config.to_dict(),
     }
+    tested = []
     if held_out:
         unseen = [Measurements.of(it) for it in held_out]
         found = [evaluate(learned.robot, it, space=space).tip_rmse for it in unseen]
         facts["unseen_error"] = dict(zip(names_of(unseen), found, strict=True))
-    residual = learned.robot.residual if isinstance(learned.robot, KNODE) and learned.kept else Nothing()
-    return KNODE(robot, residual, About(facts))
+        tested = [
+            origin_of(it, name, learned=False, held_out_error=facts["unseen_error"][name])
+            for it, name in zip(unseen, names_of(unseen), strict=True)
+        ]
+    if not (isinstance(learned.robot, KNODE) and learned.kept):
+        return KNODE(robot, Nothing(), About(facts))
+    passport = passport_of("fit", learned.robot, rows, space, learned.held_out_error(experiments), tested)
+    return KNODE(robot, learned.robot.residual, About(facts), passport)

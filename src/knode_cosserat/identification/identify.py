@@ -25,11 +25,15 @@ from knode_cosserat.identification.free_parameters import identify_parameters, p
 from knode_cosserat.identification.journal import STAGES, Journal, OutOfTimeError, SearchError
 from knode_cosserat.identification.library import identify_effects
 from knode_cosserat.identification.misfit import Misfit
+from knode_cosserat.identification.passports import passport_of
 from knode_cosserat.identification.posterior import Posterior
 from knode_cosserat.identification.result import IdentificationError, Identified
 from knode_cosserat.identification.search import ParameterSearch
+from knode_cosserat.learning.ensemble import Ensemble
+from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.recordings.recording import Recording
+from knode_cosserat.rods.passport import with_passport
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
@@ -130,14 +134,30 @@ def identify(
 
     try:
         if named:
-            return identify_parameters(searched(robot))
-        wanted = None if effects is None else [*effects, *(it.name for it in plain)]
-        return identify_effects(searched, robot, wanted, space)
+            found = identify_parameters(searched(robot))
+        else:
+            wanted = None if effects is None else [*effects, *(it.name for it in plain)]
+            found = identify_effects(searched, robot, wanted, space)
     except OutOfTimeError:
-        return _best(robot, journal, "the time is over")
+        found = _best(robot, journal, "the time is over")
     except KeyboardInterrupt as stop:
-        stop.best = _best(robot, journal, "interrupted")  # type: ignore[attr-defined]
+        found = _best(robot, journal, "interrupted")
+        stop.best = _with_passport(found, listed_rows(data), space)  # type: ignore[attr-defined]
         raise
+    return _with_passport(found, listed_rows(data), space)
+
+
+def _with_passport(found: Identified, rows: Sequence[Any], space: str | SpaceScheme) -> Identified:
+    """Return the result with the passport of its robot and ensemble; the nominal robot learned nothing."""
+    if not found.estimates:
+        return found
+    passport = passport_of("identify", found.robot, rows, space, found.held_out_error)
+    robot, members = with_passport(found.robot, passport), None
+    if found.ensemble is not None:
+        members = Ensemble(
+            KNODE(with_passport(it.knowledge, passport), it.residual, it.about) for it in found.ensemble
+        )
+    return dataclasses.replace(found, robot=robot, ensemble=members)
 
 
 def _best(nominal: System, journal: Journal, reason: str) -> Identified:

@@ -22,11 +22,10 @@ from knode_cosserat.identification.result import (
 )
 from knode_cosserat.identification.samples import sampled
 from knode_cosserat.identification.search import HORIZONS, ROUGH, ParameterSearch, SearchEnd, Subset
-from knode_cosserat.identification.trials import failed_trial, has_coarse_rows, trained_range
-from knode_cosserat.rods.parameters import ParameterError, slots_of
+from knode_cosserat.identification.trials import failed_trial, has_coarse_rows
+from knode_cosserat.rods.parameters import ParameterError
 from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
-from knode_cosserat.trajectory import Trajectory
 
 #: nodes are doubled so often at most
 REFINEMENTS = 2
@@ -262,8 +261,7 @@ def _accepted(
         journal.begin("trials")
         names, point, folds, *_ = selection
         x, kept, posterior = _averaged(search, selection, selection.posterior(model, known))
-        system, motions = misfit.system(x), list[Trajectory]()
-        reason = failed_trial(system, misfit.data, space, motions)
+        reason = failed_trial(misfit.system(x), misfit.data, space)
         if reason is None:
             break
         added = [name for name in names if not model.effect(name).basic]
@@ -287,19 +285,16 @@ def _accepted(
         if np.mean(unseen) >= np.mean(before):
             journal.step("the nominal robot is returned: it predicts held-out recordings as well")
             return _nominal(search)
-    robot = model.reduced(x, kept)
-    if "trained" in slots_of(type(robot)):
-        robot = robot.replace(trained=trained_range(robot, system, motions))
     pairs = zip(misfit.data, errors, strict=True)
     held_out = {it.name: None if it.positions(it.data) is None else error for it, error in pairs}
-    result = Identified.of(search, x, kept, posterior, robot=robot, held_out_error=held_out)
+    result = Identified.of(search, x, kept, posterior, held_out_error=held_out)
     journal.result = result
     journal.begin(STAGES[-1])
     undecided = tuple(result.undecided)
     return dataclasses.replace(
         result,
         next_experiment=next_experiment(search, posterior, x, undecided) if undecided else None,
-        ensemble=sampled(search, (x, kept), posterior, selection.held_out, getattr(robot, "trained", None)),
+        ensemble=sampled(search, (x, kept), posterior, selection.held_out),
     )
 
 

@@ -75,6 +75,16 @@ class LearnedResidual:
     with_residual: tuple[float, ...] = ()
     steps: tuple[str, ...] = ()
 
+    def held_out_error(self, data: Sequence[Experiment]) -> dict[str, float]:
+        """Return the error with the residual of each recording whose blocks were left out, in turn (m)."""
+        blocks, squares, count = blocks_of(data), np.zeros(len(data)), np.zeros(len(data))
+        for block, error in zip(blocks, self.with_residual, strict=True):
+            squares[block.experiment] += len(block.rows) * error**2
+            count[block.experiment] += len(block.rows)
+        errors = np.sqrt(squares / np.maximum(count, 1)).tolist()
+        places = [it.positions(it.data) is not None for it in data]
+        return {it.name: error for it, error, known in zip(data, errors, places, strict=True) if known}
+
 
 def learn_residual(
     robot: System, data: Sequence[Experiment], space: str | SpaceScheme, journal: Journal

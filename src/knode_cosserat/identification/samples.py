@@ -24,7 +24,6 @@ def sampled(
     at: tuple[np.ndarray, Sequence[str]],
     posterior: Posterior,
     held_out: Sequence[Float[np.ndarray, "rows e"]],
-    trained: Any,
 ) -> Ensemble | None:
     """Return samples of the robots that agree with the data, and can follow their controls; None if none can.
 
@@ -38,8 +37,7 @@ def sampled(
         moved = np.where(model.mask(names), moved, 0.0)
         rollouts = search.misfit.differences(moved)
         if all(rollouts):
-            robot = model.reduced(moved, names)
-            robots.append(robot if trained is None else robot.replace(trained=trained))
+            robots.append(model.reduced(moved, names))
             motions.append([it.values for it in rollouts if it is not None])
     if not robots:
         return None

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
-import types
 import warnings
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,11 +15,11 @@ from knode_cosserat.identification.experiments import Experiment
 from knode_cosserat.identification.steps import simulated_rows
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.tendons import remove_delay
-from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.schemes.result import Result, SimulationError
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.equilibrium import equilibria, equilibrium
 from knode_cosserat.solvers.refinement import fix_grid
+from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
 #: amplitudes of the recordings' tensions about their initial ones
@@ -35,13 +36,11 @@ def failed_trial(
     robot: System,
     data: Sequence[Experiment],
     space: str | SpaceScheme,
-    motions: list[Trajectory] | None = None,
 ) -> str | None:
     """Return the reason why a robot is not accepted; None if it passes all trials.
 
     It has to follow the tensions of every recording, the same with 1.5 times the amplitude, and random
-    tensions within the recordings' range, without a step that cannot be solved. Its `motions` under the
-    recordings' own tensions are added to a list.
+    tensions within the recordings' range, without a step that cannot be solved.
     """
     # a tendon does not push; a motor turns either way
     fields = robot.control_layout.fields
@@ -59,17 +58,13 @@ def failed_trial(
         for amplitude in AMPLITUDES
         for it in data
     ]
-    for k, (words, like, tension) in enumerate(
-        [*trials, ("random tensions", data[0], random_controls(data, SECONDS))]
-    ):
+    for words, like, tension in [*trials, ("random tensions", data[0], random_controls(data, SECONDS))]:
         try:
-            still, motion = moved(robot, tension, like, space)
+            _, motion = moved(robot, tension, like, space)
         except SimulationError as error:
             return f"{words}: {error}"
         if not np.all(np.isfinite(np.asarray(motion.y))):
             return f"{words}: a state is not finite"
-        if motions is not None and k < len(data):
-            motions += [still, motion]
     return None
 
 
@@ -88,17 +83,37 @@ def has_coarse_rows(robot: System, data: Sequence[Experiment], space: str | Spac
     return False
 
 
-def trained_range(robot: System, like: System, motions: Sequence[Trajectory]) -> TrainedRange | None:
-    """Return the range of controls, strains and strain rates of a robot that moves `like` another one.
+def motions_of(robot: System, data: Sequence[Experiment], space: str | SpaceScheme) -> list[Trajectory]:
+    """Return the motions of a robot under the controls of experiments; those without a solution are left out.
 
-    The other one has the same strains, and may have more.
+    Where an experiment starts in an equilibrium, that is a motion of its own.
     """
-    names, layout = robot.z_layout.names, like.z_layout
-    strains = (np.concatenate([layout.get(np.asarray(it.z), name) for name in names], -1) for it in motions)
-    return TrainedRange.of(
-        types.SimpleNamespace(time=it.time, z=z, control=it.control, result=it.result)
-        for it, z in zip(motions, strains, strict=True)
-    )
+    motions = list[Trajectory]()
+    with warnings.catch_warnings():
+        # what is to be said of these rows was said in the search
+        warnings.simplefilter("ignore")
+        for it in data:
+            with contextlib.suppress(SimulationError):
+                if it.held is not None and (it.readings or it.static):
+                    motions += moved(robot, it.control, it, space)
+                    continue
+                initial: Any = it.initial
+                if it.held is not None:
+                    initial = equilibrium(robot, it.held, space=it.settings.space, with_stability=False)
+                    motions.append(initial)
+                motion = simulate(
+                    fix_grid(robot),
+                    it.control,
+                    it.dt,
+                    time=it.settings.time or "bdf2",
+                    space=it.settings.space,
+                    start=it.settings.start,
+                    initial=initial,
+                    on_failure="return",
+                    recovery_budget=RECOVERY,
+                )
+                motions.append(motion)
+    return motions
 
 
 def control_range(data: Sequence[Experiment]) -> Float[np.ndarray, "2 c"]:

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import count_of, wrap_lines
 from knode_cosserat.learning.knode import KNODE, ModelFileError, load_model
+from knode_cosserat.rods.passport import Passport
 from knode_cosserat.solvers.simulate import simulate
 from knode_cosserat.trajectory import Trajectory
 
@@ -48,6 +49,11 @@ class Ensemble(Sequence[KNODE]):
 
     def __iter__(self) -> Iterator[KNODE]:
         return iter(self.members)
+
+    @property
+    def passport(self) -> Passport | None:
+        """Recordings that the members were learned from, and the range of controls and strains there."""
+        return self.members[0].passport
 
     def noise_at(self, places: Any) -> Float[np.ndarray, " M"]:
         """Return the standard deviation of what no member can follow, at places (parts of the length; m).

@@ -31,8 +31,9 @@ from knode_cosserat.learning.residual import Network, Nothing, Residual
 from knode_cosserat.learning.structured.residual import Expansion, Load, Structured, Term
 from knode_cosserat.learning.terms import Smooth, Terms, Units
 from knode_cosserat.rods import robot_file
+from knode_cosserat.rods.parameters import ParameterError
+from knode_cosserat.rods.passport import Passport
 from knode_cosserat.rods.system import System, is_traced, unknown_count
-from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import Wrapped
 from knode_cosserat.schemes import semi_discrete
 from knode_cosserat.schemes.semi_discrete import History, Point
@@ -63,31 +64,31 @@ class KNODE(Wrapped):
     knowledge: System
     residual: Residual
     about: About = eqx.field(static=True)
-    #: range of the training trajectories; None if unknown
-    trained: TrainedRange | None = None
 
     def __init__(
         self,
         knowledge: System,
         residual: Residual,
         about: About | None = None,
-        trained: TrainedRange | None = None,
+        passport: Passport | None = None,
     ):
         self.knowledge = knowledge
         self.residual = residual
         self.about = about or About()
-        self.trained = trained
+        #: by default that of the nominal model
+        self.passport = knowledge.passport if passport is None else passport
         self.nodes = knowledge.nodes
 
     def around(self, knowledge: System) -> Self:
         """Return a model with the same residual and another nominal model."""
-        return type(self)(knowledge, self.residual, self.about, self.trained)
+        return type(self)(knowledge, self.residual, self.about, self.passport)
 
     def __repr__(self) -> str:
         facts = self.about.facts
         parts = [f"KNODE of a {robot_text(self.knowledge)}", f"residual {self.residual!r}"]
-        if "trajectories" in facts:
-            parts.append(f"fitted to {count_of(len(facts['trajectories']), 'trajectory', 'trajectories')}")
+        if self.passport is not None:
+            learned = sum(origin.learned for origin in self.passport.origins)
+            parts.append(f"learned from {count_of(learned, 'recording')}")
         if isinstance(facts.get("held_out_error"), float):
             parts.append(f"held-out tip error {quantity(1e3 * facts['held_out_error'], 'mm')}")
         return wrap_lines("; ".join(parts))
@@ -137,7 +138,9 @@ class KNODE(Wrapped):
         model = super().replace(**changes) if changes else self
         if not numbers:
             return model
-        return type(self)(model.knowledge, self.residual.with_coefficients(numbers), self.about, self.trained)
+        return type(self)(
+            model.knowledge, self.residual.with_coefficients(numbers), self.about, self.passport
+        )
 
     def to_bytes(self) -> bytes:
         """Return the bytes of the model's file. Raises `ModelFileError`."""
@@ -184,7 +187,6 @@ CLASSES: dict[str, type] = {
         Terms,
         Smooth,
         Units,
-        TrainedRange,
     )
 }
 
@@ -252,7 +254,8 @@ def _facts(model: KNODE) -> dict[str, Any]:
             raise ContainerError(str(error)) from None
     else:
         knowledge["traits"] = _traits(model.knowledge)
-    own = {"residual": model.residual, "trained": model.trained, "about": model.about.facts}
+    passport = None if model.passport is None else model.passport.to_dict()
+    own = {"residual": model.residual, "passport": passport, "about": model.about.facts}
     return {"knowledge": knowledge, **own}
 
 
@@ -279,15 +282,18 @@ def _model(content: container.Content, source: str, knowledge: System | None) ->
 def _model_of(facts: Any, nominal: System | None) -> KNODE:
     if not isinstance(facts, dict):
         raise ContainerError(f"its model is a {type(facts).__name__}; allowed is a mapping")
-    trained = facts.get("trained")
     kinds = {"knowledge": dict, "residual": Residual, "about": dict}
-    kinds |= {} if trained is None else {"trained": TrainedRange}
     for name, kind in kinds.items():
         if not isinstance(facts.get(name), kind):
             raise ContainerError(
                 f"its {name} is a {type(facts.get(name)).__name__}; allowed is a {kind.__name__}"
             )
-    return KNODE(_knowledge(facts["knowledge"], nominal), facts["residual"], About(facts["about"]), trained)
+    passport = facts.get("passport")
+    try:
+        passport = None if passport is None else Passport.from_dict(passport)
+    except ParameterError as error:
+        raise ContainerError(f"its {error}") from None
+    return KNODE(_knowledge(facts["knowledge"], nominal), facts["residual"], About(facts["about"]), passport)
 
 
 def _knowledge(described: dict[str, Any], nominal: System | None) -> System:

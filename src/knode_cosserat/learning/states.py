@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import datetime
 import functools
 import logging
-import sys
 import time
 import warnings
 from collections.abc import Callable, Iterable, Sequence
@@ -16,19 +14,19 @@ from typing import Any
 import jax
 import numpy as np
 
-from knode_cosserat._files.writing import package_version
 from knode_cosserat.learning.config import FitConfig, FitError, NetworkOptions
 from knode_cosserat.learning.ensemble import Ensemble
 from knode_cosserat.learning.knode import KNODE, About
+from knode_cosserat.learning.origins import origin_of
 from knode_cosserat.learning.residual import Residual, network
 from knode_cosserat.learning.structured.fit import residuals_of
 from knode_cosserat.learning.training import rollouts
-from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity, data_hash
+from knode_cosserat.learning.training.checkpoint import Checkpoints, Identity
 from knode_cosserat.learning.training.descent import SegmentRun, standardised
 from knode_cosserat.learning.training.runs import ProgressMonitor, Run, run_all
+from knode_cosserat.rods.passport import Passport
 from knode_cosserat.rods.strands import strand_of
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.segments import Dataset, samples, strand_samples
@@ -76,12 +74,13 @@ def fit_states(
 
     Returns:
         A `KNODE`, or an `Ensemble` with one member for each seed if `config.seed` holds several. Its
-        `about.facts` has "config", "seed", "trajectories" and "held_out" (SHA-256 of the data, rows, time
-        step), "versions", "date" and "seconds". Each stage of gradient training, "segments" and "rollouts",
-        has the "loss" before every step, the "learning_rate", and the "held_out_error" (step, m) at every
-        check. The final "held_out_error" (m) is that of the model. "rollout_errors" are those of the nominal
-        model and of the model, if they were verified (`rollout_errors`). An interruption of the training by
-        Ctrl-C is a `KeyboardInterrupt`, whose `best` is the model so far; its facts have "interrupted".
+        `passport` says what it learned from, the held-out errors, the range of controls and strains, versions
+        and date. Its `about.facts` has "config", "seed" and "seconds". Each stage of gradient training,
+        "segments" and "rollouts", has the "loss" before every step, the "learning_rate", and the
+        "held_out_error" (step, m) at every check. The final "held_out_error" (m) is that of the model.
+        "rollout_errors" are those of the nominal model and of the model, if they were verified
+        (`rollout_errors`). An interruption of the training by Ctrl-C is a `KeyboardInterrupt`, whose `best`
+        is the model so far; its facts have "interrupted".
 
     Raises:
         DataError: trajectories that do not fit the nominal model or each other, are too short or not finite.
@@ -119,20 +118,32 @@ def fit_states(
                 histories[run.seed][run.stage] = run.report()
             if interrupted:
                 break
-    facts, trained = _facts(config, trajectories, held_out), TrainedRange.of(trajectories)
+    origins = [origin_of(it, f"trajectory {k}") for k, it in enumerate(trajectories)]
+    passport = Passport.of("fit", origins, knowledge, trajectories)
     if verify is None:
         verify = not type(nominal_model(knowledge)).__module__.startswith("knode_cosserat.")
     models = []
     for seed, model in learned.items():
-        about = {**facts, "seed": seed, **histories[seed]}
+        about: dict[str, Any] = {"config": config.to_dict(), "seed": seed, **histories[seed]}
         if interrupted:
             about["interrupted"] = True
+        own = passport
         if held_out_error:
             about["held_out_error"] = held_out_error(model)
+            unseen = [
+                origin_of(it, f"held-out trajectory {k}", learned=False, held_out_error=error)
+                for k, it in enumerate(held_out)
+                for error in [
+                    about["held_out_error"]
+                    if len(held_out) == 1
+                    else rollouts.held_out_error(knowledge, [it])(model)  # type: ignore[misc]
+                ]
+            ]
+            own = dataclasses.replace(passport, origins=(*passport.origins, *unseen))
         if verify:
             about["rollout_errors"] = list(rollout_errors(knowledge, model, trajectories[0]))
         about["seconds"] = time.perf_counter() - began
-        models.append(KNODE(knowledge, model.residual, About(about), trained))
+        models.append(KNODE(knowledge, model.residual, About(about), own))
         log.info("learned from %d trajectories in %.2f s, seed %s", len(trajectories), about["seconds"], seed)
     found = Ensemble(models) if isinstance(config.seed, tuple) else models[0]
     if interrupted:
@@ -197,27 +208,6 @@ def _noisy(trajectory: Trajectory, size: float, number: int) -> Trajectory:
         np.asarray(part) + size * rng.normal(size=np.shape(part)) for part in (trajectory.y, trajectory.z)
     )
     return dataclasses.replace(trajectory, y=y, z=z)
-
-
-def _facts(
-    config: FitConfig, trajectories: Sequence[Trajectory], held_out: Sequence[Trajectory]
-) -> dict[str, Any]:
-    described = [
-        [{"sha256": data_hash(one), "rows": len(one.time), "dt": one.dt} for one in several]
-        for several in (trajectories, held_out)
-    ]
-    return {
-        "config": config.to_dict(),
-        "trajectories": described[0],
-        "held_out": described[1],
-        "versions": {
-            "knode-cosserat": package_version(),
-            "jax": jax.__version__,
-            "numpy": np.__version__,
-            "python": ".".join(map(str, sys.version_info[:3])),
-        },
-        "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
-    }
 
 
 # gain of a model over the nominal one

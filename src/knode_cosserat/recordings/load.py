@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from knode_cosserat._arguments import check_arguments
+from knode_cosserat._files.reading import file_hash
 from knode_cosserat.recordings import checks, frame
 from knode_cosserat.recordings.config import RecordingConfig
 from knode_cosserat.recordings.files import File, clock_deviation, qualified, streams_of_files
@@ -62,11 +63,20 @@ def load_recording(
     if isinstance(config, str | Path):
         config = RecordingConfig.load(config)
     if not isinstance(path, str | Path):
-        return _recording_of_files(_listed(path), config)
+        paths = _listed(path)
+        recording = _recording_of_files(paths, config)
+        return dataclasses.replace(recording, files=_hashes(paths))
     path = Path(path)
     with naming(path):
         wanted = topics_read(config or RecordingConfig.paper_robot())
-        return _recording(format_of(path).read(path, wanted), config, path.name)
+        recording = _recording(format_of(path).read(path, wanted), config, path.name)
+    return dataclasses.replace(recording, files=_hashes([path]))
+
+
+def _hashes(paths: Sequence[Path]) -> tuple[tuple[str, str], ...]:
+    """Return name and hash of each file; none if one can be read once only."""
+    found = tuple((path.name, file_hash(path)) for path in paths)
+    return found if all(sha256 for _, sha256 in found) else ()
 
 
 def load_example() -> Recording:

@@ -76,6 +76,8 @@ class Measurements:
     quantities: tuple[tuple[str, int], ...] = ()
     #: standard deviation of the time between controls and poses (s), zero if it is known; or it is identified
     clock_deviation: float = 0.0
+    #: name and SHA-256 of the recording's files (`Recording.files`); empty for rows that were read from none
+    files: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self) -> str:
         times = f" from {self.time[0]:g} to {self.time[-1]:g} s" if len(self.time) else ""

@@ -51,6 +51,7 @@ class Recording:
         sensors: sensors beside motion capture.
         uses: use of each column of a table, or topic of a bag; empty text: it is not read.
         clock_deviation: standard deviation of the time between controls and poses (s), of several files.
+        files: name and SHA-256 (as `sha256sum` prints it) of each file; of a folder, of its files in order.
     """
 
     source: str
@@ -66,6 +67,7 @@ class Recording:
     sensors: tuple[Sensor, ...] = ()
     uses: Mapping[str, str] = dataclasses.field(default_factory=dict)
     clock_deviation: float = 0.0
+    files: tuple[tuple[str, str], ...] = ()
 
     def __repr__(self) -> str:
         origin = {True: "simulated", False: "real", None: "origin not stated"}[self.simulated]
@@ -175,6 +177,7 @@ class Recording:
             deviations=tuple(marker.deviation or 0.0 for marker in self.config.markers),
             quantities=driver.quantities,
             clock_deviation=0.0 if self.config.static else self.clock_deviation,
+            files=self.files,
         )
 
     def _initial_control(

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import difflib
 import importlib.resources
+import json
 import os
 import warnings
 from importlib.resources.abc import Traversable
@@ -50,6 +51,7 @@ from knode_cosserat.rods.parameters import (
     schema_if_kind,
     slots_of,
 )
+from knode_cosserat.rods.passport import Passport, with_passport
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.system import FEWEST_NODES, MOST_NODES, ChosenNodes, System, is_traced
 from knode_cosserat.rods.tendon_robots import RoutedTendonRobot, TendonRobot, VirtualRobot
@@ -59,7 +61,7 @@ from knode_cosserat.rods.tubes import ConcentricTubeRobot
 FORMATS = (1, 2)
 
 #: keys of a file, and those that it must have
-KEYS = ("format", "kind", "description", "parameters", "hardware")
+KEYS = ("format", "kind", "description", "parameters", "hardware", "passport")
 REQUIRED = ("format", "kind", "parameters")
 
 #: classes that a file can name as its kind
@@ -230,7 +232,8 @@ def _robot(file: dict[Any, Any]) -> System:
     if not isinstance(values, dict):
         raise ParameterError(f"parameters is {excerpt(values)}; allowed is a mapping from names to values")
     robot: System = read_object(KINDS[kind], values, "")
-    return robot
+    passport = file.get("passport")
+    return robot if passport is None else with_passport(robot, Passport.from_dict(passport))
 
 
 def _mapping(text: str, source: str) -> dict[Any, Any]:
@@ -269,7 +272,21 @@ def format_robot(robot: System, description: str = "", with_nodes: bool = True) 
             lines.append(f"  {name}: {parameter.written(value)}  # {parameter.unit}, {parameter.meaning}")
     if with_nodes:
         lines.append(f"  nodes: {robot.nodes}  # base and tip included")
-    return "\n".join(lines + more) + "\n"
+    return "\n".join(lines + more + _passport_lines(robot.passport)) + "\n"
+
+
+def _passport_lines(passport: Passport | None) -> list[str]:
+    """Return the lines of a passport."""
+    if passport is None:
+        return []
+    lines = ["passport:  # what it was learned from, and the range of controls and strains there"]
+    for key, value in passport.to_dict().items():
+        # JSON is YAML in which every text is quoted
+        if isinstance(value, list):
+            lines += [f"  {key}:", *(f"    - {json.dumps(one, ensure_ascii=False)}" for one in value)]
+        else:
+            lines.append(f"  {key}: {json.dumps(value, ensure_ascii=False)}")
+    return lines
 
 
 def more_of(robot: System) -> list[str]:
@@ -329,6 +346,10 @@ def robot_schema() -> dict[str, Any]:
             "hardware": {
                 "type": ["object", "null"],
                 "description": "limits of tensions and dimensions of parts, in SI units, for drivers and CAD",
+            },
+            "passport": {
+                "type": ["object", "null"],
+                "description": "what the robot was learned from, as identification writes it",
             },
         },
         "allOf": [

@@ -31,6 +31,9 @@ from knode_cosserat.rods.parameters import (
     with_value,
 )
 
+if TYPE_CHECKING:
+    from knode_cosserat.rods.passport import Passport
+
 #: smallest and largest number of nodes of a rod, and the number that is chosen if its parts need no more
 FEWEST_NODES, MOST_NODES, USUAL_NODES = 2, 10_000, 10
 #: angle (rad) through which parts turn in one segment: of the nodes that are chosen, and the largest at which
@@ -84,6 +87,8 @@ class System(Parametrised):
         length: Any
     #: number of nodes of the rod, both ends included; by default `needed_nodes`, as `ChosenNodes`
     nodes: int = eqx.field(static=True, default=None, kw_only=True)
+    #: what it was learned from, and the range of controls and strains there; None if it was not
+    passport: Passport | None = eqx.field(default=None, kw_only=True)
 
     # the equations
 

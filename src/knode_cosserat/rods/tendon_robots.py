@@ -29,7 +29,6 @@ from knode_cosserat.rods.tendons import (
     Vibration,
     tension,
 )
-from knode_cosserat.rods.trained_range import TrainedRange
 from knode_cosserat.rotation import cross, dot
 
 #: angles of the paper's four tendons about the rod, π/4 + iπ/2
@@ -173,12 +172,6 @@ class RoutedTendonRobot(TendonRod):
     )
     load_cells: LoadCells | None = slot(
         "correction of measured tensions; none: controls are tensions", LoadCells, default=None
-    )
-
-    trained: TrainedRange | None = slot(
-        "range of the data of its identification; outside it extrapolates",
-        TrainedRange,
-        default=None,
     )
 
     def __check_init__(self) -> None:

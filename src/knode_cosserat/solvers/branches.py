@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from knode_cosserat.rods.aspects import Drawing, Ends
+from knode_cosserat.rods.passport import without_passport
 from knode_cosserat.rods.strands import in_strands, strand_of
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers.guess import turns_between
@@ -37,7 +37,7 @@ def other_equilibria(known: Trajectory) -> tuple[Int[np.ndarray, " K"], Float[np
         known: equilibria of one robot, each with its control.
     """
     assert known.settings is not None
-    system, settings, controls = without_range(known.system), known.settings, np.asarray(known.control)
+    system, settings, controls = without_passport(known.system), known.settings, np.asarray(known.control)
     task = TimeIntegration(settings, steps=1, recovery_budget=0.0)
     records = np.concatenate([np.asarray(known.y), np.asarray(known.z)], axis=-1)
     nearest = _nearest(controls)

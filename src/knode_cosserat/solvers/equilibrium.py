@@ -12,8 +12,8 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
+from knode_cosserat.rods.passport import without_passport
 from knode_cosserat.rods.system import System, is_traced
-from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.history import StepRows
 from knode_cosserat.schemes.result import Result, Verdict
@@ -172,7 +172,7 @@ def _solve(
         initial = resample(initial, robot)
     if initial is not None:
         check_initial(system, initial, batch)
-    bare = without_range(system)
+    bare = without_passport(system)
     y = before = None
     if initial is not None:
         y, before = grid_of(system).spread(initial.y[-1]), initial.control[-1]

@@ -10,9 +10,9 @@ import numpy as np
 
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.aspects import Ends
+from knode_cosserat.rods.passport import without_passport
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System, array_module, is_traced
-from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.history import EXTRAPOLATIONS, SolverState
 from knode_cosserat.schemes.problem import no_history, row_of
@@ -66,7 +66,7 @@ def named_start(
     trajectory: Trajectory, names: tuple[str, ...] | None = None
 ) -> Literal["equilibrium", "unstressed"]:
     """Return the state at rest under zero control that is nearer to row 0 of a motion, in fields of y."""
-    system, settings = without_range(trajectory.system), trajectory.settings or Settings()
+    system, settings = without_passport(trajectory.system), trajectory.settings or Settings()
     columns = system.y_layout.indices(system.y_layout.names if names is None else names)
     seen, scale = np.asarray(trajectory.y[0])[:, columns], np.asarray(system.scales().y)[..., columns]
 

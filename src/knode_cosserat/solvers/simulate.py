@@ -15,8 +15,8 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
+from knode_cosserat.rods.passport import compared_numbers, with_passport, without_passport
 from knode_cosserat.rods.system import ChosenNodes, System, array_module, is_traced
-from knode_cosserat.rods.trained_range import trained_range, without_range
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.history import StateHistory, StepRows, at_stages, no_rows
 from knode_cosserat.schemes.settings import Errors, NewtonOptions, Settings
@@ -109,7 +109,7 @@ def simulate(
     Returns:
         A `Trajectory` of T + 1 rows; row 0 is the initial state. Every row carries its result, and estimates
         of its errors by the nodes (`position_error`) and by the time step (`time_error`). Rows in which a
-        learned or identified model is outside the range of its training data are marked (`extrapolated`).
+        learned or identified model is outside the range of its data (`passport`) are marked (`extrapolated`).
         Inside `jit`, `grad` or `vmap` no error can be raised: unsolved rows are NaN there.
 
     Raises:
@@ -134,11 +134,11 @@ def simulate(
     def solve(robot: Any) -> Solved[Trajectory]:
         system = stack_robots(robot)[0]
         before = initial
-        # ranges are not part of the equations: programs are compiled for systems without them
-        bare = without_range(system)
+        # passports are not part of the equations: programs are compiled for systems without them
+        bare = without_passport(system)
         if isinstance(before, Trajectory):
             before = _again_at_rest(before, system, settings)
-            before = without_range(dataclasses.replace(before, extrapolated=None))
+            before = without_passport(dataclasses.replace(before, extrapolated=None))
         task = TimeIntegration(settings, dt, np.shape(controls)[-2], recovery_budget=recovery_budget)
         if is_traced((system, controls, before)):
             named, rows = (None, before) if isinstance(before, Trajectory) else (before, None)
@@ -161,7 +161,7 @@ def _again_at_rest(initial: Trajectory, system: System, settings: Settings) -> T
     """Return the last equilibrium of a trajectory on the grid of a system."""
     if initial.y.shape[-2] == system.nodes:
         return initial
-    guess, bare = resample(initial, system), without_range(system)
+    guess, bare = resample(initial, system), without_passport(system)
     task = TimeIntegration(Settings(None, settings.space, newton=settings.newton))
     y, control = grid_of(bare).spread(guess.y[-1]), np.asarray(guess.control[-1:])
     rows, _, cause = static_run(task, bare, control, y, control[0])
@@ -177,14 +177,9 @@ def mark_extrapolated(trajectory: Trajectory, initial: Any) -> Trajectory:
     one).
     """
     system = trajectory.system
-    trained = trained_range(system)
-    if trained is None:
+    if system.passport is None:
         return trajectory
-    time, control, z = trajectory.time, trajectory.control, trajectory.z
-    if trajectory.settings is not None and trajectory.settings.time is None:
-        # equilibria are motions of one row
-        time, control, z = time[:1], control[..., None, :], z[..., None, :, :]
-    outside = trained.outside(system, time, control, z).reshape(trajectory.result.shape)
+    outside = system.passport.outside(system, **compared_numbers(trajectory))
     if isinstance(initial, Trajectory) and initial.extrapolated is not None:
         numeric = array_module(outside)
         first = numeric.arange(outside.shape[-1]) == 0
@@ -228,6 +223,8 @@ def stack_robots(robot: Any) -> tuple[System, int | None]:
         raise ValueError(f"robot is {type(robot).__name__}; allowed is a robot or a non-empty list of robots")
     if has_chosen(robots):
         robots = on_grid(robots, ChosenNodes(nodes_of(robots)))
+    if len({one.passport is None for one in robots}) > 1:  # it is not known of all where they extrapolate
+        robots = [with_passport(one, None) for one in robots]
     if len({jax.tree.structure(one) for one in robots}) > 1:
         raise ValueError("the robots of a batch must be of one class, with the same nodes and options given")
     numeric = array_module(robots)

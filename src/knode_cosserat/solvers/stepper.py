@@ -10,8 +10,8 @@ import numpy as np
 
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat._reprs import robot_text
+from knode_cosserat.rods.passport import without_passport
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.history import SolverState, StateHistory, StepRows, at_stages
 from knode_cosserat.schemes.result import Result, SimulationError
 from knode_cosserat.schemes.settings import Errors, NewtonOptions, Settings
@@ -107,7 +107,7 @@ class Stepper:
 
     @robot.setter
     def robot(self, robot: System) -> None:
-        self._robot, self._bare = robot, without_range(robot)
+        self._robot, self._bare = robot, without_passport(robot)
         # memories and machine code were those of the robot before; no state until it moves, as in a copy
         self._engines, self._motion = [], None
 

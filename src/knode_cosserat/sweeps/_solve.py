@@ -18,8 +18,8 @@ import numpy as np
 
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.parameters import parameter_at
+from knode_cosserat.rods.passport import without_passport
 from knode_cosserat.rods.system import System
-from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.schemes.history import SolverState
 from knode_cosserat.schemes.result import Result, SimulationError
@@ -139,7 +139,7 @@ def _chunk(plan: Plan, robot: int, cases: Cases, first: int) -> dict[str, Any]:
 @functools.lru_cache(maxsize=64)
 def _solved_system(plan: Plan, robot: int) -> System:
     """Return a robot without the range of its training data, as the solvers' programs expect."""
-    return without_range(plan.systems[robot])
+    return without_passport(plan.systems[robot])
 
 
 def _equilibria(plan: Plan, system: System, values: dict[str, Any]) -> tuple[Any, Any, dict[int, str]]:

@@ -380,13 +380,9 @@ def view_live(
 
 
 def usual_step(robot: System) -> float:
-    """Return the time step (s) of a model's training trajectories, or else 0.05 s."""
-    about = getattr(robot, "about", None)
-    learned = None if about is None else about.facts.get("trajectories")
-    try:
-        return float(learned[0]["dt"]) if learned else USUAL
-    except (KeyError, TypeError, ValueError):  # facts are the user's to change
-        return USUAL
+    """Return the time step (s) of the data that a model learned from, or else 0.05 s."""
+    origins = () if robot.passport is None else robot.passport.origins
+    return next((origin.dt for origin in origins if origin.learned and origin.dt), USUAL)
 
 
 def require_websockets() -> None:
