@@ -9,6 +9,7 @@ import pytest
 from native import STRICT, Library, has
 
 import knode_cosserat as kc
+from knode_cosserat.rods.passport import Passport, with_passport
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
 
 pytestmark = pytest.mark.skipif(not has("cc"), reason="no C compiler")
@@ -172,3 +173,25 @@ def test_what_cannot_be_exported_says_why(robot, tmp_path):
         kc.export(robot, tmp_path, DT, name="1arm")
     with pytest.raises(kc.KnodeCosseratError, match="target is 'arm'; allowed is native"):
         kc.export(robot, tmp_path, DT, target="arm")
+
+
+def test_a_learned_model_says_where_it_extrapolates(robot, tmp_path):
+    controls = kc.controls.sine(period=1.5, steps=40, dt=DT)
+    motion = kc.simulate(robot, controls, DT)
+    passport = Passport.of("fit", [], robot, [motion])
+    library = Library(with_passport(robot, passport), tmp_path, DT)
+    assert "learned by fit" in (tmp_path / "arm.h").read_text()
+    library.start()
+    for control, row in zip(controls, motion.tip_position[1:], strict=True):
+        library.step(control)
+        assert library.call("extrapolates") == 0
+        np.testing.assert_allclose(library.tip(), row, rtol=0, atol=1e-12)
+    # controls just beyond the range and its tolerance, then strains alone
+    low, high = passport.limits("controls", robot.control_layout)
+    library.step(np.where(np.arange(4) == 1, high + 1e-3, controls[-1]))
+    assert library.call("extrapolates") == 1
+    # at rest under controls of the range, the rod is bent farther than in the motion
+    library.start()
+    assert library.call("extrapolates") == 0
+    library.equilibrium(np.where(np.arange(4) < 2, high, low))
+    assert library.call("extrapolates") == 1 and np.all(low < high)

@@ -26,9 +26,9 @@ from knode_cosserat.engine.pattern import packed
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.layout import Field, Layout
+from knode_cosserat.rods.passport import Passport, without_passport
 from knode_cosserat.rods.strands import in_strands
 from knode_cosserat.rods.system import SEEN_TURN, System
-from knode_cosserat.rods.trained_range import without_range
 from knode_cosserat.schemes.grid import turn_of_segments
 from knode_cosserat.schemes.history import COARSE_ANGLE, COARSE_SHARE, StepCoefficients
 from knode_cosserat.schemes.result import Result
@@ -160,19 +160,20 @@ class _NativeModel:
     dt: float
     target: str
     horizon: int
+    passport: Passport | None
 
     @classmethod
     def of(
         cls, model: System, settings: Settings, dt: float, name: str, target: str, horizon: int
     ) -> _NativeModel:
         """Write the code, and find where the robot starts."""
-        system = without_range(model)
+        system = without_passport(model)
         code = NativeCode.of(system, settings, target, name)
         start = start_of(system, "equilibrium", settings, dt)
         steps = StepCoefficients.of(settings, dt, start.state.known(settings))
         history = jax.tree.map(lambda leaf: np.asarray(leaf)[None], start.state.history)
         motions = Motions(code.core, packed(system), history, steps)
-        return cls(code, motions, system, start, dt, target, horizon)
+        return cls(code, motions, system, start, dt, target, horizon, model.passport)
 
     @property
     def settings(self) -> Settings:
@@ -206,7 +207,7 @@ class _NativeModel:
             "rods": core.strands, "nodes": core.counts["nodes"], "controls": core.equations.nc,
             "horizon": self.horizon, "length": repr(float(system.length)),
         }  # fmt: skip
-        found |= self._sizes() | self._places() | self._controls() | self._outcomes()
+        found |= self._sizes() | self._places() | self._controls() | self._outcomes() | self._learned()
         digest = hashlib.sha256(repr(found).encode())
         for each in self.tables.values():
             digest.update(np.ascontiguousarray(each).tobytes())
@@ -309,6 +310,22 @@ class _NativeModel:
             "ends": _listed(repr(float(end)) for end in np.reshape(self.motions.steps.ends, -1)),
             "start": "in equilibrium" if Ends.of(self.system).held else "unstressed: nothing holds it",
         }  # fmt: skip
+
+    def _learned(self) -> dict[str, Any]:
+        """Limits of controls and strains within which the model was learned, and from what."""
+        system, passport, found = self.system, self.passport, {}
+        layouts = {"controls": system.control_layout, "strains": system.z_layout}
+        for part, layout in layouts.items():
+            low, high = np.full((2, layout.size), np.inf) * [[-1.0], [1.0]]
+            if passport is not None:
+                low, high = passport.limits(part, layout)
+            for name, ends in (("low", low), ("high", high)):
+                found[f"{part}_{name}"] = _listed([*map(_limit, ends), "0.0"])
+        text = "The model states no recordings from which it was learned." if passport is None else passport
+        return found | {
+            "strains": system.z_layout.size // self.code.core.strands,
+            "passport": "\n".join(f" * {line}".rstrip() for line in str(text).replace("*/", "").splitlines()),
+        }
 
 
 def _range_text(field: Field) -> str:

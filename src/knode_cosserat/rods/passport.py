@@ -274,6 +274,11 @@ class Passport:
             return np.zeros((*axes, 0)), np.zeros((*axes, 0))
         return numeric.concatenate(low, axis=-1), numeric.concatenate(high, axis=-1)
 
+    def limits(self, part: str, layout: Layout) -> tuple[Float[Any, " n"], Float[Any, " n"]]:
+        """Return the numbers of a part below and above which a model extrapolates: `bounds` with a tolerance."""
+        low, high, slack = (it[..., 0, 0, :] for it in self._limits(part, layout))
+        return low - slack, high + slack
+
     def outside(self, system: System, **numbers: Any) -> Bool[Any, "*batch T"]:
         """Return True for rows outside the range, by more than a tenth of the largest range in its field.
 

@@ -50,6 +50,9 @@ static const int order[NUMBERS] = {$order};
 static const int64_t record_at[RECORDS] = {$records_at}, tangent_record_at[RECORDS] = {$tangent_records_at};
 static const int64_t record_apart[RECORDS] = {$records_apart}, tangent_record_apart[RECORDS] = {$tangent_records_apart};
 static const double length = $length;
+/* range from which the model was learned, with its tolerance */
+static const double least_control[CONTROLS + 1] = {$controls_low}, most_control[CONTROLS + 1] = {$controls_high};
+static const double least_strain[RODS * $strains + 1] = {$strains_low}, most_strain[RODS * $strains + 1] = {$strains_high};
 
 /* numbers of a prediction, one part after the other */
 enum { MOST = ${NAME}_HORIZON * STAGES };
@@ -156,6 +159,7 @@ int ${name}_step(${name}_robot *robot, const double *control, double dt) {
     robot->result = result > robot->result ? result : robot->result;
     for (int c = 0; c < CONTROLS; c++) robot->control[c] = control[c];
     robot->steps++;
+    robot->acts = 1;
     return (int)robot->result;
 }
 
@@ -203,6 +207,7 @@ int ${name}_equilibrium(${name}_robot *robot, const double *control) {
     ${name}_settle(robot->memory, robot->motion);
     robot->start_time = robot->motion[TIME] = now;
     robot->steps = 0;
+    robot->acts = 1;
     robot->result = result > $start_result ? result : $start_result;
     for (int c = 0; c < CONTROLS; c++) robot->control[c] = control[c];
     return (int)robot->result;
@@ -287,6 +292,21 @@ int ${name}_base_wrench(const ${name}_robot *robot, int rod, double *force, doub
         if (moment) moment[i] = y_of(robot, rod, 0, MOMENT + i);
     }
     return (int)robot->result;
+}
+
+int ${name}_extrapolates(const ${name}_robot *robot) {
+    if (!is_started(robot)) return 0;
+    /* before the first step no control acts */
+    for (int k = 0; k < CONTROLS && robot->acts; k++)
+        if (robot->control[k] < least_control[k] || robot->control[k] > most_control[k]) return 1;
+    for (int rod = 0; rod < RODS; rod++)
+        for (int i = 0; i < $strains; i++)
+            for (int node = 0; node < NODES; node++) {
+                double z = robot->motion[Z + (Y_SIZE + i) * Z_APART + points[rod * NODES + node]];
+                int k = rod * $strains + i;
+                if (z < least_strain[k] || z > most_strain[k]) return 1;
+            }
+    return 0;
 }
 
 /* Prepare the memory of tangents at the robot's state. */
@@ -387,6 +407,7 @@ int ${name}_load(${name}_robot *robot, const double *saved) {
     robot->position_error = saved[5];
     robot->time_error = saved[6];
     robot->continues = 0;
+    robot->acts = 1;
     memcpy(robot->control, saved + OF_CONTROL, CONTROLS * sizeof *saved);
     memcpy(robot->motion, saved + OF_MOTION, sizeof robot->motion);
     robot->motion[TIME] = robot->start_time;

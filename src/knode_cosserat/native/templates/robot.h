@@ -11,6 +11,9 @@
  * time. A structure is copied by assignment. It is aligned to 64 bytes: make it static, or with
  * aligned_alloc(64, sizeof *robot), or in C++17 with new.
  */
+/* Passport.
+$passport
+ */
 #ifndef ${NAME}_H
 #define ${NAME}_H
 
@@ -64,6 +67,7 @@ typedef struct ${name}_robot {
     int64_t steps;
     int64_t result;
     int64_t continues;
+    int64_t acts;
     const double *parameters;
     double start_time;
     /* of the last step: the control, the largest residual (natural units), and estimated errors of positions
@@ -113,6 +117,10 @@ int ${name}_tip(const ${name}_robot *robot, double *position);
 /* Force (N) and moment (N m) of a rod on its base, about the base's point, global frame. The pull of routed
  * tendons at the base is part of it. */
 int ${name}_base_wrench(const ${name}_robot *robot, int rod, double *force, double *moment);
+
+/* 1 if the controls of the last step, or strains of the robot, are outside of the range from which the model
+ * was learned by more than a tenth of it: there it extrapolates. Else 0, also if it was not learned. */
+int ${name}_extrapolates(const ${name}_robot *robot);
 
 /* Predict the tip (steps, 3) after each of a number of steps from the robot's state under controls
  * (steps, ${NAME}_CONTROLS), and its tangents (steps, 3, ${NAME}_CONTROLS) by the controls: the change of the
