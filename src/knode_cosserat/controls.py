@@ -309,8 +309,8 @@ def base_motion(
         shape = values[name].shape
         if len(shape) not in (1, 2) or shape[-1] != size or len(counts) > 1 or not min(counts, default=2) > 1:
             raise ControlsError(
-                f"{name} has the shape {shape}; allowed is (rows, {size}), with as many rows in all that have "
-                f"rows, 2 or more, or ({size},)"
+                f"{name} has the shape {shape}; allowed is (rows, {size}), with as many rows in all of these "
+                f"that have rows, 2 or more, or ({size},)"
             )
     if not counts:
         raise ControlsError(

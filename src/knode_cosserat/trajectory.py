@@ -213,8 +213,7 @@ class Trajectory:
         and inertia of the motors: the pull of routed tendons at the base is part of n and m. The force per
         length of a `TendonRobot` has no reaction there. With several rods it is (…, T, rods, 6).
         """
-        node = (0, slice(None)) if self.force.ndim == self.y.ndim else (0, slice(None), slice(None))
-        return array_module(self.y).concatenate([x[..., *node] for x in (self.force, self.moment)], axis=-1)
+        return self._base_wrench(self.y)
 
     @property
     def mean_base_wrench(self) -> Any:
@@ -230,10 +229,18 @@ class Trajectory:
         wrench = self.base_wrench
         mean = last * wrench
         for k, weight in enumerate(first):
-            states = self.stages[..., k, :, :]
-            stage = dataclasses.replace(self, y=states[..., :ny], z=states[..., ny : ny + self.z.shape[-1]])
-            mean = mean + weight * stage.base_wrench
+            mean = mean + weight * self._base_wrench(self.stages[..., k, :, :ny])
         return numeric.where(numeric.isnan(mean), wrench, mean)
+
+    def _base_wrench(self, y: Any) -> Any:
+        """Return n and m at the base of states y (…, N, y)."""
+        layout = self.system.y_layout
+        if {"n", "m"} <= set(layout.names):
+            parts = [layout.get(y[..., 0, :], name) for name in "nm"]
+        else:
+            several = dataclasses.replace(self, y=y)
+            parts = [several.part(name)[..., 0, :, :] for name in "nm"]
+        return array_module(y).concatenate(parts, axis=-1)
 
     @property
     def velocity(self) -> Any:
