@@ -16,6 +16,7 @@ pose of that time. The impulses on both are then equal, and momentum is kept to 
 from __future__ import annotations
 
 import importlib
+import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -26,6 +27,7 @@ from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.ends import Clamped, Moving
 from knode_cosserat.rods.rod import SlenderRod
+from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.solvers import Stepper, equilibrium
 from knode_cosserat.trajectory import Trajectory
 
@@ -35,6 +37,9 @@ __all__ = ["CouplingError", "RodOnSite"]
 MOST, MANY = 20, 4
 #: displacement of the site in a step, as part of the rod's length, by which the apparent inertia is measured
 PROBE = 1e-3
+#: largest apparent inertia of the rod against that of the site: from 8.5 on, free flanges of little inertia were
+#: unstable
+HEAVIEST = 5.0
 
 
 class CouplingError(KnodeCosseratError, RuntimeError):
@@ -60,7 +65,8 @@ class RodOnSite:
         coupled.state.tip_position[0], coupled.wrench
 
     The robot's `base_end` may have a position and an orientation, which are then in the frame of the site.
-    Gravity is the model's. The mass of the rod against the flange does not matter for stability.
+    Gravity is the model's. Motions are stable while the rod's apparent inertia is less than about five times
+    that of the site, beyond which a warning is given; that of an arm is far larger than its rod's.
     """
 
     def __init__(
@@ -71,6 +77,7 @@ class RodOnSite:
         site: str,
         *,
         substeps: int = 1,
+        space: str | SpaceScheme = "lobatto2",
         tolerance: float = 1e-7,
     ):
         """Couple them at the present state of `data`, the rod in equilibrium with the motion of the site.
@@ -81,6 +88,7 @@ class RodOnSite:
             data: its `mujoco.MjData`, which `step` advances.
             site: name of the site, or of the body, that carries the rod.
             substeps: time steps of MuJoCo in a step of the rod, in which the wrench is constant.
+            space: scheme along the rod, as in `simulate`.
             tolerance: of the wrench, relative to its size.
 
         Raises:
@@ -91,7 +99,7 @@ class RodOnSite:
             self._mujoco = importlib.import_module("mujoco")
         except ImportError:
             raise CouplingError(
-                "MuJoCo is not installed; allowed is pip install knode-cosserat[mujoco]"
+                "MuJoCo is not installed; allowed is pip install 'knode-cosserat[mujoco]'"
             ) from None
         if not isinstance(model, self._mujoco.MjModel) or not isinstance(data, self._mujoco.MjData):
             raise CouplingError(
@@ -123,11 +131,12 @@ class RodOnSite:
         self.dt = float(model.opt.timestep) * substeps
         self._h = np.array([1.0, 0.0, 0.0, 0.0])
         begun = self._control(np.zeros(len(self._own)), self._interface())
-        start = equilibrium(self.robot, begun)
-        self._stepper = Stepper(self.robot, self.dt, initial=start, errors=False)
+        start = equilibrium(self.robot, begun, space=space)
+        self._stepper = Stepper(self.robot, self.dt, space=space, initial=start, errors=False)
         #: wrench of the rod on the site in the last step: force (N) and moment (N·m) about it, global frame
         self.wrench = self._at_site(np.asarray(start.base_wrench[0]), start)
         self._inertia: Any = None
+        self._warned = False
         #: corrections of the wrench in the last step
         self.corrections = 0
 
@@ -168,6 +177,7 @@ class RodOnSite:
                 if slope is None:
                     if self._inertia is None or self.corrections >= MANY:
                         self._inertia = self._measured_inertia(own, after, found)
+                        self._warn_if_heavy(self._inertia @ mobility)
                     slope = np.eye(6) + self._inertia @ mobility
                 else:
                     change = wrench - last
@@ -185,6 +195,17 @@ class RodOnSite:
             raise
         self.corrections, self.wrench = k, wrench
         return self._stepper.step(self._control(own, after))
+
+    def _warn_if_heavy(self, ratios: Float[np.ndarray, "6 6"]) -> None:
+        """Warn once if the rod's apparent inertia is too large against the site's."""
+        largest = float(np.max(np.abs(np.linalg.eigvals(ratios))))
+        if largest > HEAVIEST and not self._warned:
+            self._warned = True
+            warnings.warn(
+                f"the rod's inertia is {largest:.3g} times that of the site; motions are stable up to about "
+                f"{HEAVIEST:g}: give the body more mass or inertia, or the model shorter time steps",
+                stacklevel=3,
+            )
 
     # the model
 

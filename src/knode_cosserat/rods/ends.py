@@ -64,6 +64,8 @@ class End(Part):
     by_rates: ClassVar[bool] = True
     #: True if the end can be a rod's base as well as its tip
     anywhere: ClassVar[bool] = True
+    #: True if the end can be a rod's tip
+    at_tip: ClassVar[bool] = True
     #: the tip's conditions: names, sizes, units
     conditions: ClassVar[tuple[tuple[Any, ...], ...]]
 
@@ -242,6 +244,7 @@ class Moving(Clamped):
     """
 
     kind: ClassVar[str] = "moving"
+    at_tip: ClassVar[bool] = False
 
     def check(self, rod: Any) -> None:
         """Raise `ParameterError` unless this is the base of a rod, whose n and m are its wrench there."""
