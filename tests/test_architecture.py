@@ -32,7 +32,7 @@ ORDER = (
         "metrics",
     ),
     *("estimation", "recordings", "statics", "control", "learning", "loading", "figures", "native"),
-    *("identification", "viewer", "diagnosis", "sweeps", "envs", "", "cli", "__main__"),
+    *("identification", "viewer", "diagnosis", "sweeps", "envs", "mujoco", "", "cli", "__main__"),
 )
 LAYERS = (BASE.split(), *([name] for name in ORDER))
 #: folders of the repository beside the package

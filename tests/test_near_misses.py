@@ -137,6 +137,11 @@ FUNCTIONS: dict[Any, dict[str, str]] = {
     kc.load_recording: {"path": "path"},
     kc.recordings.proposed_config: {"path": "path"},
     kc.controls.load: {"path": "path"},
+    partial(kc.controls.base_motion, position=np.zeros((3, 3))): {
+        "robot": "robot",
+        "controls": "controls",
+        "dt": "number",
+    },
     kc.controls.save: {"path": "path", "tensions": "controls", "dt": "number"},
     kc.controls.parse: {"specification": "name", "steps": "whole", "dt": "number"},
     kc.controls.constant: {"tension": "number", "steps": "whole"},

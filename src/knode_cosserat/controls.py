@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "Controls",
     "ControlsError",
+    "base_motion",
     "constant",
     "load",
     "parse",
@@ -257,6 +258,82 @@ def step_values(t: Any, height: Any, base: Any, at: Any, dt: Any) -> Any:
 def ramp_values(t: Any, height: Any, base: Any, start: Any, end: Any) -> Any:
     """Return `base` with a linear rise by `height` from `start` to `end`."""
     return base + height * np.clip((t - start) / (end - start), 0.0, 1.0)
+
+
+# a moving base
+
+
+def base_motion(
+    robot: System,
+    controls: Any,
+    dt: float,
+    *,
+    position: Any = None,
+    orientation: Any = None,
+) -> Float[np.ndarray, "rows c"]:
+    """Return controls in rows 0, 1, … of a robot whose base moves, with the velocities of its path.
+
+    The first row is that of the initial equilibrium, the others are those of `simulate`:
+
+        rows = kc.controls.base_motion(arm, tensions, dt, position=path)
+        motion = kc.simulate(arm, rows[1:], dt, initial=kc.equilibrium(arm, rows[0]))
+
+    Args:
+        robot: with the base_end `kc.robots.ends.Moving()`.
+        controls: its other controls, (rows, k), or (k,) in all rows.
+        dt: time (s) from row to row.
+        position: (rows, 3), or (3,) in all rows, of the body that carries the base, in m; by default zero.
+        orientation: quaternions (rows, 4), scalar first, or (4,); by default upright. Their signs are free.
+
+    Raises:
+        ControlsError: a robot without a moving base, or arrays of other shapes.
+    """
+    check_arguments(base_motion, locals())
+    from scipy.interpolate import CubicSpline
+    from scipy.spatial.transform import Rotation, RotationSpline
+
+    names = [f"base_{name}" for name in ("position", "orientation", "velocity", "angular_velocity")]
+    layout = robot.control_layout
+    if not set(names) <= set(layout.names):
+        raise ControlsError(
+            f"robot has the controls {', '.join(layout.names) or 'none'}, no base_position; allowed is a "
+            "robot with base_end=kc.robots.ends.Moving()"
+        )
+    columns = [layout.indices((name,)) for name in names]
+    own = np.setdiff1d(np.arange(layout.size), np.concatenate(columns))
+    given = {"controls": (controls, len(own)), "position": (position, 3), "orientation": (orientation, 4)}
+    usual = {"position": np.zeros(3), "orientation": np.array([1.0, 0.0, 0.0, 0.0])}
+    values = {name: usual[name] if value is None else real_array(value) for name, (value, _) in given.items()}
+    counts = {len(value) for value in values.values() if value.ndim == 2}
+    for name, (_, size) in given.items():
+        shape = values[name].shape
+        if len(shape) not in (1, 2) or shape[-1] != size or len(counts) > 1 or not min(counts, default=2) > 1:
+            raise ControlsError(
+                f"{name} has the shape {shape}; allowed is (rows, {size}), with as many rows in all of these "
+                f"that have rows, 2 or more, or ({size},)"
+            )
+    if not counts:
+        raise ControlsError(
+            "controls, position and orientation have no rows; allowed is (rows, …) for one of them"
+        )
+    count = counts.pop()
+    every = np.zeros((count, layout.size))
+    h = values["orientation"]
+    if not np.all(np.linalg.norm(h, axis=-1) > 0.0):
+        raise ControlsError("an orientation is zero; allowed are quaternions, scalar first")
+    every[:, own] = values["controls"]
+    p = np.broadcast_to(values["position"], (count, 3))
+    turned = Rotation.from_quat(np.broadcast_to(h, (count, 4)), scalar_first=True)
+    h = turned.as_quat(scalar_first=True)
+    # of two signs that nearest to the row before
+    sign = np.cumprod(np.where(np.sum(h[1:] * h[:-1], axis=1) < 0.0, -1.0, 1.0))
+    h[1:] *= sign[:, None]
+    t = dt * np.arange(count)
+    # rates of the spline are in the frame of the body
+    spun = turned.apply(RotationSpline(t, turned)(t, 1))
+    for where, value in zip(columns, (p, h, CubicSpline(t, p)(t, 1), spun), strict=True):
+        every[:, where] = value
+    return every
 
 
 def _in_tendons(

@@ -207,6 +207,43 @@ class Trajectory:
         return self.part("m")
 
     @property
+    def base_wrench(self) -> Any:
+        """Force (N) and moment (N·m) of the rod on its base, about the base point, global frame (…, T, 6).
+
+        A sensor between the rod with its motors and the body that carries them measures it, plus the weight
+        and inertia of the motors: the pull of routed tendons at the base is part of n and m. The force per
+        length of a `TendonRobot` has no reaction there. With several rods it is (…, T, rods, 6).
+        """
+        return self._base_wrench(self.y)
+
+    @property
+    def mean_base_wrench(self) -> Any:
+        """Mean of the wrench on the base over the step before each row, whose impulse is dt times it.
+
+        It is of the order of the time scheme. In a row itself, a moving base has the acceleration of the
+        step's middle. For schemes of one stage, and in a first row, it is `base_wrench`.
+        """
+        if self.stages is None or self.settings is None:
+            return self.base_wrench
+        numeric, ny = array_module(self.y), self.y.shape[-1]
+        *first, last = getattr(self.settings.time, "tableau", ((1.0,),))[-1]
+        wrench = self.base_wrench
+        mean = last * wrench
+        for k, weight in enumerate(first):
+            mean = mean + weight * self._base_wrench(self.stages[..., k, :, :ny])
+        return numeric.where(numeric.isnan(mean), wrench, mean)
+
+    def _base_wrench(self, y: Any) -> Any:
+        """Return n and m at the base of states y (…, N, y)."""
+        layout = self.system.y_layout
+        if {"n", "m"} <= set(layout.names):
+            parts = [layout.get(y[..., 0, :], name) for name in "nm"]
+        else:
+            several = dataclasses.replace(self, y=y)
+            parts = [several.part(name)[..., 0, :, :] for name in "nm"]
+        return array_module(y).concatenate(parts, axis=-1)
+
+    @property
     def velocity(self) -> Any:
         """Velocity q (…, T, N, 3) in m/s, material frame; with several rods (…, T, N, rods, 3)."""
         return self.part("q")

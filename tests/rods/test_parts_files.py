@@ -95,7 +95,8 @@ def everywhere(found):
 ROD = {
     "sections": some(SectionChange), "loads": some(Load), "surroundings": some(Obstacle),
     "effects": st.tuples(parts(SpinningFrame)),
-    "base_end": parts(End).filter(lambda end: end.anywhere), "tip_end": parts(End),
+    "base_end": parts(End).filter(lambda end: end.anywhere and end.at_tip),
+    "tip_end": parts(End).filter(lambda end: end.at_tip),
 }  # fmt: skip
 TENDONS = {"tendon_offset": st.just(0.01), "tendon_angles": st.just([0.0, 2.0])}
 ROUTED = {
@@ -132,7 +133,7 @@ FIELDS = {
             st.builds(
                 SlenderRod, name=st.just("arm"), **{name: st.just(value) for name, value in BODY.items()},
                 **{name: ROD[name] for name in ROD if name != "effects"}
-                | {"base_end": parts(End).filter(lambda end: end.anywhere and end.held)},
+                | {"base_end": parts(End).filter(lambda end: end.anywhere and end.at_tip and end.held)},
             )
         ),
     },

@@ -69,9 +69,16 @@ class Ends(_Aspect):
     def unloaded(self, y: Any, along: Any, controls: Any) -> Any:
         """Return guesses of y (T, points, y): the unloaded system as each control (T, c) turns it.
 
-        By default they are y (points, y), the unloaded shape. The points are at fractions `along` the grid.
+        By default they are y (points, y), the unloaded shape, `placed` by each. The points are at fractions
+        `along` the grid.
         """
-        return np.broadcast_to(y, (len(controls), *np.shape(y)))
+        if type(self).placed is Ends.placed:
+            return np.broadcast_to(y, (len(controls), *np.shape(y)))
+        return np.stack([self.placed(y, control) for control in controls])
+
+    def placed(self, y: Any, control: Any) -> Any:
+        """Return the unloaded shape y (points, y) where a control (c,) places the base; by default y."""
+        return y
 
     def branches(self, y: Any, along: Any, controls: Any) -> tuple[Any, Any]:
         """Return guesses (K, points, y) by which several equilibria are found, and the control's row of each.

@@ -18,10 +18,14 @@ from knode_cosserat.rods.layout import Field
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, text
 from knode_cosserat.rods.parts import Part
 from knode_cosserat.rods.shapes import Shape, ball, bar
-from knode_cosserat.rotation import conjugate, dot, quaternion_of, quaternion_product, rotation_matrix
+from knode_cosserat.rotation import conjugate, cross, dot, quaternion_of, quaternion_product, rotation_matrix
 
 #: motions of an end that a control may drive: along a global axis, or about one
 AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+#: largest difference between moves of a base by its pose and by its velocities, as part of the largest move;
+#: and moves (m, rad) that are rounding
+CONTRADICTION, ROUNDING = 0.2, 1e-9
 
 _POSITION = ("p", 3, "m", "position at the tip, global frame")
 _TURN = ("turn", 3, "rad", "rotation at the tip, from where it is held")
@@ -56,8 +60,12 @@ class End(Part):
     unknowns: ClassVar[tuple[str, ...]]
     #: True if the end is constrained
     held: ClassVar[bool] = True
+    #: True if the velocities of a base are the rates of its pose
+    by_rates: ClassVar[bool] = True
     #: True if the end can be a rod's base as well as its tip
     anywhere: ClassVar[bool] = True
+    #: True if the end can be a rod's tip
+    at_tip: ClassVar[bool] = True
     #: the tip's conditions: names, sizes, units
     conditions: ClassVar[tuple[tuple[Any, ...], ...]]
 
@@ -89,6 +97,10 @@ class End(Part):
         """Return the end's place as a fraction of the length, and the radius (m) of its joint's drawing."""
         return float(rod.tip_end is self), max(2.2 * float(rod.section.radius), 0.012 * float(rod.length))
 
+    def twist(self, held: Pose, control: Any) -> Float[Any, "6"]:
+        """Return q and ω (material frame) of a base held in a pose; zero unless controls give them."""
+        return jnp.zeros(6)
+
     @abc.abstractmethod
     def residual(self, held: Pose, y: Pose, n: Any, m: Any) -> Float[Any, " k"]:
         """Return the residual of the tip's conditions, from poses, and n and m less the loads at the tip."""
@@ -111,6 +123,7 @@ class Clamped(End):
     """An end with prescribed position and orientation."""
 
     kind: ClassVar[str] = "clamped"
+    by_rates: ClassVar[bool] = False
     unknowns: ClassVar[tuple[str, ...]] = ("n", "m")
     conditions: ClassVar[tuple[tuple[Any, ...], ...]] = (_POSITION, _TURN)
 
@@ -169,6 +182,7 @@ class Driven(Clamped):
     """A clamped end moved by the control: along global axes (m), and about them (rad)."""
 
     kind: ClassVar[str] = "driven"
+    by_rates: ClassVar[bool] = True
 
     axes: tuple[str, ...] = choice("driven axes", AXES, ("z",))
 
@@ -218,6 +232,70 @@ class Sliding(Driven):
         rows, k = super().residual(held, y, n, m), AXES.index(self.along)
         across = [i for i in range(3) if i != k]
         return jnp.concatenate([jnp.stack([rows[i] for i in across]), -n[k : k + 1], rows[3:]])
+
+
+class Moving(Clamped):
+    """A base that is clamped to a moving body, such as the flange of an arm, whose motion is the control.
+
+    Its position and orientation are stated in the frame of that body; an orientation control of zeros is
+    upright. Controls are linear from row to row. The pose places the rod, and the velocities move it: a pose
+    that a time scheme differentiates twice gives no accelerations. In an equilibrium, the body has constant
+    velocities: with an angular velocity, it is a steady rotation.
+    """
+
+    kind: ClassVar[str] = "moving"
+    at_tip: ClassVar[bool] = False
+
+    def check(self, rod: Any) -> None:
+        """Raise `ParameterError` unless this is the base of a rod, whose n and m are its wrench there."""
+        effects = [part.kind for part in rod.effects if part.gyroscopic or part.kind == "insertion"]
+        if self.body or rod.base_end is not self or effects:
+            found = f"has {effects[0]}" if effects else f"is on {self.body!r}" if self.body else "is a tip"
+            raise ParameterError(
+                f"a moving end {found}; allowed is the base of a rod without body, spinning frame, insertion"
+            )
+
+    @property
+    def control_fields(self) -> tuple[Field, ...]:
+        """Pose and velocities of the body."""
+        return (
+            Field("position", 3, "m", "position of the body, global frame"),
+            Field("orientation", 4, "1", "orientation of the body, quaternion, scalar first", moves=True),
+            Field("velocity", 3, "m/s", "velocity of the body's origin, global frame", moves=True),
+            Field("angular_velocity", 3, "rad/s", "angular velocity of the body, global frame", moves=True),
+        )
+
+    def place(self, rest: Pose, control: Any) -> Pose:
+        """Return the pose of the rod's base on the body."""
+        p, h = jnp.asarray(control)[:3], jnp.asarray(control)[3:7]
+        square = jnp.sum(h * h)
+        h = jnp.where(square > 0.0, h, AT_ORIGIN.h) / jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
+        return Pose(p, h).then(super().place(AT_ORIGIN, control))
+
+    def twist(self, held: Pose, control: Any) -> Float[Any, "6"]:
+        """Return q and ω of the rod's base on the body."""
+        p, v, w = (jnp.asarray(control)[part] for part in (slice(3), slice(7, 10), slice(10, 13)))
+        R = rotation_matrix(held.h)
+        return jnp.concatenate([dot(R.T, v + cross(w, held.p - p)), dot(R.T, w)])
+
+    def contradiction(self, input: Any, dt: float) -> str:
+        """Return a sentence on velocities that are not the rates of the pose, or signs of quaternions."""
+        p, h, v, w = np.split(np.asarray(input), [3, 7, 10])
+        before, after = h[..., :-1], h[..., 1:]
+        if np.any(np.sum(before * after, axis=0) < 0.0):
+            return "base_orientation changes its sign from row to row; allowed is the nearer of h and -h"
+        turn = before[0] * after[1:] - after[0] * before[1:] + np.cross(before[1:], after[1:], axis=0)
+        turn = 2.0 * turn / np.maximum(np.sum(before * before, axis=0), np.finfo(float).tiny)
+        for name, moved, rate in ("velocity", np.diff(p), v), ("angular_velocity", turn, w):
+            moves = dt * (rate[..., 1:] + rate[..., :-1]) / 2.0
+            size = max(float(np.max(np.abs(each), initial=0.0)) for each in (moved, moves))
+            off = float(np.max(np.abs(moved - moves), initial=0.0))
+            if off > CONTRADICTION * size + ROUNDING:
+                return (
+                    f"base_{name} is off by up to {off / dt:.3g} from the rate of the pose; allowed are "
+                    "those of one motion, such as kc.controls.base_motion(robot, controls, dt, position)"
+                )
+        return ""
 
 
 def velocities(pose: Pose, pose_t: Pose) -> tuple[Any, Any]:

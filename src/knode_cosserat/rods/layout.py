@@ -22,7 +22,8 @@ class Field(NamedTuple):
     `frame` names the orientation (a quaternion in y) whose rotation takes a vector of the global frame to the
     material frame; it is empty for a field that is not rotated. `load` is the unit of the load that balances
     the field's rate along s, such as N/m for an internal force. It is empty for a field whose rate is
-    geometry. For a strain, it is the unit of its stress. `low` and `high` are a control's limits.
+    geometry. For a strain, it is the unit of its stress. `low` and `high` are a control's limits; `moves` is
+    true for one that is no displacement or rotation, but cannot jump either, such as a velocity.
     """
 
     name: str
@@ -33,6 +34,7 @@ class Field(NamedTuple):
     load: str = ""
     low: float = -np.inf
     high: float = np.inf
+    moves: bool = False
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,9 +53,10 @@ class Layout:
 
     @property
     def moving(self) -> np.ndarray:
-        """True for each number that is a displacement or rotation (in m or rad), which cannot jump."""
+        """True for each number that cannot jump: displacements and rotations (in m or rad), and others."""
         return np.array(
-            [field.unit in MOVING for field in self.fields for _ in range(field.size)], dtype=bool
+            [field.unit in MOVING or field.moves for field in self.fields for _ in range(field.size)],
+            dtype=bool,
         )
 
     @property

@@ -174,6 +174,10 @@ class Contribution:
         """Return the form in which the part's control enters the equations; by default the control."""
         return control
 
+    def contradiction(self, input: Float[Any, "k *batch T"], dt: float) -> str:
+        """Return a sentence on controls of this part, in rows dt (s) apart, that contradict each other."""
+        return ""
+
     def usual_control(self, rod: Any, field: Field) -> float | None:
         """Return a high value of a control, for sliders that begin at zero; None if the unit decides it."""
         return None

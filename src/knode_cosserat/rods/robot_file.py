@@ -327,11 +327,12 @@ def robot_schema() -> dict[str, Any]:
     """
     parts: dict[str, Any] = {}
     robots = {name: object_schema(cls, parts, nodes=NODES) for name, cls in KINDS.items()}
-    tip_only = [kind for kind, end in kinds_of(End).items() if not end.anywhere]
-    for robot in robots.values():
-        if "base_end" in robot["properties"]:
-            kind = {"properties": {"kind": {"enum": tip_only}}, "required": ["kind"]}
-            robot["properties"]["base_end"]["not"] = kind
+    for name, allowed in ("base_end", "anywhere"), ("tip_end", "at_tip"):
+        refused = [kind for kind, end in kinds_of(End).items() if not getattr(end, allowed)]
+        kind = {"properties": {"kind": {"enum": refused}}, "required": ["kind"]}
+        for robot in robots.values():
+            if name in robot["properties"]:
+                robot["properties"][name]["not"] = kind
     return {
         "$schema": DIALECT,
         "title": "robot file of KNODE-Cosserat",

@@ -570,8 +570,10 @@ class SlenderRod(System):
 
     def base(self, t: Any, control: Any, unknowns: Float[Any, " k"]) -> Float[Any, " y"]:
         """Return y at s = 0: the pose of the base's end, with the unknowns."""
-        held = self.base_end.pose(AT_ORIGIN, self.end_controls(control)[0])
-        y = jnp.concatenate([held.p, held.h, np.zeros(self.y_layout.size - 7)])
+        own = self.end_controls(control)[0]
+        held = self.base_end.pose(AT_ORIGIN, own)
+        twist = self.base_end.twist(held, own)
+        y = jnp.concatenate([held.p, held.h, np.zeros(6), twist, np.zeros(self.y_layout.size - 19)])
         y = self.y_layout.replaced(y, self.base_unknowns, unknowns)
         place = self.material_place(0.0, control)
         for part in () if isinstance(place, float) else self.parts.values():
@@ -659,10 +661,20 @@ class RodEnds(Ends, of=SlenderRod):
         )
         return base, tip
 
-    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
-        """Return y at s = 0 with the velocities of the base's pose; a clamped base does not move."""
+    def placed(self, y: Any, control: Any) -> Any:
+        """Return the unloaded shape on a body that carries a rod with a free tip."""
         rod = self.system
-        if type(rod.base_end) is not Clamped or rod.base_end.body:
+        if rod.base_end.by_rates or not rod.base_end.control_fields or rod.tip_end.held:
+            return y
+        still, own = (rod.end_controls(each)[0] for each in (np.zeros(np.shape(control)), control))
+        moved = rod.base_end.pose(AT_ORIGIN, own).then(rod.base_end.pose(AT_ORIGIN, still).inverse())
+        poses = jax.vmap(lambda each: jnp.concatenate(moved.then(rod.pose(each))))(jnp.asarray(y))
+        return np.concatenate([poses, y[:, 7:]], axis=1)
+
+    def moving_base(self, y: Float[Any, " y"], y_t: Float[Any, " y"]) -> Float[Any, " y"]:
+        """Return y at s = 0 with the velocities of the base's pose, unless its end states them."""
+        rod = self.system
+        if rod.base_end.by_rates or rod.base_end.body:
             q, w = velocities(rod.pose(y), rod.pose(y_t))
             y = jnp.concatenate([y[:13], q, w, y[19:]])
         point = RodPoint(rod, 0.0, None, y, y_t)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from knode_cosserat.rods.ends import Moving
 from knode_cosserat.rods.law import MaterialLaw, Viscoelastic
 from knode_cosserat.rods.loads import transverse_force
 from knode_cosserat.rods.parameters import ParameterError, choice, parameter, slot
@@ -111,6 +112,13 @@ class TendonRobot(TendonRod):
     """
 
     kind: ClassVar[str] = "tendon-robot"
+
+    def __check_init__(self) -> None:
+        if isinstance(self.base_end, Moving):
+            raise ParameterError(
+                "base_end moves, and the tendons of a tendon-robot push along fixed global axes; allowed is "
+                "RoutedTendonRobot.like(robot)"
+            )
 
     @property
     def tendons(self) -> _TransverseTendons:

@@ -16,7 +16,9 @@ import numpy as np
 from knode_cosserat._arguments import check_arguments
 from knode_cosserat.engine.pattern import Pattern
 from knode_cosserat.rods.passport import compared_numbers, with_passport, without_passport
+from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.rods.system import ChosenNodes, System, array_module, is_traced
+from knode_cosserat.rods.wrapped import nominal_model
 from knode_cosserat.schemes.grid import grid_of
 from knode_cosserat.schemes.history import StateHistory, StepRows, at_stages, no_rows
 from knode_cosserat.schemes.settings import Errors, NewtonOptions, Settings
@@ -130,6 +132,7 @@ def simulate(
     check_initial(system, initial, batch)
     warn_if_undamped(robot, dt)
     warn_of_long_steps(robot, dt)
+    warn_of_contradictions(system, controls, dt)
 
     def solve(robot: Any) -> Solved[Trajectory]:
         system = stack_robots(robot)[0]
@@ -289,6 +292,16 @@ def check_limits(system: System, controls: Any) -> None:
                 f"a tension is {np.min(tension):g} N: a tendon only pulls, but is computed as if it pushed",
                 stacklevel=4,
             )
+
+
+def warn_of_contradictions(system: System, controls: Any, dt: float) -> None:
+    """Warn of controls (…, T, c) that contradict each other, such as a base's pose and its velocities."""
+    rod = nominal_model(system)
+    if is_traced(controls) or not isinstance(rod, SlenderRod):
+        return
+    for part, input in rod.inputs(np.moveaxis(np.asarray(controls), -1, 0)):
+        if said := part.contradiction(input, dt):
+            warnings.warn(f"controls: {said}", stacklevel=4)
 
 
 def check_initial(system: System, initial: Any, batch: int | None) -> None:

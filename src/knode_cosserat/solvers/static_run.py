@@ -67,6 +67,8 @@ def static_batch(
     controls, many, size = np.asarray(controls), np.ndim(system.length) > 0, len(controls)
     guess = unloaded_shape(system, task.settings.space) if y is None else y
     guess = guess if guess.ndim == 3 else jnp.broadcast_to(guess, (size, *guess.shape))
+    if y is None and not many:
+        guess = np.stack([Ends.of(system).placed(*each) for each in zip(guess, controls[:, 0], strict=True)])
     last = np.broadcast_to(0.0 if before is None else before, (size, controls.shape[-1]))
 
     def walk(i: int) -> _Walk:
@@ -162,7 +164,7 @@ class _Walk:
         if not free and "p" in self.system.y_layout.names and strand_count(self.system) == 1:
             p = np.asarray(y)[:, self.system.y_layout.slice("p")]
             self.chord = float(np.linalg.norm(p[-1] - p[0]))
-        guess = None
+        y, guess = Ends.of(self.system).placed(y, controls[0]), None
         if self.chord > STRAIGHT * float(self.system.length) and self._compressed(controls[0]):
             guess = self._best(controls[0], curve_guesses(self.system, controls[0]))[0]
         if guess is None:
