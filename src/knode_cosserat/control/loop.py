@@ -25,6 +25,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
 from knode_cosserat.rods.wrapped import nominal_model
@@ -165,6 +166,7 @@ class LoopLog:
         settings: settings of the controller that were chosen or given, as plain numbers by name.
         out_of_reach: largest distance (m) from the reference to the nearest tip at rest within the limits;
             0 if it is below 0.2 % of the length, or the tip follows as closely; None: not known.
+        control_layout: names and units of the controls; None: not known.
         estimated: estimated states, a trajectory that can be saved, drawn and viewed; None without an
             observer. Its robot has the parameters that the model had at first.
     """
@@ -186,6 +188,7 @@ class LoopLog:
     settings: dict[str, int] = dataclasses.field(default_factory=dict)
     estimated: Trajectory | None = None
     out_of_reach: float | None = None
+    control_layout: Layout | None = None
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -453,6 +456,7 @@ class Loop:
         columns: Any = Period._make(zip(*rows, strict=True))
         commands: Any = Command._make(zip(*columns.command, strict=True))
         states = [state for state in columns.estimated if state is not None]
+        robot = getattr(self.controller, "robot", None) or getattr(self.plant, "robot", None)
         return LoopLog(
             time=np.array(columns.time),
             reference=np.array(columns.reference),
@@ -473,6 +477,7 @@ class Loop:
             initial_control=self._initial if rows[0].time == 0.0 else None,
             settings=self.controller.settings,
             estimated=join_rows(states, columns.time) if states else None,
+            control_layout=None if robot is None else robot.control_layout,
         )
 
 

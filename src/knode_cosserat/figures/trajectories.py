@@ -16,6 +16,7 @@ from knode_cosserat.figures.drawing import (
     View,
     by_label,
     checked_view,
+    control_words,
     curves_of,
     draw_tensions,
     draw_tips,
@@ -456,12 +457,13 @@ def closed_loop(log: LoopLog) -> Figure:
         for each in log.time[fallback]:
             error.axvspan(each, each + log.time[1] - log.time[0], color=PALETTE[1], alpha=0.3, lw=0)
         error.set(xlabel="time [s]", ylabel="distance [mm]", title="distance from the reference")
+        names, title = [str(k + 1) for k in range(log.control.shape[1])], "control"
+        if log.control_layout is not None:
+            names, title = control_words(log.control_layout)
         for k, column in enumerate(log.control.T):
-            control.step(log.time, column, where="post", color=PALETTE[k % len(PALETTE)], label=f"{k + 1}")
-        low, high = float(log.control.min()), float(log.control.max())
-        # room for the legend
-        control.set(xlabel="time [s]", title="controls", ylim=(low, high + 0.25 * (high - low or 1.0)))
-        control.legend(ncols=4, loc="upper left")
+            control.step(log.time, column, where="post", color=PALETTE[k % len(PALETTE)], label=names[k])
+        control.set(xlabel="time [s]", ylabel=title)
+        legend_above(control)
         if log.parameters:
             for k, (name, values) in enumerate(log.parameters.items()):
                 unit = np.max(np.abs(values)) or 1.0
