@@ -86,6 +86,35 @@ def test_a_robot_that_sags_is_simulated_from_its_equilibrium(tmp_path):
     )
 
 
+def test_a_robot_without_controls_needs_none(tmp_path):
+    rod = kc.robots.SlenderRod(
+        length=0.3,
+        radius=0.004,
+        density=1200.0,
+        youngs_modulus=2e8,
+        bending_damping=1e-3,
+        nodes=6,
+        gravity=[9.81, 0.0, 0.0],
+    )
+    kc.save_robot(rod, tmp_path / "rod.yaml")
+    words = (
+        "simulate",
+        tmp_path / "rod.yaml",
+        "--steps",
+        4,
+        "--dt",
+        0.02,
+        "--initial",
+        "unstressed",
+        "--out",
+    )
+    told(*words, tmp_path / "a.nc")
+    told(*words, tmp_path / "b.nc", "--controls", "none")
+    first, second = (kc.load_trajectory(tmp_path / name) for name in ("a.nc", "b.nc"))
+    assert first.control.shape == (5, 0) and first.tip_position[-1, 0] > 1e-3
+    np.testing.assert_array_equal(first.y, second.y)
+
+
 @pytest.mark.campaign
 def test_simulate_takes_schemes_and_parameters(tmp_path):
     facts = told(

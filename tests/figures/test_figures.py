@@ -137,7 +137,9 @@ def test_tensions_are_held_from_row_to_row(trajectory):
         values, edges, _ = patch.get_data()
         np.testing.assert_array_equal(values, np.asarray(trajectory.held_tension)[:-1, k])
         np.testing.assert_array_equal(edges, trajectory.time)
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [f"tension {k}" for k in range(1, 5)]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        f"tension {k}" for k in range(1, 5)
+    ]
 
 
 def test_a_prediction_stands_against_its_recording(trajectory, recording):
