@@ -10,6 +10,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.cli.arguments import limits_of
+from knode_cosserat.cli.kinematics import TipTarget
 from knode_cosserat.cli.program import joined_vectors
 from knode_cosserat.cli.robots import Held
 from knode_cosserat.control.commands import CONTROLLERS
@@ -292,6 +293,18 @@ def test_limits_may_have_units():
     ):
         with pytest.raises(ValueError, match=message):
             limits_of(tendons, **wrong)
+
+
+def test_tensions_and_positions_may_have_units():
+    tendons = kc.load_robot(ROBOT)
+    found = Held(tension=joined_vectors(["--tension", "7 N,500gf,5,7 N"])[1]).of(tendons)
+    np.testing.assert_allclose(found, [7.0, 4.905, 5.0, 7.0], rtol=1e-15)
+    target = TipTarget(position="174.04 mm, 0.0838, 60cm").pose(0.635)[0]
+    np.testing.assert_allclose(target, [0.17404, 0.0838, 0.6], rtol=1e-15)
+    with pytest.raises(ValueError, match="--tension is '7 mm,5,5,7': mm is no unit of a number in N"):
+        Held(tension="7 mm,5,5,7").of(tendons)
+    with pytest.raises(ValueError, match="--position must be 3 numbers"):
+        TipTarget(position="174 mm, 83 mm").pose(0.635)
 
 
 def test_parameters_that_are_vectors():

@@ -154,7 +154,7 @@ class Held(NamedTuple):
     """Constant control of an equilibrium: from tensions, from numbers in order, or by name.
 
     Options:
-        tension (--tension N,N,…): Tensions of all tendons (N), such as 7,5,5,7.
+        tension (--tension N,N,…): Tensions of all tendons (N), such as 7,5,5,7 or 700gf,5,5,7.
         control (--control CONTROL): All controls in order, such as 7,5,5,7; or some by name, such as
             base_z=20mm,base_ry=0.2, and the others zero. Numbers may have units. `knode-cosserat info
             ROBOT` lists names and units.
@@ -182,7 +182,7 @@ class Held(NamedTuple):
             )
         words = [] if self.control is None else _control_words(self.control, names)
         if self.tension is not None:
-            values = parse_numbers("--tension", self.tension, tensions[0])
+            values = parse_numbers("--tension", self.tension, tensions[0], unit="N")
             if not all(0.0 <= value < np.inf for value in values):
                 raise ValueError(
                     f"--tension must be {tensions[0]} numbers, 0 or more (N), such as 7,5,5,7 "
