@@ -383,8 +383,9 @@ def workspace(samples: Workspace, colour: str | ArrayLike = "controls", *, label
     look: dict[str, Any] = {"c": values, "s": 1, "cmap": TIME_COLOURS, "linewidths": 0, "rasterized": True}
     look |= {"vmin": values.min(), "vmax": values.max()}
     with new_figure(TWO_COLUMNS, 2.9) as figure:
-        grid = figure.add_gridspec(1, 3, width_ratios=(1.2, 1.0, 1.0))
-        for k, view in enumerate(("xyz", "xz", "xy")):
+        # an empty column, because the layout leaves no room for the labels of an axis in space
+        grid = figure.add_gridspec(1, 4, width_ratios=(1.2, 0.2, 1.0, 1.0))
+        for k, view in ((0, "xyz"), (2, "xz"), (3, "xy")):
             seen = View(figure, grid[0, k], view)
             dots = seen.axes.scatter(*seen.of(points), **look)
             if seen.flat:
