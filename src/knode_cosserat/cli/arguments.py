@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
-#: parameters that otherwise follow from Young's modulus
-STIFFNESSES = ("bending_stiffness", "shear_stiffness")
 #: endings of figure files
 FORMATS = (".png", ".pdf", ".svg")
 #: endings of recordings
@@ -267,17 +265,10 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
         stated = parameter_at(nominal_model(system), name)
         values[name] = value if stated is None else stated.in_si(name, value)
     changed = system.replace(**values)
-    nominal = nominal_model(changed)
     if "tendon_offset" in values:
         from knode_cosserat.rods.robot_file import warn_of_paper_tendons
 
-        warn_of_paper_tendons(nominal, "--set tendon_offset")
-    own = [name for name in STIFFNESSES if getattr(nominal, name, None) is not None]
-    if "youngs_modulus" in values and own and values.keys().isdisjoint(own):
-        warnings.warn(
-            f"--set youngs_modulus has no effect: the robot states its {' and '.join(own)}; set these",
-            stacklevel=2,
-        )
+        warn_of_paper_tendons(nominal_model(changed), "--set tendon_offset")
     return changed
 
 
