@@ -16,6 +16,7 @@ from knode_cosserat.cli.robots import Held
 from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
+from tests.viewer.test_scene import Scripts, unpacked
 
 # help
 
@@ -554,6 +555,11 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     assert before == pytest.approx([42.70, 34.57, 23.13, 21.44], rel=5e-3)
     assert published == pytest.approx([5.07, 10.95, 1.31, 5.94], rel=5e-3)
     assert all(own < 0.01 * paper for own, paper in zip(ours, published, strict=True))
+    # the scene shows no row that the paper's coarse grid spoils
+    page = Scripts((tmp_path / "pictures" / "scene.html").read_text(encoding="utf-8"))
+    tracks = json.loads(page.found["scene"])["tracks"]
+    assert len(tracks) == 3
+    assert all(np.all(unpacked(track["result"]) == 0) for track in tracks)
     # the last table: a held-out recording is predicted after calibration
     title, nominal, calibrated = done.stdout.rstrip().splitlines()[-7:-4]
     assert "held-out recording (simulated)" in title
