@@ -1,7 +1,7 @@
 """Every piece of code in README and docs: Python and commands run, and print what is said there.
 
-The blocks of a page share their names and their folder, in order. A block after `<!-- test: long -->`, and all that follows it
-on its page, are run by `make test-all` only.
+The blocks of a page share their names and their folder, in order. Python after `<!-- test: long -->`, and all
+of it that follows on the page, is run by `make test-all` only.
 """
 
 import itertools
