@@ -10,11 +10,13 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat.cli.arguments import limits_of
+from knode_cosserat.cli.kinematics import TipTarget
 from knode_cosserat.cli.program import joined_vectors
 from knode_cosserat.cli.robots import Held
 from knode_cosserat.control.commands import CONTROLLERS
 from knode_cosserat.metrics import dtw_distance
 from tests.commands import COMMANDS, ROBOT, run, simulated, succeeded, told
+from tests.viewer.test_scene import Scripts, unpacked
 
 # help
 
@@ -84,6 +86,35 @@ def test_a_robot_that_sags_is_simulated_from_its_equilibrium(tmp_path):
     assert (
         result.exit_code == 2 and 'allowed is a Trajectory or "equilibrium" or "unstressed"' in result.stderr
     )
+
+
+def test_a_robot_without_controls_needs_none(tmp_path):
+    rod = kc.robots.SlenderRod(
+        length=0.3,
+        radius=0.004,
+        density=1200.0,
+        youngs_modulus=2e8,
+        bending_damping=1e-3,
+        nodes=6,
+        gravity=[9.81, 0.0, 0.0],
+    )
+    kc.save_robot(rod, tmp_path / "rod.yaml")
+    words = (
+        "simulate",
+        tmp_path / "rod.yaml",
+        "--steps",
+        4,
+        "--dt",
+        0.02,
+        "--initial",
+        "unstressed",
+        "--out",
+    )
+    told(*words, tmp_path / "a.nc")
+    told(*words, tmp_path / "b.nc", "--controls", "none")
+    first, second = (kc.load_trajectory(tmp_path / name) for name in ("a.nc", "b.nc"))
+    assert first.control.shape == (5, 0) and first.tip_position[-1, 0] > 1e-3
+    np.testing.assert_array_equal(first.y, second.y)
 
 
 @pytest.mark.campaign
@@ -263,6 +294,18 @@ def test_limits_may_have_units():
     ):
         with pytest.raises(ValueError, match=message):
             limits_of(tendons, **wrong)
+
+
+def test_tensions_and_positions_may_have_units():
+    tendons = kc.load_robot(ROBOT)
+    found = Held(tension=joined_vectors(["--tension", "7 N,500gf,5,7 N"])[1]).of(tendons)
+    np.testing.assert_allclose(found, [7.0, 4.905, 5.0, 7.0], rtol=1e-15)
+    target = TipTarget(position="174.04 mm, 0.0838, 60cm").pose(0.635)[0]
+    np.testing.assert_allclose(target, [0.17404, 0.0838, 0.6], rtol=1e-15)
+    with pytest.raises(ValueError, match="--tension is '7 mm,5,5,7': mm is no unit of a number in N"):
+        Held(tension="7 mm,5,5,7").of(tendons)
+    with pytest.raises(ValueError, match="--position must be 3 numbers"):
+        TipTarget(position="174 mm, 83 mm").pose(0.635)
 
 
 def test_parameters_that_are_vectors():
@@ -512,6 +555,11 @@ def test_the_demonstration_runs_and_says_what_it_shows(tmp_path):
     assert before == pytest.approx([42.70, 34.57, 23.13, 21.44], rel=5e-3)
     assert published == pytest.approx([5.07, 10.95, 1.31, 5.94], rel=5e-3)
     assert all(own < 0.01 * paper for own, paper in zip(ours, published, strict=True))
+    # the scene shows no row that the paper's coarse grid spoils
+    page = Scripts((tmp_path / "pictures" / "scene.html").read_text(encoding="utf-8"))
+    tracks = json.loads(page.found["scene"])["tracks"]
+    assert len(tracks) == 3
+    assert all(np.all(unpacked(track["result"]) == 0) for track in tracks)
     # the last table: a held-out recording is predicted after calibration
     title, nominal, calibrated = done.stdout.rstrip().splitlines()[-7:-4]
     assert "held-out recording (simulated)" in title

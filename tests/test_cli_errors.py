@@ -17,7 +17,7 @@ def bad_inputs():
     return [
         (("simulat",), "simulate"),
         (("info", "--colour"), "--colour"),
-        ((*simulation, "--steps", "3"), "--controls"),
+        ((*simulation, "--steps", "3"), "--controls is not given; allowed is one number for each control"),
         (("simulate", ROBOT, "--controls", "sine:1.5", "--steps", "3"), "--out"),
         ((*sine, "--steps", "three"), "--steps"),
         ((*sine, "--steps", "0"), "steps"),

@@ -138,6 +138,7 @@ def test_every_question_is_an_option():
 def test_a_modulus_without_effect_is_said():
     robot = kc.load_robot("delrin-tendon-robot").replace(bending_stiffness=[0.1, 0.1, 0.07])
     with pytest.warns(
-        UserWarning, match="youngs_modulus has no effect: the robot states its bending_stiffness"
-    ):
+        UserWarning, match="youngs_modulus has no effect on bending and twisting: the robot states"
+    ) as seen:
         modified(robot, ["youngs_modulus=1 GPa"])
+    assert len(seen) == 1

@@ -571,3 +571,29 @@ REELS = kc.load_robot("delrin-routed-tendon-robot").replace(drive="reel")
 def test_named_signals_that_are_not_right(robot, word, parts):
     with fails(*parts):
         controls.parse(word, 4, DT, robot)
+
+
+@pytest.mark.parametrize(
+    ("robot", "text", "expected"),
+    [
+        ("delrin-tendon-robot", "7 N, 500 gf, 5, 7", [7.0, 4.905, 5.0, 7.0]),
+        ("three-chamber-arm", "constant:30 kPa, 0, 0.1bar", [3e4, 0.0, 1e4]),
+        ("three-tube-robot", "180deg,-2 mm,0,0,0.25rev,0", [np.pi, -0.002, 0.0, 0.0, np.pi / 2, 0.0]),
+    ],
+)
+def test_constant_controls_may_have_units(robot, text, expected):
+    found = controls.parse(text, 2, 0.05, kc.load_robot(robot))
+    np.testing.assert_allclose(found, [expected] * 2, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("30 kPa,5,5,7", "kPa is no unit of a number in N"),
+        ("7 N,5 N", "must be 4 finite numbers"),
+        ("2026.csv", "no such signal or file"),
+    ],
+)
+def test_constant_controls_with_other_units_are_refused(text, message):
+    with pytest.raises(ControlsError, match=message):
+        controls.parse(text, 2, 0.05, kc.load_robot("delrin-tendon-robot"))

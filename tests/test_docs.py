@@ -1,11 +1,15 @@
-"""Every piece of code in README and docs: Python runs, commands parse, and they print what is said there.
+"""Every piece of code in README and docs: Python and commands run, and print what is said there.
 
-The blocks of a page share their names, in order. A block after `<!-- test: long -->`, and all that follows it
-on its page, are run by `make test-all` only.
+The blocks of a page share their names and their folder, in order. Python after `<!-- test: long -->`, and all
+of it that follows on the page, is run by `make test-all` only.
 """
 
+import itertools
+import os
 import re
 import shlex
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -35,8 +39,40 @@ LONG_PAGES = (
 )  # fmt: skip
 #: of these, pages that CI runs too
 SAMPLES = ("README.md", "docs/tutorials/fit.md", "docs/tutorials/simulate.md", "docs/which-function.md")
-#: pages whose commands are cheap enough to be run, and checked by what the page says they print
-RUN = ("docs/first-ten-minutes.md",)
+#: pages whose commands are cheap enough for `make test`, those that take minutes, and those whose commands
+#: print what the block that follows shows
+QUICK_SHELL = (
+    "docs/first-ten-minutes.md", "docs/glossary.md", "docs/how-it-works.md", "docs/install.md",
+    "docs/robot-file.md", "docs/robots.md", "docs/solver.md",
+)  # fmt: skip
+LONG_SHELL = (
+    "README.md",
+    "docs/identification.md",
+    "docs/real-robots.md",
+    "docs/routes/my-robot.md",
+    "docs/simulated-recordings.md",
+)
+SHOWN = ("docs/first-ten-minutes.md",)
+#: parts of commands that are not run here, and why
+NOT_RUN = {
+    "git clone": "needs a network",
+    "pip install": "is an installation",
+    "apt-get": "is an installation",
+    "robot-parts": "needs an installation of build123d",
+    "make demo": "makes an environment; tests/test_cli.py runs the program",
+    "make bench": "measures for long",
+    "python -m tools.budget": "make lint runs it",
+    "python -m benchmarks": "measures for long, or needs installations of other simulators",
+    "python -m studies": "takes minutes to hours; tests/studies runs the parts",
+    "python examples/": "tests/test_examples.py and tests/test_your_own_robot.py run it",
+    "roscore": "needs an installation of ROS",
+    "rosbag": "needs an installation of ROS",
+    "ros1": "needs an installation of ROS",
+    "--live": "runs until Ctrl-C; tests/viewer runs it",
+    "observations_controlled": "needs recordings of others from the network",
+    "v6_": "needs recordings of others from the network",
+    "pressure_arm_t": "needs recordings of others from the network",
+}
 
 
 def blocks(page, language):
@@ -202,19 +238,94 @@ def lasting(text):
     return sorted(re.sub(r" *\d\.\d+e-(0[89]|[1-9]\d)", " 0", text).splitlines())
 
 
-@pytest.mark.parametrize("page", RUN)
-def test_commands_print_what_the_page_shows(page, folder):
-    shell = [(found[2], found[3]) for found in BLOCK.finditer(PAGES[page])]
-    for k, (language, text) in enumerate(shell):
-        if language != "sh":
+#: options whose value is written, and endings of files that are read
+WRITTEN = ("--out", "--page", "--figure", "--picture", "--export", "--states", "--recording", "--plot")
+READ = (".yaml", ".bag", ".csv", ".nc")
+
+
+def shell(page):
+    """Commands of each shell block of a page that are run, and the block that follows."""
+    found = list(BLOCK.finditer(PAGES[page]))
+    for block, following in itertools.zip_longest(found, found[1:]):
+        if block[2] not in ("sh", "bash", "console"):
             continue
+        # the lines of a loop are one command
+        loop, done, rest = block[3].rpartition("\ndone\n")
+        lines = (rest if done else block[3]).replace("\\\n", " ").splitlines()
+        listed = [loop + done] * bool(done) + [
+            re.sub(r"\s+#.*", "", line.strip().removeprefix("$ ")) for line in lines
+        ]
+        kept = [line for line in listed if line and not any(part in line for part in NOT_RUN)]
+        if kept:
+            yield kept, following[3] if following is not None and following[2] == "" else ""
+
+
+def bring(page, words):
+    """Make the files of the reader that a command reads: robots as the page shows them, short recordings."""
+    inputs = [word for k, word in enumerate(words) if word.endswith(READ) and words[k - 1] not in WRITTEN]
+    for name in inputs:
+        path = Path(name)
+        if path.exists() or (words[0] == "init" and name == inputs[0]):
+            continue
+        path.parent.mkdir(exist_ok=True)
+        if name == "recording.yaml":
+            recordings = [other for other in inputs if other.endswith(".csv")]
+            assert invoke(app, ["inspect", recordings[0], "--out", name]).exit_code == 0
+        elif name == "path.csv":
+            path.write_text("t [s],x [mm],y [mm]\n0,0,0\n10,60,30\n", encoding="utf-8")
+        elif name.endswith(".yaml"):
+            shown = [text for _, text, _ in blocks(page, "yaml") if re.search("^kind: ", text, re.MULTILINE)]
+            if shown:
+                path.write_text(shown[0], encoding="utf-8")
+            else:
+                kc.save_robot(kc.load_robot("delrin-tendon-robot"), path)
+        elif name.endswith(".nc"):
+            kc.simulate(kc.load_robot("delrin-tendon-robot"), kc.controls.sine(0.5, 6, 0.05), 0.05).save(name)
+        elif path.parent.name == "afternoon":
+            your_own_robot.record(path, your_own_robot.SIGNALS[path.stem], 3.0)
+        else:
+            record_virtual(name, "sine:1.0", seconds=3.0)
+
+
+def invoke(program, words):
+    """The result of a command; a question gets the default as its answer."""
+    return typer.testing.CliRunner().invoke(program, words, input="\n" * 60)
+
+
+def shell_marks(page):
+    if page in QUICK_SHELL:
+        return []
+    return [pytest.mark.campaign if page in LONG_SHELL else pytest.mark.slow]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(page, marks=shell_marks(page)) for page in PAGES if next(shell(page), None)],
+)
+def test_its_commands_run(page, folder):
+    for lines, shown in shell(page):
         printed = ""
-        for program, words in commands(text):
-            result = typer.testing.CliRunner().invoke(PROGRAMS[program], words)
-            assert result.exit_code == 0, result.output
-            printed = result.stdout
-        if k + 1 < len(shell) and shell[k + 1][0] == "":
-            assert lasting(printed) == lasting(shell[k + 1][1])
+        for line in lines:
+            ours = list(commands(line))
+            for program, words in ours:
+                bring(page, words)
+                if words[0] == "view" and "--export" not in words:
+                    words = [*words, "--export", "seen.html"]
+                result = invoke(PROGRAMS[program], words)
+                assert result.exit_code == 0, f"{line}: {result.output}"
+                printed = result.stdout
+            if not ours:
+                typed = ["bash", "-ec", line]
+                done = subprocess.run(typed, env=program_paths(), capture_output=True, text=True)
+                assert done.returncode == 0, f"{line}: {done.stderr}"
+        if shown and page in SHOWN:
+            assert lasting(printed) == lasting(shown)
+
+
+def program_paths():
+    """The environment in which a shell finds this Python, and the modules of the repository."""
+    beside = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    return os.environ | {"PATH": beside, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"}
 
 
 # tables of figures

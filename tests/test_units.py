@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import knode_cosserat as kc
-from knode_cosserat._units import PREFIXED, PREFIXES, UnitError, in_unit, unit_of
+from knode_cosserat._units import PREFIXED, PREFIXES, UnitError, in_unit, numbers_with_units, unit_of
 from knode_cosserat.rods.robot_file import RobotFileError, format_robot, parse_robot
 
 #: text, unit of the result, and the number by definition
@@ -42,6 +42,22 @@ def test_a_number_with_a_unit_has_its_value_in_si_units(text, unit, number):
 @pytest.mark.parametrize("text", ["250", "mm", "", "1e5", "1:30", "length", "-", "0.1, 0.2", "1 2"])
 def test_other_texts_are_no_numbers_with_units(text):
     assert in_unit(text, "m") is None
+
+
+@pytest.mark.parametrize(
+    ("text", "units", "numbers"),
+    [
+        ("7 5 5 7", ["N"], [7.0, 5.0, 5.0, 7.0]),
+        ("5 N, 2kN;[3]", ["N"], None),
+        ("[5 N, 2kN; 3]", ["N"], [5.0, 2000.0, 3.0]),
+        ("90deg, -2 mm, 0.1", ("rad", "m"), [math.pi / 2, -0.002, 0.1]),
+        ("5 N,b", ["N"], None),
+        ("5 N,1 2", ["N"], None),
+        ("5 N", (), None),
+    ],
+)
+def test_lists_of_numbers_may_have_units(text, units, numbers):
+    assert numbers_with_units(text, units) == numbers
 
 
 @pytest.mark.parametrize(

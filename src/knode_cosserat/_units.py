@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Sequence
 from typing import NamedTuple
 
+from knode_cosserat._numbers import numbers_in
 from knode_cosserat.errors import KnodeCosseratError
 
 #: exponents of m, kg, s, A and rad
@@ -128,3 +130,24 @@ def in_unit(text: str, unit: str) -> float | None:
     if given.dimension != wanted.dimension:
         raise UnitError(f"{symbols} is no unit of a number in {unit}" if unit else "this number has no unit")
     return _shortest(float(match[1]) * given.factor / wanted.factor)
+
+
+def numbers_with_units(text: str, units: Sequence[str]) -> list[float] | None:
+    """Return the numbers of a text in SI units: `7 5 5 7`, or, separated by commas, `5 N, 200 gf`.
+
+    The last unit is that of further numbers, too. None if the text has other words.
+
+    Raises:
+        UnitError: a unit is not known, or of another kind.
+    """
+    plain = numbers_in(text)
+    if plain is not None or not units:
+        return plain
+    numbers = []
+    for k, word in enumerate(re.split("[,;]", text.strip().strip("[]()"))):
+        number = in_unit(word, units[min(k, len(units) - 1)])
+        one = numbers_in(word) if number is None else [number]
+        if one is None or len(one) != 1:
+            return None
+        numbers += one
+    return numbers

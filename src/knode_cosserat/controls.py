@@ -27,7 +27,7 @@ from knode_cosserat._files.writing import replacing
 from knode_cosserat._files.yaml_text import did_you_mean
 from knode_cosserat._numbers import numbers_in, real_array
 from knode_cosserat._reprs import count_of
-from knode_cosserat._units import UnitError, factors_of, in_unit
+from knode_cosserat._units import UnitError, factors_of, in_unit, numbers_with_units
 from knode_cosserat.errors import KnodeCosseratError
 
 if TYPE_CHECKING:
@@ -603,9 +603,9 @@ def parse(
     `constant:VALUE`, `ramp:HEIGHT[,base=,start=,end=]`, `step:HEIGHT[,base=,at=]`,
     `sine:PERIOD[,base=,amplitude=,phase=]`. Numbers are in SI units, or have one: `rotation_1=180deg`.
 
-    Numbers are a constant control, one for each: `7,5,5,7` or `constant:7,5,5,7`. Anything else is a CSV file
-    of tensions, as for `load`, or with the columns `time [s]` and any names of controls with their units; it
-    is sampled at dt.
+    Numbers are a constant control, one for each: `7,5,5,7`, `constant:7,5,5,7` or `500 gf,5,5,7`. Anything
+    else is a CSV file of tensions, as for `load`, or with the columns `time [s]` and any names of controls
+    with their units; it is sampled at dt.
 
     Args:
         specification: signals, numbers or file, as above.
@@ -635,7 +635,7 @@ def parse(
     is_signal = is_tension and name in _TENSIONS
     if os.path.exists(specification) and not (is_signal and rest):
         return _from_file(specification, layout, steps, dt)
-    held = _constant_control(specification, layout.size)
+    held = _constant_control(specification, layout)
     # `NAME=SIGNAL;…` and `none`; words such as `sine:2,base=5` are for all tendons
     word, equals, _ = specification.partition("=")
     is_named = not is_tension or specification.strip() == "none" or (equals and not set(":,") & set(word))
@@ -663,16 +663,21 @@ def parse(
     return _checked_tensions(values, f"controls {specification!r}") if is_tension else values
 
 
-def _constant_control(specification: str, size: int) -> np.ndarray | None:
-    """Return a constant control (size,) given by its numbers: `7,5,5,7`, or with `constant:` before them.
+def _constant_control(specification: str, layout: Layout) -> np.ndarray | None:
+    """Return a constant control (c,) given by its numbers: `7,5,5,7`, or with `constant:` before them.
 
     None if the specification is something else, such as a signal, or `constant:` and one number.
 
     Raises:
-        ControlsError: there are not as many numbers as controls.
+        ControlsError: there are not as many numbers as controls, or a unit is not theirs.
     """
-    text = specification.strip().removeprefix("constant:")
-    numbers = numbers_in(text)
+    size, text = layout.size, specification.strip().removeprefix("constant:")
+    if text.endswith(".csv"):  # 2026.csv is no number in csv
+        return None
+    try:
+        numbers = numbers_with_units(text, units(layout))
+    except UnitError as error:
+        raise ControlsError(f"controls {specification!r}: {error}") from None
     if numbers is None or (text != specification.strip() and len(numbers) == 1):
         return None
     if len(numbers) != size or not np.all(np.isfinite(numbers)):

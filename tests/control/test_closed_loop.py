@@ -100,6 +100,7 @@ def test_a_log_reports_and_is_written(wrong_model, tmp_path):
     lines = (tmp_path / "log.csv").read_text().splitlines()
     assert len(lines) == 141 and lines[0].startswith("t (s),reference 0")
     assert "tip RMSE" in repr(wrong_model)
+    assert wrong_model.control_layout == ROBOT.control_layout
 
 
 def test_a_loop_is_a_recording_of_its_robot(tmp_path):

@@ -64,6 +64,16 @@ def test_controllers_command_as_without_a_camera(name):
     assert_allclose(seen.command(0.0, measured_by(TURNED, tip), aim).control, wanted, atol=1e-6)
 
 
+def test_without_an_observer_only_the_markers_turn_is_missed():
+    """A turned camera costs nothing; a marker costs what it turns with the tip, up to its distance x θ."""
+    own, turned, marked = (loop(ROBOT.replace(camera=it), "lqr") for it in (None, TURNED, MARKED))
+    assert_allclose(turned.tip, own.tip, atol=1e-9)
+    # a cantilever under a moment, the least inclined: θ = 2 d / L; under a force at the tip 1.5 d / L
+    inclination = 2.0 * np.linalg.norm(own.tip[:, :2], axis=1).max() / float(ROBOT.length)
+    missed = np.linalg.norm(marked.tip - own.tip, axis=1).max()
+    assert 1e-4 < missed < 1.1 * np.linalg.norm(MARKED.marker) * inclination
+
+
 def test_a_boundary_observer_is_pulled_in_the_robots_frame():
     tip, estimates = np.array([0.05, 0.0, 0.62]), []
     for camera, measured in ((None, tip), (TURNED, measured_by(TURNED, tip))):

@@ -1,5 +1,7 @@
 """Episodes move as simulations do, with drawn parameters, delays and changes; failures end them."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat import envs
+from knode_cosserat.control import ControlLimits
 from knode_cosserat.envs import dynamics
 from knode_cosserat.robots import ParameterError
 
@@ -118,7 +121,7 @@ def test_commands_keep_their_limits_and_rate(environment, keys):
     ("wrong", "message"),
     [
         ({"task": "folow"}, "no task 'folow'.*did you mean follow"),
-        ({"actions": "force"}, '"tension" or "increment"'),
+        ({"actions": "force"}, '"control" or "increment"'),
         ({"duration": 0.01}, "at least one period"),
         ({"bodies": (0.5,)}, "must be 1.0, the tip"),
         ({"randomisation": {"mass": 1}}, "randomisation is dict"),
@@ -161,6 +164,18 @@ def test_a_parameter_that_does_not_exist_is_refused(robot):
 def test_wrong_randomisations_are_refused(wrong):
     with pytest.raises(envs.TaskError, match=r"allowed|must not"):
         envs.Randomisation(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("robot", "settings", "words"),
+    [
+        ("delrin-tendon-robot", {}, r"actions \(4,\) are tension \[N\],"),
+        ("delrin-tendon-robot", {"actions": "increment"}, r"are changes of tension \[N\],"),
+        ("three-chamber-arm", {"limits": ControlLimits(0.0, 3e4, 1e5)}, r"\(3,\) are pressure \[Pa\],"),
+    ],
+)
+def test_actions_have_the_names_and_units_of_the_controls(robot, settings, words):
+    assert re.search(words, repr(envs.make("follow", robot, **settings)))
 
 
 def test_a_robot_without_tensions_needs_limits():

@@ -7,6 +7,7 @@ import pytest
 
 import knode_cosserat as kc
 from knode_cosserat import figures
+from knode_cosserat.control import LoopLog
 from knode_cosserat.figures.style import PALETTE
 from knode_cosserat.metrics import dtw_distance
 
@@ -136,7 +137,9 @@ def test_tensions_are_held_from_row_to_row(trajectory):
         values, edges, _ = patch.get_data()
         np.testing.assert_array_equal(values, np.asarray(trajectory.held_tension)[:-1, k])
         np.testing.assert_array_equal(edges, trajectory.time)
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == [f"tendon {k}" for k in range(1, 5)]
+    assert [text.get_text() for text in axes.get_legend().get_texts()] == [
+        f"tension {k}" for k in range(1, 5)
+    ]
 
 
 def test_a_prediction_stands_against_its_recording(trajectory, recording):
@@ -362,3 +365,42 @@ def test_what_is_no_trajectory_is_said(trajectory):
 
 def test_a_notebook_shows_it(trajectory):
     assert figures.tensions(trajectory)._repr_png_().startswith(b"\x89PNG")
+
+
+def log_of(layout, **more):
+    """A log of two periods of zero controls."""
+    none = np.zeros(2)
+    return LoopLog(
+        time=0.1 * np.arange(2),
+        reference=np.zeros((2, 3)),
+        measured=np.zeros((2, 3)),
+        tip=np.full((2, 3), 1e-3),
+        control=np.zeros((2, layout.size)),
+        status=("optimal",) * 2,
+        reason=("",) * 2,
+        violation=none,
+        feedback=none + 1e-3,
+        preparation=none + 1e-3,
+        parameters={},
+        missed=0,
+        **more,
+    )
+
+
+@pytest.mark.parametrize(
+    ("robot", "title", "first", "last"),
+    [
+        ("delrin-tendon-robot", "tension [N]", "tension 1", "tension 4"),
+        ("three-chamber-arm", "pressure [Pa]", "pressure 1", "pressure 3"),
+        ("three-tube-robot", "control", "rotation 1 [rad]", "insertion 3 [m]"),
+    ],
+)
+def test_controls_have_their_names_and_units(robot, title, first, last):
+    layout = kc.load_robot(robot).control_layout
+    for log, expected in (
+        (log_of(layout, control_layout=layout), (title, first, last)),
+        (log_of(layout), ("control", "1", str(layout.size))),
+    ):
+        axes = kc.figures.closed_loop(log).axes[2]
+        names = [text.get_text() for text in axes.get_legend().get_texts()]
+        assert (axes.get_ylabel(), names[0], names[-1]) == expected

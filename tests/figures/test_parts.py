@@ -1,5 +1,7 @@
 """Parts are where they are stated to be, and energies are those of closed forms; nothing is solved."""
 
+import itertools
+
 import numpy as np
 import pytest
 
@@ -119,6 +121,15 @@ def test_a_comparison_has_the_instant_of_the_largest_difference():
     )
 
 
+def overlapping_titles(figure):
+    """Pairs of axes' titles that lie on each other."""
+    figure.draw_without_rendering()
+    shown = [(axes, name) for axes in figure.axes for name in "xyz" if hasattr(axes, f"{name}axis")]
+    titles = [getattr(axes, f"{name}axis").label for axes, name in shown]
+    boxes = [(title.get_text(), title.get_window_extent()) for title in titles if title.get_text()]
+    return [(a, b) for (a, one), (b, other) in itertools.combinations(boxes, 2) if one.overlaps(other)]
+
+
 def test_a_workspace_has_the_colours_that_are_chosen():
     robot = kc.load_robot("delrin-tendon-robot")
     rng = np.random.default_rng(0)
@@ -137,6 +148,7 @@ def test_a_workspace_has_the_colours_that_are_chosen():
         space, *_ = figures.workspace(found, colour).axes
         np.testing.assert_allclose(np.sort(space.collections[0].get_array()), np.sort(wanted[1:]))
         assert "convex hull" in space.get_title()
+    assert not overlapping_titles(figures.workspace(found))
     with pytest.raises(ValueError, match="allowed is controls, reach"):
         figures.workspace(found, "speed")
     with pytest.raises(ValueError, match="one a sample"):

@@ -71,7 +71,9 @@ def test_opposed_tubes_are_unstable_beyond_the_known_product():
     critical = np.pi / 2 / (L * twisting(1.0, 1.0))
     opposed = [0.0, 0.0, np.pi, 0.0]
     straight = rest(pair(0.99 * critical, 0.99 * critical, nodes=21), opposed)
-    assert kc.statics.stability(straight).kind == "stable"
+    found = kc.statics.stability(straight)
+    assert found.kind == "stable" and found.eigenvalue.real < 0.0
+    assert np.isnan(found.least) and "the energy is not of poses alone" in repr(found)
     beyond = rest(pair(1.01 * critical, 1.01 * critical, nodes=21), opposed, initial=straight)
     if np.ptp(np.diff(beyond.part("angle")[0], axis=1)) < 1e-6:  # still the straight branch
         assert kc.statics.stability(beyond).kind == "divergence"

@@ -50,7 +50,7 @@ def test_controls_are_drawn_one_below_the_other(truth, baseline):
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("time [s]", "tension [N]")
         for k, patch in enumerate(axes.patches):
             np.testing.assert_array_equal(patch.get_data()[0], np.asarray(truth.held_tension)[:-1, k])
-    assert labels(figure) == [f"tendon {k}" for k in range(1, 5)]
+    assert labels(figure) == [f"tension {k}" for k in range(1, 5)]
 
 
 def test_shapes_stand_beside_the_references(truth, baseline):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from knode_cosserat._numbers import numbers_in
-from knode_cosserat._units import UnitError, in_unit
+from knode_cosserat._units import UnitError, numbers_with_units
 from knode_cosserat.recordings.formats import read_suffixes
 from knode_cosserat.rods.parameters import parameter_at
 from knode_cosserat.rods.wrapped import nominal_model
@@ -26,8 +26,6 @@ if TYPE_CHECKING:
     from knode_cosserat.rods.system import System
     from knode_cosserat.trajectory import Trajectory
 
-#: parameters that otherwise follow from Young's modulus
-STIFFNESSES = ("bending_stiffness", "shear_stiffness")
 #: endings of figure files
 FORMATS = (".png", ".pdf", ".svg")
 #: endings of recordings
@@ -147,30 +145,28 @@ class Sampling(NamedTuple):
 # numbers
 
 
-def parse_numbers(option: str, text: str, count: int | None = None, example: str = "7,5,5,7") -> list[float]:
+def parse_numbers(
+    option: str, text: str, count: int | None = None, example: str = "7,5,5,7", unit: str | None = None
+) -> list[float]:
     """Return the numbers of an option, separated by commas or spaces. All vector options are read by it.
+
+    Numbers that have units are separated by commas.
 
     Args:
         option: name of the option, for errors.
         text: the given text.
         count: the required number of numbers; None: one or more.
         example: a valid text, for errors.
+        unit: SI unit of the numbers; None: they have none.
     """
-    numbers = numbers_in(text)
+    try:
+        numbers = numbers_with_units(text, [] if unit is None else [unit])
+    except UnitError as error:
+        raise ValueError(f"{option} is {text!r}: {error}") from None
     if numbers is None or (count is not None and len(numbers) != count):
         allowed = "numbers" if count is None else f"{count} numbers"
         raise ValueError(f"{option} must be {allowed}, such as {example} (got {text!r})")
     return numbers
-
-
-def parse_limits(option: str, text: str, count: int) -> float | list[float]:
-    """Return the limits of `count` controls: one number for all, or one for each."""
-    numbers = numbers_in(text)
-    if numbers is None or len(numbers) not in (1, count):
-        raise ValueError(
-            f"{option} must be one number for all controls, or {count}, one for each (got {text!r})"
-        )
-    return numbers[0] if len(numbers) == 1 else numbers
 
 
 def limits_of(robot: System, **texts: str | None) -> dict[str, Any]:
@@ -184,23 +180,26 @@ def limits_of(robot: System, **texts: str | None) -> dict[str, Any]:
     for name, text in texts.items():
         if text is not None:
             per = "/s" if name == "rate" else ""
-            given[name] = _parse_limits_with_units(f"--{name}", text, units(robot.control_layout), per)
+            given[name] = parse_limits(
+                f"--{name}", text, [f"{unit or 1}{per}" for unit in units(robot.control_layout)]
+            )
     return completed_limits(robot.control_layout, given, options=True)
 
 
-def _parse_limits_with_units(option: str, text: str, units: Sequence[str], per: str) -> float | list[float]:
-    words = [word.strip() for word in text.split(",")]
-    if numbers_in(text) is None and len(words) in (1, len(units)):
-        words = words * len(units) if len(words) == 1 else words
-        try:
-            in_si = [in_unit(word, f"{unit or 1}{per}") for word, unit in zip(words, units, strict=True)]
-        except UnitError as error:
-            raise ValueError(f"{option} is {text!r}: {error}") from None
-        plain = ",".join(
-            word if number is None else repr(number) for word, number in zip(words, in_si, strict=True)
+def parse_limits(option: str, text: str, units: Sequence[str]) -> float | list[float]:
+    """Return the limits of controls in their units: one number for all, or one for each."""
+    # one number with a unit has to have the unit of every control
+    is_one = numbers_in(text) is None and not {",", ";"} & set(text)
+    words = ",".join([text] * len(units)) if is_one else text
+    try:
+        numbers = numbers_with_units(words, units)
+    except UnitError as error:
+        raise ValueError(f"{option} is {text!r}: {error}") from None
+    if numbers is None or len(numbers) not in (1, len(units)):
+        raise ValueError(
+            f"{option} must be one number for all controls, or {len(units)}, one for each (got {text!r})"
         )
-        text = text if numbers_in(plain) is None else plain
-    return parse_limits(option, text, len(units))
+    return numbers[0] if len(numbers) == 1 else numbers
 
 
 # robots and models
@@ -266,17 +265,10 @@ def modified(system: System, changes: list[str] | None, nodes: int | None = None
         stated = parameter_at(nominal_model(system), name)
         values[name] = value if stated is None else stated.in_si(name, value)
     changed = system.replace(**values)
-    nominal = nominal_model(changed)
     if "tendon_offset" in values:
         from knode_cosserat.rods.robot_file import warn_of_paper_tendons
 
-        warn_of_paper_tendons(nominal, "--set tendon_offset")
-    own = [name for name in STIFFNESSES if getattr(nominal, name, None) is not None]
-    if "youngs_modulus" in values and own and values.keys().isdisjoint(own):
-        warnings.warn(
-            f"--set youngs_modulus has no effect: the robot states its {' and '.join(own)}; set these",
-            stacklevel=2,
-        )
+        warn_of_paper_tendons(nominal_model(changed), "--set tendon_offset")
     return changed
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import numpy as np
 
+from knode_cosserat._numbers import numbers_in
 from knode_cosserat.cli.arguments import (
     Json,
     Model,
@@ -52,11 +53,11 @@ class _Limits(NamedTuple):
 FARTHEST = 10.0
 
 
-class _TipTarget(NamedTuple):
+class TipTarget(NamedTuple):
     """Target of the tip.
 
     Options:
-        position (--position X,Y,Z): Target position of the tip (m), such as 0.1,0.05,0.58.
+        position (--position X,Y,Z): Target position of the tip (m), such as 0.1,0.05,0.58 or 100mm,50mm,0.58.
         quaternion (--quaternion W,X,Y,Z): Target orientation of the tip: a quaternion, scalar first.
         tolerance (--tolerance X): Tolerance: position error as a fraction of the length, angle error in rad.
     """
@@ -72,8 +73,8 @@ class _TipTarget(NamedTuple):
             orientation = parse_numbers("--quaternion", self.quaternion, 4, "0.98,-0.1,0.17,0")
         if self.position is None:
             return None, orientation
-        target = parse_numbers("--position", self.position, 3, "0.1,0.05,0.25")
-        if np.linalg.norm(target) > FARTHEST * length:
+        target = parse_numbers("--position", self.position, 3, "0.1,0.05,0.25", unit="m")
+        if numbers_in(self.position) is not None and np.linalg.norm(target) > FARTHEST * length:
             meant = in_other_unit(target, "m", -2.0 * length, 2.0 * length)
             if meant is not None:
                 unit, values = meant
@@ -86,7 +87,7 @@ class _TipTarget(NamedTuple):
 
 @app.command()
 def reach(
-    model: Model, target: _TipTarget, limits: _Limits, space: Space = "lobatto2", as_json: Json = False
+    model: Model, target: TipTarget, limits: _Limits, space: Space = "lobatto2", as_json: Json = False
 ) -> None:
     """Compute controls that move the tip to a pose at rest.
 

@@ -51,7 +51,8 @@ class _SimulationOptions(NamedTuple):
             step:HEIGHT,at=S), ramp:HEIGHT (N; in the first and last tendon, or
             ramp:HEIGHT,tendons=1,3), random:SEED, constant tensions (N) such as 7,5,5,7, or a CSV file. Any
             controls by name: NAME=SIGNAL;…, such as tension_4=ramp:2;base_z=0.1 (`knode-cosserat
-            info ROBOT` lists the names), the others zero; or none.
+            info ROBOT` lists the names), the others zero; or none, which a robot without controls
+            need not state.
         steps (--steps N): Number of time steps; required unless a file gives the controls.
         dt (--dt S): Time step (s). Default: 0.05, or the file's.
         time (--time SCHEME): Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.
@@ -60,13 +61,25 @@ class _SimulationOptions(NamedTuple):
         allow_failure (--allow-failure): Write the solved steps even if a later step fails.
     """
 
-    controls: str
+    controls: str | None = None
     steps: int | None = None
     dt: float | None = None
     time: str = "sdirk2"
     space: Space = "lobatto2"
     initial: str = "equilibrium"
     allow_failure: bool = False
+
+    def word(self, system: System) -> str:
+        """Return the text of a robot's controls."""
+        from knode_cosserat.controls import labels
+
+        names = labels(system.control_layout)
+        if self.controls is None and names:
+            raise ValueError(
+                "--controls is not given; allowed is one number for each control, or NAME=SIGNAL;…, or none; "
+                f"names are {', '.join(names)}"
+            )
+        return "none" if self.controls is None else self.controls
 
 
 @app.command()
@@ -93,10 +106,11 @@ def simulate(
     import knode_cosserat as kc
 
     system, dt = model.load(), run.dt
+    controls = run.word(system)
     if dt is None:
         tensions_only = system.control_layout.names == ("tension",)
-        dt = kc.controls.load(run.controls).dt if os.path.isfile(run.controls) and tensions_only else 0.05
-    sequence = kc.controls.parse(run.controls, run.steps, dt, system)
+        dt = kc.controls.load(controls).dt if os.path.isfile(controls) and tensions_only else 0.05
+    sequence = kc.controls.parse(controls, run.steps, dt, system)
     began = perf_counter()
     with coarse_grid_in_output():
         trajectory = kc.simulate(
@@ -141,7 +155,7 @@ class Held(NamedTuple):
     """Constant control of an equilibrium: from tensions, from numbers in order, or by name.
 
     Options:
-        tension (--tension N,N,…): Tensions of all tendons (N), such as 7,5,5,7.
+        tension (--tension N,N,…): Tensions of all tendons (N), such as 7,5,5,7 or 700gf,5,5,7.
         control (--control CONTROL): All controls in order, such as 7,5,5,7; or some by name, such as
             base_z=20mm,base_ry=0.2, and the others zero. Numbers may have units. `knode-cosserat info
             ROBOT` lists names and units.
@@ -169,7 +183,7 @@ class Held(NamedTuple):
             )
         words = [] if self.control is None else _control_words(self.control, names)
         if self.tension is not None:
-            values = parse_numbers("--tension", self.tension, tensions[0])
+            values = parse_numbers("--tension", self.tension, tensions[0], unit="N")
             if not all(0.0 <= value < np.inf for value in values):
                 raise ValueError(
                     f"--tension must be {tensions[0]} numbers, 0 or more (N), such as 7,5,5,7 "

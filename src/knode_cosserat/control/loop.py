@@ -25,6 +25,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
 from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.rods.passport import named
 from knode_cosserat.rods.strands import strand_count
 from knode_cosserat.rods.system import System
@@ -168,6 +169,7 @@ class LoopLog:
             and how far, in words; empty if there are none.
         out_of_reach: largest distance (m) from the reference to the nearest tip at rest within the limits;
             0 if it is below 0.2 % of the length, or the tip follows as closely; None: not known.
+        control_layout: names and units of the controls; None: not known.
         estimated: estimated states, a trajectory that can be saved, drawn and viewed; None without an
             observer. Its robot has the parameters that the model had at first.
     """
@@ -190,6 +192,7 @@ class LoopLog:
     estimated: Trajectory | None = None
     out_of_reach: float | None = None
     extrapolation: str = ""
+    control_layout: Layout | None = None
 
     @property
     def tip_distance(self) -> Float[np.ndarray, " T"]:
@@ -461,6 +464,7 @@ class Loop:
         states = [state for state in columns.estimated if state is not None]
         estimated = join_rows(states, columns.time) if states else None
         control = np.array(commands.control)
+        robot = getattr(self.controller, "robot", None) or getattr(self.plant, "robot", None)
         return LoopLog(
             time=np.array(columns.time),
             reference=np.array(columns.reference),
@@ -482,6 +486,7 @@ class Loop:
             settings=self.controller.settings,
             estimated=estimated,
             extrapolation=_extrapolation(getattr(self.controller, "robot", None), control, estimated),
+            control_layout=None if robot is None else robot.control_layout,
         )
 
 

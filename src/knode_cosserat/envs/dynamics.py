@@ -29,7 +29,7 @@ from knode_cosserat.schemes.settings import Settings
 from knode_cosserat.solvers.rollout import rollout
 from knode_cosserat.solvers.run import TimeIntegration
 
-Actions = Literal["tension", "increment"]
+Actions = Literal["control", "increment"]
 
 #: number of measurements in an observation, the newest first: their differences are velocities
 MEASURED = 3
@@ -68,7 +68,7 @@ class Spec:
         task: the task.
         dt: period (s).
         steps: periods of an episode.
-        actions: "tension": an action of -1 to 1 is a control within its limits; "increment": it is a change
+        actions: "control": an action of -1 to 1 is a control within its limits; "increment": it is a change
             of control within its greatest rate.
         settings: of the solver.
         output: measured positions.

@@ -52,7 +52,7 @@ class Environment:
         *,
         dt: float = 0.05,
         duration: float = 10.0,
-        actions: Actions = "tension",
+        actions: Actions = "control",
         bodies: tuple[float, ...] = (0.5, 1.0),
         seed: int = 0,
     ):
@@ -65,7 +65,7 @@ class Environment:
             limits: of the controls; None: tensions of 0 to 10 N, or those of the robot's file, 40 N/s.
             dt: period (s).
             duration: time limit of an episode (s).
-            actions: "tension": actions of -1 to 1 are controls within their limits; "increment": changes of
+            actions: "control": actions of -1 to 1 are controls within their limits; "increment": changes of
                 the control within its rate.
             bodies: places whose positions are observed, as fractions of the length; the last one is the tip.
             seed: of the survey.
@@ -84,8 +84,8 @@ class Environment:
             raise TaskError(
                 "an environment has one robot, not a batch; use Randomisation(models=...) for several"
             )
-        if actions not in ("tension", "increment"):
-            raise TaskError(f'actions is {actions!r}; allowed is "tension" or "increment"')
+        if actions not in ("control", "increment"):
+            raise TaskError(f'actions is {actions!r}; allowed is "control" or "increment"')
         dt = checked_dt(dt)
         steps = round(duration / dt) if np.isfinite(duration) else 0
         if steps < 1:
@@ -215,9 +215,11 @@ class Environment:
         return self.task.reference(state.goal, self.arrays.survey)
 
     def __repr__(self) -> str:
+        controls = ", ".join(f"{field.name} [{field.unit}]" for field in self.robot.control_layout.fields)
+        changes = "changes of " if self.spec.actions == "increment" else ""
         return (
             f"Environment {self.task.name!r} of a {robot_text(self.robot)}: {self.steps} periods of "
-            f"{self.dt:g} s, actions ({self.action_size},) are {self.spec.actions}s, observations "
+            f"{self.dt:g} s, actions ({self.action_size},) are {changes}{controls}, observations "
             f"({self.observation_size},)"
         )
 

@@ -85,8 +85,8 @@ class _EpisodePlant(Plant):
         Raises:
             TaskError: an environment with increments as actions.
         """
-        if environment.spec.actions != "tension":
-            raise TaskError('a controller commands tensions; use an environment with actions="tension"')
+        if environment.spec.actions != "control":
+            raise TaskError('a controller commands no increments; use an environment with actions="control"')
         self.environment, self.dt, self._first = environment, environment.dt, state
         self.start()
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from knode_cosserat.controls import labels
+from knode_cosserat.controls import labels, titles
 from knode_cosserat.figures.style import DASHES, PALETTE
 from knode_cosserat.rods.aspects import Drawing
+from knode_cosserat.rods.layout import Layout
 from knode_cosserat.trajectory import Trajectory
 
 if TYPE_CHECKING:
@@ -86,21 +87,30 @@ def require_span(axes: Axes, span: float) -> None:
         axes.set_ylim((low + high - span) / 2, (low + high + span) / 2)
 
 
+def control_words(layout: Layout) -> tuple[list[str], str]:
+    """Return the name of every control, and the title of their axis.
+
+    The unit of all is in the title, such as `pressure [Pa]`; those that differ are beside the names.
+    """
+    fields, units = layout.fields, {field.unit for field in layout.fields}
+    name = fields[0].name if len(fields) == 1 else "control"
+    names = labels(layout) if len(units) == 1 else titles(layout)
+    title = f"{name} [{units.pop()}]" if len(units) == 1 else name
+    return [each.replace("_", " ") for each in names], title.replace("_", " ")
+
+
 def draw_tensions(axes: Axes, trajectory: Trajectory) -> None:
     """Draw the tension of every tendon, held from row to row, or the controls of other robots."""
-    one, layout = one_of(trajectory), trajectory.system.control_layout
+    values, layout = np.asarray(one_of(trajectory).control), trajectory.system.control_layout
     if "tension" in layout.names:
-        values, names, label = np.asarray(one.part("tension")), None, "tension [N]"
-    else:
-        values, names = np.asarray(one.control), labels(layout)
-        units = {field.unit for field in layout.fields}
-        label = f"control [{units.pop()}]" if len(units) == 1 else "control, in its units"
+        values = layout.get(values, "tension")
+        layout = Layout(*(field for field in layout.fields if field.name == "tension"))
+    names, label = control_words(layout)
     time = np.asarray(trajectory.time)
     for k in range(values.shape[1]):
         # decreasing widths, so that equal tensions all remain visible
         width = max(0.7, 2.4 - 0.55 * k)
-        name = names[k] if names else f"tendon {k + 1}"
-        style: dict[str, Any] = {"label": name, "color": PALETTE[k % len(PALETTE)], "linewidth": width}
+        style: dict[str, Any] = {"label": names[k], "color": PALETTE[k % len(PALETTE)], "linewidth": width}
         if len(time) == 1:
             axes.plot(time, values[:, k], "o", markersize=4.0 * width, **style)
         else:

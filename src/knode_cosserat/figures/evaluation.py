@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import NDArray
 
-from knode_cosserat.figures.drawing import AXES, curves_of, legend_above
+from knode_cosserat.figures.drawing import AXES, control_words, curves_of, legend_above
 from knode_cosserat.figures.style import PALETTE, new_figure
 from knode_cosserat.rods.wrapped import nominal_model
 
@@ -259,14 +259,16 @@ def _controls(it: Comparison) -> Any:
                 lines += axes.plot(_abscissa(it), values[:, k], ".", markersize=2.5, color=look["color"])
             else:
                 lines += axes.plot(*thinned(it.time, values[:, k]), drawstyle="steps-post", **look)
-        fields = layout.fields if layout.size == count else ()
-        name = fields[0].name if len(fields) == 1 else "controls"
-        units = {field.unit for field in fields}
-        axes.set_ylabel(f"{name}\n[{units.pop()}]" if len(units) == 1 else name)
+        # a recording may have other controls than the robot
+        names, title = control_words(layout) if layout.size == count else ([], "control")
+        axes.set_ylabel(title.replace(" [", "\n["))
         if 1 < count <= MOST_NAMES:
-            names = [str(k + 1) for k in range(count)]
+            # numbers are enough where the axis has the unit of all
+            if numbered := "[" in title or not names:
+                names = [str(k + 1) for k in range(count)]
+            columns = count if numbered else 3
             axes.legend(
-                lines, names, loc="lower right", bbox_to_anchor=(1.0, 0.94), ncols=count, fontsize=7,
+                lines, names, loc="lower right", bbox_to_anchor=(1.0, 0.94), ncols=columns, fontsize=7,
                 handlelength=0.9, columnspacing=0.8, handletextpad=0.3, borderpad=0.0,
             )  # fmt: skip
 

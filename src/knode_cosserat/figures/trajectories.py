@@ -16,6 +16,7 @@ from knode_cosserat.figures.drawing import (
     View,
     by_label,
     checked_view,
+    control_words,
     curves_of,
     draw_tensions,
     draw_tips,
@@ -382,8 +383,9 @@ def workspace(samples: Workspace, colour: str | ArrayLike = "controls", *, label
     look: dict[str, Any] = {"c": values, "s": 1, "cmap": TIME_COLOURS, "linewidths": 0, "rasterized": True}
     look |= {"vmin": values.min(), "vmax": values.max()}
     with new_figure(TWO_COLUMNS, 2.9) as figure:
-        grid = figure.add_gridspec(1, 3, width_ratios=(1.2, 1.0, 1.0))
-        for k, view in enumerate(("xyz", "xz", "xy")):
+        # an empty column, because the layout leaves no room for the labels of an axis in space
+        grid = figure.add_gridspec(1, 4, width_ratios=(1.2, 0.2, 1.0, 1.0))
+        for k, view in ((0, "xyz"), (2, "xz"), (3, "xy")):
             seen = View(figure, grid[0, k], view)
             dots = seen.axes.scatter(*seen.of(points), **look)
             if seen.flat:
@@ -456,12 +458,13 @@ def closed_loop(log: LoopLog) -> Figure:
         for each in log.time[fallback]:
             error.axvspan(each, each + log.time[1] - log.time[0], color=PALETTE[1], alpha=0.3, lw=0)
         error.set(xlabel="time [s]", ylabel="distance [mm]", title="distance from the reference")
+        names, title = [str(k + 1) for k in range(log.control.shape[1])], "control"
+        if log.control_layout is not None:
+            names, title = control_words(log.control_layout)
         for k, column in enumerate(log.control.T):
-            control.step(log.time, column, where="post", color=PALETTE[k % len(PALETTE)], label=f"{k + 1}")
-        low, high = float(log.control.min()), float(log.control.max())
-        # room for the legend
-        control.set(xlabel="time [s]", title="controls", ylim=(low, high + 0.25 * (high - low or 1.0)))
-        control.legend(ncols=4, loc="upper left")
+            control.step(log.time, column, where="post", color=PALETTE[k % len(PALETTE)], label=names[k])
+        control.set(xlabel="time [s]", ylabel=title)
+        legend_above(control)
         if log.parameters:
             for k, (name, values) in enumerate(log.parameters.items()):
                 unit = np.max(np.abs(values)) or 1.0

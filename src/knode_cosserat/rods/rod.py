@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any, ClassVar
+import warnings
+from typing import Any, ClassVar, Self
 
 import jax
 import jax.numpy as jnp
@@ -43,7 +44,7 @@ from knode_cosserat.rods.section import (
 )
 from knode_cosserat.rods.shapes import Shape
 from knode_cosserat.rods.surroundings import Obstacle
-from knode_cosserat.rods.system import Discontinuities, Scales, System
+from knode_cosserat.rods.system import Discontinuities, Scales, System, is_traced
 from knode_cosserat.rotation import cross, dot, quaternion_rate, rotation_matrix
 
 #: layouts of a rod without further parts
@@ -188,6 +189,25 @@ class SlenderRod(System):
             # what is no part is refused afterwards
             if isinstance(part, Contribution):
                 part.check(self)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with other parameters, by name (`System.replace`).
+
+        It warns of a modulus that changes nothing, because the robot states the stiffness.
+        """
+        changed = super().replace(**changes)
+        moduli = [name for name in ("youngs_modulus", "shear_modulus") if changes.get(name) is not None]
+        stiffness = changed.bending_stiffness
+        stated = stiffness is not None and changes.get("bending_stiffness") is None
+        if moduli and stated and not is_traced(changes):
+            both = changed.shear_stiffness is not None
+            warnings.warn(
+                f"{' and '.join(moduli)} {'have' if len(moduli) > 1 else 'has'} no effect"
+                f"{'' if both else ' on bending and twisting'}: the robot states its bending_stiffness"
+                f"{' and shear_stiffness; set these' if both else '; set it'}",
+                stacklevel=2,
+            )
+        return changed
 
     # parts
 

@@ -25,6 +25,8 @@ from knode_cosserat.solvers.run import TimeIntegration
 
 #: vectors side by side; most vectors for each factor that is wanted
 BLOCK, MOST = 16, 16
+#: growth of the basis after which its eigenvalues, which cost most, are computed again
+AGAIN = 1.25
 #: residual of an eigenvector, as a fraction of its factor
 CONVERGED = 1e-9
 #: c0 of the step in natural units: near the lowest frequencies, which are thereby the most accurate
@@ -204,18 +206,22 @@ def largest_eigenvalues(step: LinearStep, wanted: int) -> tuple[np.ndarray, np.n
     unit = step.unit
     fresh = np.linalg.qr(np.random.default_rng(0).normal(size=(len(unit), BLOCK)))[0]
     basis = images = np.zeros((len(unit), 0))
+    examined = 0
     while True:
         basis = np.concatenate([basis, fresh], axis=1)
         images = np.concatenate([images, step(unit[:, None] * fresh) / unit[:, None]], axis=1)
-        values, small = np.linalg.eig(basis.T @ images)
-        largest = np.argsort(-np.abs(values))[:wanted]
-        values, vectors = values[largest], basis @ small[:, largest]
-        off = np.linalg.norm(images @ small[:, largest] - vectors * values, axis=0)
-        known = (np.abs(values) > STILL) & (off <= CONVERGED * np.abs(values))
-        if known.all() or basis.shape[1] + BLOCK > min(MOST * wanted, len(unit)):
-            # none beyond one that did not converge
-            count = int(np.argmin(np.append(known, False)))
-            return values[:count], unit[:, None] * vectors[:, :count]
+        last = basis.shape[1] + BLOCK > min(MOST * wanted, len(unit))
+        if last or basis.shape[1] >= AGAIN * examined:
+            examined = basis.shape[1]
+            values, small = np.linalg.eig(basis.T @ images)
+            largest = np.argsort(-np.abs(values))[:wanted]
+            values, vectors = values[largest], basis @ small[:, largest]
+            off = np.linalg.norm(images @ small[:, largest] - vectors * values, axis=0)
+            known = (np.abs(values) > STILL) & (off <= CONVERGED * np.abs(values))
+            if last or known.all():
+                # none beyond one that did not converge
+                count = int(np.argmin(np.append(known, False)))
+                return values[:count], unit[:, None] * vectors[:, :count]
         fresh = images[:, -BLOCK:]
         for _ in range(2):
             fresh = np.linalg.qr(fresh - basis @ (basis.T @ fresh))[0]

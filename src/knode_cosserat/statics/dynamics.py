@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from knode_cosserat._blas import one_thread
 from knode_cosserat.engine.linear_step import LinearStep
 from knode_cosserat.engine.loops import has_friction, linear_step
 from knode_cosserat.rods.aspects import Ends
@@ -88,7 +89,8 @@ def linearised_modes(system: System, y: np.ndarray, control: np.ndarray) -> _Res
         off = np.max(np.abs(of_rods(system, solved - guess, "p")))
         if not (error <= NewtonOptions().acceptable and off < SAME * float(system.length)):
             raise ValueError(f"no equilibrium near it is found with {nodes} nodes")
-        factors, vectors = largest_eigenvalues(step, WANTED * strand_count(system))
+        with one_thread():
+            factors, vectors = largest_eigenvalues(step, WANTED * strand_count(system))
         found.append(RATE * (1.0 - 1.0 / factors))
     coarse, fine = found
     nearest = np.abs(fine[:, None] - coarse).argmin(axis=1)

@@ -83,7 +83,8 @@ class Stability(NamedTuple):
     #: 16 parts), or for loads without a potential growing modes
     unstable_directions: int
     #: the smallest eigenvalue of the stiffness's symmetric part, in natural units (EI/L): with a potential it
-    #: is zero at the onset of buckling or snapping; NaN for a robot with further unknowns, such as reels
+    #: is zero at the onset of buckling or snapping; NaN for a robot with further unknowns, such as reels and
+    #: tubes, whose energy is not of poses alone: its margin is the decay of `eigenvalue`
     least: float
     #: (nodes, 3): displacement of the line in the direction of the smallest eigenvalue, or in the fastest
     #: growing mode, with maximum 1; for several rods (nodes, rods, 3)
@@ -91,8 +92,8 @@ class Stability(NamedTuple):
     #: work of the loads around a small cycle of two displacements, over the energies of both: zero for loads
     #: with a potential; it does not depend on the nodes
     asymmetry: float
-    #: for loads without a potential: growth rate + i · angular frequency (1/s) of the mode that grows most or
-    #: decays least
+    #: for loads without a potential and further unknowns: growth rate + i · angular frequency (1/s) of the
+    #: mode that grows most or decays least
     eigenvalue: complex | None = None
     #: reason why stability is undecided
     reason: str = ""
@@ -112,7 +113,10 @@ class Stability(NamedTuple):
         if self.eigenvalue is None:
             return f"Stability: {kind}; smallest eigenvalue {self.least:.4g} (in units of EI/L)"
         growth, frequency = self.eigenvalue.real, abs(self.eigenvalue.imag) / (2.0 * np.pi)
-        return f"Stability: {kind}; growth rate {growth:.4g} 1/s at {frequency:.4g} Hz"
+        text = f"Stability: {kind}; growth rate {growth:.4g} 1/s at {frequency:.4g} Hz"
+        if np.isnan(self.least):
+            text += "; no eigenvalue of the stiffness, because the energy is not of poses alone"
+        return text
 
     @property
     def kind(self) -> str:

@@ -219,7 +219,9 @@ def calibrate(
         if machine.robot is None and not has_terminal():
             raise ValueError("calibrate needs a terminal: a person hangs the weights (or give --table)")
         with connected(machine, yes) as driver:
-            weights = [GRAVITY * mass for mass in parse_numbers("--masses", masses, example="0,0.5,1")]
+            weights = [
+                GRAVITY * mass for mass in parse_numbers("--masses", masses, example="0,0.5,1", unit="kg")
+            ]
             fit = _weighed(driver, index, weights)
             if save:
                 from knode_cosserat_hardware.calibration import write_calibration

@@ -237,7 +237,11 @@ def _control_limits(driver: Driver, high: str | None, lag: float) -> Any:
     from knode_cosserat.control import ControlLimits
 
     limits, count = driver.limits, driver.tendon_count
-    most = min(limits.high, limits.total / count) if high is None else parse_limits("--high", high, count)
+    most = (
+        min(limits.high, limits.total / count)
+        if high is None
+        else parse_limits("--high", high, ["N"] * count)
+    )
     if np.max(most) > limits.high:
         raise ValueError(f"--high is {high}; the robot allows {limits.high:g} N")
     return ControlLimits(limits.low, most, limits.rate, lag=lag)
