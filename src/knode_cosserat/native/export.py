@@ -62,6 +62,7 @@ class Exported:
         folder: where the files are.
         files: their names.
         object_size: size of the object file (bytes), of which `data_size` are the model's numbers.
+        values: sizes and places by the names that the templates of the files use.
     """
 
     name: str
@@ -69,6 +70,7 @@ class Exported:
     files: tuple[str, ...]
     object_size: int
     data_size: int
+    values: Mapping[str, str] = dataclasses.field(repr=False, compare=False)
 
     def __str__(self) -> str:
         files = ", ".join(self.files)
@@ -132,7 +134,7 @@ def export(
     written.append(f"{name}.o")
     (folder / written[-1]).write_bytes(content)
     data = sum(each.nbytes for each in native.tables.values())
-    return Exported(name, folder, tuple(written), len(content), data)
+    return Exported(name, folder, tuple(written), len(content), data, values)
 
 
 def _checked_name(name: str | None, folder: Path) -> str:
