@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import platform
 import re
 import shutil
@@ -30,7 +31,16 @@ from knode_cosserat.schemes.time import TimeScheme
 VERSIONS = {"2": "2.0", "3": "3.0"}
 COMPILERS = ("cc", "gcc", "clang")
 #: no rounding of sums and products together: numbers are those of `simulate`
-FLAGS = "-std=gnu11 -O2 -ffp-contract=off -fPIC -shared -fvisibility=hidden -Wl,-Bsymbolic -s".split()
+FLAGS = (
+    "-std=gnu11",
+    "-O2",
+    "-ffp-contract=off",
+    "-fPIC",
+    "-shared",
+    "-fvisibility=hidden",
+    "-Wl,-Bsymbolic",
+    "-s",
+)
 
 
 class Variable(NamedTuple):
@@ -107,26 +117,33 @@ def export_fmu(
         versions = " and ".join(VERSIONS.values())
         raise ExportError(f"export: fmi is {fmi!r}; allowed are {versions}{_meant(fmi)}")
     processor = TARGETS[target].triple.partition("-")[0] if target in TARGETS else ""
-    compiler = _compiler(processor or platform.machine())
+    processor = processor or platform.machine()
+    compiler = _compiler(processor)
     name = re.sub(r"\W", "_", path.stem) if name is None else name
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch)
+    with tempfile.TemporaryDirectory() as folder:
         exported = export(
             model, folder, dt, name=name, target=target, time=time, space=space, newton=newton,
             errors=errors, horizon=horizon,
         )  # fmt: skip
-        variables = _variables(model, exported)
-        description = Description(exported, variables, fmi, dt)
-        major = fmi[0]
-        for source in ("fmu.c", f"fmi{major}.c"):
-            (folder / source).write_text(_filled(source, {**exported.values, **description.code()}))
-        library = folder / f"{name}.so"
-        _compile(compiler, folder, [f"fmi{major}.c", f"{name}.o", "-lm", "-o", library.name])
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-            archive.writestr("modelDescription.xml", description.text())
-            archive.write(library, f"binaries/{_binaries(processor or platform.machine(), fmi)}/{name}.so")
+        write_fmu(exported, path, Description(exported, model, fmi), compiler, processor)
     return dataclasses.replace(exported, folder=path.parent, files=(path.name,))
+
+
+def write_fmu(
+    exported: Exported, path: Path, description: Description, compiler: str, processor: str
+) -> None:
+    """Write an FMU of exported C code."""
+    values = {**exported.values, **description.code()}
+    source, library = description.source, f"{exported.name}.so"
+    for template in ("fmu.c", source):
+        (exported.folder / template).write_text(_filled(template, values))
+    _compile(compiler, exported.folder, [source, f"{exported.name}.o", "-lm", "-o", library])
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", description.text())
+        archive.write(
+            exported.folder / library, f"binaries/{_binaries(processor, description.fmi)}/{library}"
+        )
 
 
 def _meant(fmi: str) -> str:
@@ -137,14 +154,17 @@ def _meant(fmi: str) -> str:
 def _compiler(processor: str) -> str:
     """Return the path of a C compiler for a processor."""
     if platform.system() != "Linux":
-        raise ExportError(f"export: FMUs are made on Linux, not {platform.system()}; give a folder for C code")
+        raise ExportError(
+            f"export: FMUs are made on Linux, not {platform.system()}; export C code, to a folder"
+        )
     own = processor == platform.machine()
     names = COMPILERS if own else (f"{processor}-linux-gnu-gcc",)
     found = next(filter(None, map(shutil.which, names)), None)
     if found is None:
         wanted = " or ".join(names) if own else names[0]
         raise ExportError(
-            f"export: an FMU needs a C compiler, and there is no {wanted}: install gcc, or give a folder for C code"
+            f"export: an FMU needs a C compiler, and there is no {wanted}: install gcc, or export C code, "
+            "to a folder"
         )
     return found
 
@@ -159,10 +179,6 @@ def _compile(compiler: str, folder: Path, arguments: Sequence[str]) -> None:
 def _binaries(processor: str, fmi: str) -> str:
     """Return the folder of a library in an FMU."""
     return "linux64" if fmi == "2.0" and processor == "x86_64" else f"{processor}-linux"
-
-
-def _variables(model: System, exported: Exported) -> list[Variable]:
-    return [*_inputs(model), *_outputs({k: int(exported.values[k]) for k in _PLACES}), *_OTHERS]
 
 
 #: names of places in the values of an export
@@ -191,7 +207,13 @@ def _inputs(model: System) -> Iterator[Variable]:
     for label, field in zip(layout.labels, fields, strict=True):
         start = repr(float(np.clip(0.0, field.low, field.high)))
         yield Variable(
-            label, "input", field.meaning, field.unit, start=start, low=float(field.low), high=float(field.high)
+            label,
+            "input",
+            field.meaning,
+            field.unit,
+            start=start,
+            low=float(field.low),
+            high=float(field.high),
         )
 
 
@@ -227,9 +249,19 @@ class Description:
     """Description of a model for a version of FMI, and the numbers of its variables in the C code."""
 
     exported: Exported
-    variables: list[Variable]
+    model: System
     fmi: str
-    dt: float
+
+    @functools.cached_property
+    def variables(self) -> list[Variable]:
+        """Variables in the order of their numbers."""
+        places = {name: int(self.exported.values[name]) for name in _PLACES}
+        return [*_inputs(self.model), *_outputs(places), *_OTHERS]
+
+    @property
+    def source(self) -> str:
+        """File of the functions of FMI."""
+        return f"fmi{self.fmi[0]}.c"
 
     @property
     def token(self) -> str:
@@ -246,7 +278,7 @@ class Description:
             for size in ([1] * each.size if self.fmi == "2.0" else [each.size] + [0] * (each.size - 1))
         ]
         return {
-            "fmi": self.fmi, "fmi_major": self.fmi[0], "token": self.token, "places": str(len(places)),
+            "fmi": self.fmi, "source": self.source, "token": self.token, "places": str(len(places)),
             "sizes": ", ".join(map(str, sizes)),
             "place_table": ", ".join(f"{{{rod}, {node}, {number}}}" for rod, node, number in places),
             "input_names": " ".join(f'"{each.name}",' for each in inputs),
@@ -262,18 +294,20 @@ class Description:
             generationDateAndTime=f"{values['date']}T00:00:00Z", variableNamingConvention="structured",
         )  # fmt: skip
         root.set("instantiationToken" if is_3 else "guid", self.token)
-        flags = dict.fromkeys(["canHandleVariableCommunicationStepSize"], "false")
-        states, derivatives = ("State", "s") if is_3 else ("state", "")
-        flags |= dict.fromkeys(
-            [f"canGetAndSetFMU{states}", f"canSerializeFMU{states}", f"providesDirectionalDerivative{derivatives}"],
-            "true",
-        )
-        flags |= {"fixedInternalStepSize": repr(self.dt)} if is_3 else {"canNotUseMemoryManagementFunctions": "true"}
+        states, derivatives = ("State", "Derivatives") if is_3 else ("state", "Derivative")
+        flags = {
+            "canHandleVariableCommunicationStepSize": "false", f"canGetAndSetFMU{states}": "true",
+            f"canSerializeFMU{states}": "true", f"providesDirectional{derivatives}": "true",
+        }  # fmt: skip
+        if is_3:
+            flags["fixedInternalStepSize"] = values["dt_exact"]
+        else:
+            flags["canNotUseMemoryManagementFunctions"] = "true"
         ElementTree.SubElement(root, "CoSimulation", modelIdentifier=self.exported.name, **flags)
         self._add_units(root)
         categories = ElementTree.SubElement(root, "LogCategories")
         ElementTree.SubElement(categories, "Category", name="logStatusError", description="errors")
-        ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=repr(self.dt))
+        ElementTree.SubElement(root, "DefaultExperiment", startTime="0", stepSize=values["dt_exact"])
         (self._add_arrays if is_3 else self._add_scalars)(root)
         ElementTree.indent(root)
         return ElementTree.tostring(root, encoding="UTF-8", xml_declaration=True)

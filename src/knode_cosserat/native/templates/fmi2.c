@@ -14,8 +14,9 @@ typedef struct {
 } callbacks;
 enum { CO_SIMULATION = 1, LAST_SUCCESSFUL_TIME = 2, IS_TERMINATED = 3 };
 
+/* messages have no %: they are their own format, which importers can show that read no further arguments */
 static void tell(const instance *each, const char *message) {
-    if (each->logger) each->logger(each->environment, each->name, ERROR, "logStatusError", "%s", message);
+    if (each->logger) each->logger(each->environment, each->name, ERROR, "logStatusError", message);
 }
 
 /* A function of an instance. */

@@ -1,4 +1,4 @@
-/* FMI co-simulation of $title. The functions of FMI $fmi are in fmi$fmi_major.c, which includes this file. */
+/* FMI co-simulation of $title. The functions of FMI $fmi are in $source, which includes this file. */
 #include "$name.c"
 
 #include <stdarg.h>
