@@ -5,30 +5,24 @@ from __future__ import annotations
 import dataclasses
 import functools
 import platform
-import re
 import shutil
 import subprocess
-import tempfile
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
 
-from knode_cosserat._arguments import check_arguments
 from knode_cosserat._files.writing import replacing
 from knode_cosserat._units import unit_of
 from knode_cosserat.engine.native import TARGETS
-from knode_cosserat.native.export import Exported, ExportError, _filled, export
+from knode_cosserat.native.files import Exported, ExportError, filled
 from knode_cosserat.rods.system import System
-from knode_cosserat.schemes.settings import Errors, NewtonOptions
-from knode_cosserat.schemes.space import SpaceScheme
-from knode_cosserat.schemes.time import TimeScheme
 
-#: versions of FMI, by their first digit
-VERSIONS = {"2": "2.0", "3": "3.0"}
+#: versions of FMI
+VERSIONS = ("2.0", "3.0")
 COMPILERS = ("cc", "gcc", "clang")
 #: no rounding of sums and products together: numbers are those of `simulate`
 FLAGS = (
@@ -69,116 +63,66 @@ class Variable(NamedTuple):
         return self.causality == "output"
 
 
-def export_fmu(
-    model: System,
-    path: str | Path,
-    dt: float,
-    *,
-    fmi: str = "3.0",
-    name: str | None = None,
-    target: str = "native",
-    time: str | TimeScheme = "sdirk2",
-    space: str | SpaceScheme = "lobatto2",
-    newton: NewtonOptions = NewtonOptions(),
-    errors: Errors = True,
-    horizon: int = 20,
-) -> Exported:
-    """Write a model as an FMU for co-simulation, for Linux; this needs a C compiler.
+@dataclasses.dataclass(frozen=True)
+class Packer:
+    """Path of an FMU, its version of FMI, and the compiler for its processor."""
 
-    The steps are those of `simulate` with the same arguments. Inputs are the controls, held in each step.
-    Outputs are the tip's position and orientation, the nodes' positions, the base's force and moment, the
-    estimated error of positions, and the result.
+    path: Path
+    fmi: str
+    processor: str
+    compiler: str
 
-    Args:
-        model: one robot, or a learned model.
-        path: of the file, which ends in `.fmu`.
-        dt: internal time step (s); communication steps are whole multiples of it.
-        fmi: version of FMI, "3.0" or "2.0".
-        name: the model's identifier; by default that of the file.
-        target: the computer on which it runs, as in `export`; with another processor than this computer's, a
-            cross compiler is needed.
-        time: scheme in time, as in `simulate`.
-        space: scheme along the rod.
-        newton: options of Newton's method.
-        errors: which errors are estimated.
-        horizon: most internal steps of a communication step of which derivatives are known.
+    @classmethod
+    def of(cls, path: Path, fmi: str, target: str) -> Packer:
+        """Find a compiler.
 
-    Raises:
-        ExportError: as in `export`; an unknown version of FMI; no C compiler, or another system than Linux.
-        EngineError: the engine does not cover the model.
-        SimulationError: the equilibrium in which it starts was not found.
-        TargetError: an unknown target.
-    """
-    check_arguments(export_fmu, locals())
-    path = Path(path)
-    if path.suffix != ".fmu":
-        raise ExportError(f"export: the file of an FMU ends in .fmu, not {path.name!r}")
-    if fmi not in VERSIONS.values():
-        versions = " and ".join(VERSIONS.values())
-        raise ExportError(f"export: fmi is {fmi!r}; allowed are {versions}{_meant(fmi)}")
-    processor = TARGETS[target].triple.partition("-")[0] if target in TARGETS else ""
-    processor = processor or platform.machine()
-    compiler = _compiler(processor)
-    name = re.sub(r"\W", "_", path.stem) if name is None else name
-    with tempfile.TemporaryDirectory() as folder:
-        exported = export(
-            model, folder, dt, name=name, target=target, time=time, space=space, newton=newton,
-            errors=errors, horizon=horizon,
-        )  # fmt: skip
-        write_fmu(exported, path, Description(exported, model, fmi), compiler, processor)
-    return dataclasses.replace(exported, folder=path.parent, files=(path.name,))
+        Raises:
+            ExportError: an unknown version of FMI; no C compiler, or another system than Linux.
+        """
+        if fmi not in VERSIONS:
+            meant = next((f". Did you mean {each}?" for each in VERSIONS if each[0] == fmi.strip()[:1]), "")
+            raise ExportError(f"export: fmi is {fmi!r}; allowed are {' and '.join(VERSIONS)}{meant}")
+        own = platform.machine()
+        if platform.system() != "Linux":
+            raise ExportError(
+                f"export: FMUs are made on Linux, not {platform.system()}; export C code, to a folder"
+            )
+        processor = (TARGETS[target].triple.partition("-")[0] if target in TARGETS else "") or own
+        names = COMPILERS if processor == own else (f"{processor}-linux-gnu-gcc",)
+        compiler = next(filter(None, map(shutil.which, names)), None)
+        if compiler is None:
+            wanted = " or ".join(names)
+            raise ExportError(
+                f"export: an FMU needs a C compiler, and there is no {wanted}: install gcc, or export C code, "
+                "to a folder"
+            )
+        return cls(path, fmi, processor, compiler)
 
+    def write(self, exported: Exported, model: System) -> Exported:
+        """Write the FMU of exported C code, and return what is written."""
+        description = Description(exported, model, self.fmi)
+        values = {**exported.values, **description.code()}
+        source, library = description.source, f"{exported.name}.so"
+        for template in ("fmu.c", source):
+            (exported.folder / template).write_text(filled(template, values))
+        self._compile(exported.folder, source, f"{exported.name}.o", "-lm", "-o", library)
+        is_common = self.fmi == "2.0" and self.processor == "x86_64"
+        binaries = "linux64" if is_common else f"{self.processor}-linux"
+        self.path.parent.mkdir(parents=True, exist_ok=True)
+        with (
+            replacing(self.path) as temporary,
+            zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive,
+        ):
+            archive.writestr("modelDescription.xml", description.text())
+            archive.write(exported.folder / library, f"binaries/{binaries}/{library}")
+        return dataclasses.replace(exported, folder=self.path.parent, files=(self.path.name,))
 
-def write_fmu(
-    exported: Exported, path: Path, description: Description, compiler: str, processor: str
-) -> None:
-    """Write an FMU of exported C code."""
-    values = {**exported.values, **description.code()}
-    source, library = description.source, f"{exported.name}.so"
-    for template in ("fmu.c", source):
-        (exported.folder / template).write_text(_filled(template, values))
-    _compile(compiler, exported.folder, [source, f"{exported.name}.o", "-lm", "-o", library])
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing(path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("modelDescription.xml", description.text())
-        archive.write(
-            exported.folder / library, f"binaries/{_binaries(processor, description.fmi)}/{library}"
-        )
-
-
-def _meant(fmi: str) -> str:
-    meant = VERSIONS.get(fmi.strip()[:1])
-    return f". Did you mean {meant}?" if meant else ""
-
-
-def _compiler(processor: str) -> str:
-    """Return the path of a C compiler for a processor."""
-    if platform.system() != "Linux":
-        raise ExportError(
-            f"export: FMUs are made on Linux, not {platform.system()}; export C code, to a folder"
-        )
-    own = processor == platform.machine()
-    names = COMPILERS if own else (f"{processor}-linux-gnu-gcc",)
-    found = next(filter(None, map(shutil.which, names)), None)
-    if found is None:
-        wanted = " or ".join(names) if own else names[0]
-        raise ExportError(
-            f"export: an FMU needs a C compiler, and there is no {wanted}: install gcc, or export C code, "
-            "to a folder"
-        )
-    return found
-
-
-def _compile(compiler: str, folder: Path, arguments: Sequence[str]) -> None:
-    done = subprocess.run([compiler, *FLAGS, *arguments], cwd=folder, capture_output=True, text=True)
-    if done.returncode:
-        lines = [line for line in done.stderr.splitlines() if "error" in line] or done.stderr.splitlines()
-        raise ExportError(f"export: {compiler} failed: {lines[0] if lines else done.returncode}")
-
-
-def _binaries(processor: str, fmi: str) -> str:
-    """Return the folder of a library in an FMU."""
-    return "linux64" if fmi == "2.0" and processor == "x86_64" else f"{processor}-linux"
+    def _compile(self, folder: Path, *arguments: str) -> None:
+        done = subprocess.run([self.compiler, *FLAGS, *arguments], cwd=folder, capture_output=True, text=True)
+        if done.returncode:
+            lines = done.stderr.splitlines()
+            shown = next((line for line in lines if "error" in line), f"status {done.returncode}")
+            raise ExportError(f"export: {self.compiler} failed: {shown}")
 
 
 #: names of places in the values of an export

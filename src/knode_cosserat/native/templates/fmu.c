@@ -71,7 +71,7 @@ static void restart(instance *each) {
     memset(&each->now, 0, sizeof each->now);
     each->now.version = ${NAME}_VERSION;
     each->now.steps = -1;
-    for (int c = 0; c < CONTROLS; c++) each->now.inputs[c] = fmin(fmax(0.0, low[c]), high[c]);
+    for (int c = 0; c < CONTROLS; c++) each->now.inputs[c] = fmin(fmax(0.0, ${name}_low[c]), ${name}_high[c]);
     each->is_initial = each->has_tangents = 0;
     ${name}_start(&each->robot);
 }
@@ -108,9 +108,9 @@ static int initialize(instance *each) {
 static int has_inputs(instance *each) {
     for (int c = 0; c < CONTROLS; c++) {
         double input = each->now.inputs[c];
-        if (input >= low[c] && input <= high[c]) continue;
+        if (input >= ${name}_low[c] && input <= ${name}_high[c]) continue;
         report(each, "t = %g s: the input %s is %g %s; allowed is %g to %g", time_of(each), input_names[c], input,
-               input_units[c], low[c], high[c]);
+               input_units[c], ${name}_low[c], ${name}_high[c]);
         return 0;
     }
     return 1;
