@@ -40,7 +40,7 @@ class Exported:
     def __str__(self) -> str:
         files = ", ".join(self.files)
         size = f"{self.object_size / 1e3:.0f} kB, of which {self.data_size / 1e3:.0f} kB are numbers"
-        return f"{self.folder}: {files}\n{self.name}.o has {size}"
+        return f"{self.folder}: {files}\nmachine code: {size}"
 
 
 def filled(source: str, values: Mapping[str, Any]) -> str:

@@ -93,8 +93,8 @@ class Packer:
         if compiler is None:
             wanted = " or ".join(names)
             raise ExportError(
-                f"export: an FMU needs a C compiler, and there is no {wanted}: install gcc, or export C code, "
-                "to a folder"
+                f"export: an FMU needs a C compiler, and there is no {wanted}: install gcc, or export C "
+                "code, to a folder"
             )
         return cls(path, fmi, processor, compiler)
 
