@@ -286,7 +286,9 @@ def test_inputs_that_are_not_finite_leave_the_robot_as_it_was(opened, version, w
     inputs = [1.0, 2.0, wrong, 3.0]
     with pytest.raises(Exception, match="failed with status 3"):
         one.step(inputs, 0.0)
-    assert one.messages[-1].startswith(f"t = 0 s: the input tension_3 is {wrong} N; allowed is")
+    assert one.messages[-1].startswith(
+        f"t = 0 s: the input tension_3 is {wrong} N; allowed are finite numbers"
+    )
     assert np.array_equal(one.step(CONTROLS[0], 0.0), other.step(CONTROLS[0], 0.0))
 
 
@@ -388,3 +390,29 @@ def test_an_fmu_of_a_learned_model(tmp_path):
     expected = kc.simulate(model, CONTROLS, DT).tip_position
     np.testing.assert_allclose(found["tip_position"], expected, rtol=0, atol=SAME)
     assert np.abs(expected - kc.simulate(PAPER, CONTROLS, DT).tip_position).max() > 1e-6
+
+
+@pytest.mark.slow
+def test_an_fmu_of_a_robot_with_limits(tmp_path):
+    robot, path = kc.load_robot("three-chamber-arm"), tmp_path / "arm.fmu"
+    kc.export(robot, path, DT, fmi="2.0")
+    assert validation.validate_fmu(str(path)) == []
+    inputs = [
+        each for each in fmpy.read_model_description(str(path)).modelVariables if each.causality == "input"
+    ]
+    field = robot.control_layout.fields[0]
+    assert [(each.unit, each.min, float(each.max)) for each in inputs] == [("Pa", None, field.high)] * 3
+    controls = 2e4 * np.sin(2 * np.arange(1, 21) * DT)[:, None] * [1.0, 0.5, 0.2]
+    rows = signals(controls, robot.control_layout.labels)
+    found = fmpy.simulate_fmu(str(path), input=rows, stop_time=20 * DT, output_interval=DT)
+    expected = kc.simulate(robot, controls, DT).tip_position
+    np.testing.assert_allclose(array_of(found, "tip_position", "2.0", 3), expected, rtol=0, atol=SAME)
+    one = Instance(path)
+    try:
+        one.fmu.setReal([1], [1.5 * field.high])
+        with pytest.raises(Exception, match="failed with status 3"):
+            one.fmu.doStep(0.0, DT)
+        message = "t = 0 s: the input pressure_2 is 90000 Pa; allowed is at most 60000"
+        assert one.messages == [message] and field.high == 60000.0
+    finally:
+        one.close()

@@ -107,10 +107,15 @@ static int initialize(instance *each) {
 /* false, and a message, if an input is not finite or beyond its limits */
 static int has_inputs(instance *each) {
     for (int c = 0; c < CONTROLS; c++) {
-        double input = each->now.inputs[c];
-        if (input >= ${name}_low[c] && input <= ${name}_high[c]) continue;
-        report(each, "t = %g s: the input %s is %g %s; allowed is %g to %g", time_of(each), input_names[c], input,
-               input_units[c], ${name}_low[c], ${name}_high[c]);
+        double input = each->now.inputs[c], least = ${name}_low[c], most = ${name}_high[c];
+        if (input >= least && input <= most) continue;
+        double limit = input < least ? least : input > most ? most : NAN;
+        const char *name = input_names[c], *unit = input_units[c];
+        if (fabs(limit) < DBL_MAX)
+            report(each, "t = %g s: the input %s is %g %s; allowed is %s %g", time_of(each), name, input, unit,
+                   limit == least ? "at least" : "at most", limit);
+        else
+            report(each, "t = %g s: the input %s is %g %s; allowed are finite numbers", time_of(each), name, input, unit);
         return 0;
     }
     return 1;
