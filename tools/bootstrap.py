@@ -122,7 +122,7 @@ def set_up() -> None:
     # Written only once all of it is installed: an environment without it is never built upon.
     installed = VENV / ".locked"
     if not (installed.is_file() and installed.read_text() == wanted):
-        print("Setting up .venv, only once: 310 MB to download, 1.4 GB on disk, a minute or more", flush=True)
+        print("Setting up .venv, only once: 350 MB to download, 1.5 GB on disk, a minute or more", flush=True)
         installed.unlink(missing_ok=True)
         make_venv(VENV)
         # Wheels only: there may be no compiler here, and the hashes would not cover what a build downloads.

@@ -20,6 +20,7 @@ class _ExportOptions(NamedTuple):
         name (--name NAME): Prefix of all names in the code. Default: the name of the folder.
         time (--time SCHEME): Time scheme: sdirk2, bdf1, bdf2, bdf-alpha or trapezoidal.
         horizon (--horizon N): Most steps of one prediction with tangents.
+        fmi (--fmi VERSION): Version of FMI of an FMU: 3.0 (default) or 2.0.
     """
 
     dt: float
@@ -28,22 +29,25 @@ class _ExportOptions(NamedTuple):
     time: str = "sdirk2"
     space: Space = "lobatto2"
     horizon: int = 20
+    fmi: str | None = None
 
 
 @app.command()
 def export(
     model: Model,
-    folder: Annotated[Path, argument("FOLDER", "Folder for the files.")],
+    folder: Annotated[Path, argument("FOLDER", "Folder for the files, or a path that ends in .fmu.")],
     options: _ExportOptions,
     as_json: Json = False,
 ) -> None:
     """Write a robot or a model as C code that runs without Python.
 
-    The folder gets a header, a source file, an object file, CMakeLists.txt and two examples.
+    The folder gets a header, a source file, an object file, CMakeLists.txt and two examples. A path that ends
+    in .fmu becomes a functional mock-up unit for co-simulation; this takes a C compiler.
 
     Examples:
         export delrin-tendon-robot arm --dt 0.02
         export fitted-model arm --dt 0.002 --target aarch64 --nodes 21
+        export delrin-tendon-robot arm.fmu --dt 0.02 --fmi 2.0
     """
     import knode_cosserat as kc
 
@@ -52,8 +56,7 @@ def export(
         "robot": model.robot, "name": found.name, "folder": str(found.folder), "files": list(found.files),
         "object_size": found.object_size, "data_size": found.data_size,
     }  # fmt: skip
-    lines = [
-        str(found),
-        f"next: cd {found.folder} && cc example.c {found.name}.c {found.name}.o -lm -o example",
-    ]
+    lines = [str(found)]
+    if found.files != (folder.name,):
+        lines += [f"next: cd {found.folder} && cc example.c {found.name}.c {found.name}.o -lm -o example"]
     write_output(as_json, facts, lines)

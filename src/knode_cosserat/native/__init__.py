@@ -1,5 +1,6 @@
 """Models outside of Python: C code around machine code of the engine, for controllers and simulators."""
 
-from knode_cosserat.native.export import Exported, ExportError, export
+from knode_cosserat.native.export import export
+from knode_cosserat.native.files import Exported, ExportError
 
 __all__ = ["ExportError", "Exported", "export"]

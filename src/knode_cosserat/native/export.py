@@ -7,11 +7,10 @@ import datetime
 import functools
 import hashlib
 import importlib.metadata
-import importlib.resources
 import keyword
 import re
-import string
-from collections.abc import Iterable, Iterator, Mapping
+import tempfile
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +22,8 @@ from knode_cosserat._reprs import robot_text
 from knode_cosserat.engine.motions import Motions, coefficients_of
 from knode_cosserat.engine.native import NativeCode
 from knode_cosserat.engine.pattern import packed
-from knode_cosserat.errors import KnodeCosseratError
+from knode_cosserat.native.files import Exported, ExportError, filled
+from knode_cosserat.native.fmu import Packer
 from knode_cosserat.rods.aspects import Drawing, Ends
 from knode_cosserat.rods.layout import Field, Layout
 from knode_cosserat.rods.passport import Passport, without_passport
@@ -47,35 +47,6 @@ EXAMPLES = {"example.c": "example.c", "example.cpp": "example.cpp"}
 COLUMNS = 8
 
 
-class ExportError(KnodeCosseratError, ValueError):
-    """A model, or an option, that cannot be exported."""
-
-    code = "export"
-
-
-@dataclasses.dataclass(frozen=True)
-class Exported:
-    """Files of an exported model.
-
-    Attributes:
-        name: prefix of all its names.
-        folder: where the files are.
-        files: their names.
-        object_size: size of the object file (bytes), of which `data_size` are the model's numbers.
-    """
-
-    name: str
-    folder: Path
-    files: tuple[str, ...]
-    object_size: int
-    data_size: int
-
-    def __str__(self) -> str:
-        files = ", ".join(self.files)
-        size = f"{self.object_size / 1e3:.0f} kB, of which {self.data_size / 1e3:.0f} kB are numbers"
-        return f"{self.folder}: {files}\n{self.name}.o has {size}"
-
-
 def export(
     model: System,
     folder: str | Path,
@@ -88,16 +59,18 @@ def export(
     newton: NewtonOptions = NewtonOptions(),
     errors: Errors = True,
     horizon: int = 20,
+    fmi: str | None = None,
 ) -> Exported:
     """Write a model as C code that runs without Python: `NAME.h`, `NAME.c`, `NAME.o` and two examples.
 
-    The steps are those of `simulate` with the same arguments. The header documents all functions.
+    The steps are those of `simulate` with the same arguments. The header documents all functions. To a path
+    that ends in `.fmu`, write a functional mock-up unit for co-simulation, which takes a C compiler.
 
     Args:
         model: one robot, or a learned model.
-        folder: for the files; made if there is none.
+        folder: for the files, made if there is none; or the path of an FMU.
         dt: time step (s).
-        name: prefix of all names of the code; that of the folder by default.
+        name: prefix of all names of the code; that of the folder, or of the FMU, by default.
         target: the computer on which it runs: "native" (this one), "x86-64" (any), "x86-64-v3" (AVX2),
             "x86-64-v4" (AVX-512) or "aarch64" (ARM, 64 bit), all with Linux.
         time: scheme in time, as in `simulate`.
@@ -105,9 +78,11 @@ def export(
         newton: options of Newton's method.
         errors: which errors are estimated.
         horizon: most steps of one prediction with tangents.
+        fmi: version of FMI of an FMU: "3.0", the default, or "2.0".
 
     Raises:
-        ExportError: a batch, a model without positions, a name that C does not allow.
+        ExportError: a batch, a model without positions, a name that C does not allow; for an FMU, no C
+            compiler.
         EngineError: the engine does not cover the model.
         SimulationError: the equilibrium in which it starts was not found.
         TargetError: an unknown target.
@@ -120,6 +95,17 @@ def export(
     if not 1 <= horizon <= 10_000:
         raise ExportError(f"export: horizon is {horizon}; allowed is 1 to 10000 steps")
     folder = Path(folder)
+    if folder.suffix == ".fmu":
+        packer = Packer.of(folder, "3.0" if fmi is None else fmi, target)
+        name = _checked_name(name, folder.with_suffix(""))
+        with tempfile.TemporaryDirectory() as scratch:
+            exported = export(
+                model, scratch, dt, name=name, target=target, time=time, space=space, newton=newton,
+                errors=errors, horizon=horizon,
+            )  # fmt: skip
+            return packer.write(exported, model)
+    if fmi is not None:
+        raise ExportError(f"export: fmi is for a path that ends in .fmu. Did you mean {folder}.fmu?")
     name = _checked_name(name, folder)
     settings = Settings.of(time, space, "consistent", newton, errors=errors)
     native = _NativeModel.of(model, settings, checked_dt(dt), name, target, horizon)
@@ -128,25 +114,20 @@ def export(
     written = []
     for source, pattern in (FILES | EXAMPLES).items():
         written.append(pattern.format(name=name))
-        (folder / written[-1]).write_text(_filled(source, values))
+        (folder / written[-1]).write_text(filled(source, values))
     written.append(f"{name}.o")
     (folder / written[-1]).write_bytes(content)
     data = sum(each.nbytes for each in native.tables.values())
-    return Exported(name, folder, tuple(written), len(content), data)
+    return Exported(name, folder, tuple(written), len(content), data, values)
 
 
 def _checked_name(name: str | None, folder: Path) -> str:
     given = name
     name = re.sub(r"\W", "_", folder.resolve().name) if name is None else name
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or keyword.iskeyword(name):
-        origin = "the name of the folder" if given is None else "name"
+        origin = "the last part of the path" if given is None else "name"
         raise ExportError(f"export: {origin} is {name!r}; allowed are letters, digits and _, a letter first")
     return name
-
-
-def _filled(source: str, values: Mapping[str, Any]) -> str:
-    text = importlib.resources.files(__package__).joinpath("templates", source).read_text()
-    return string.Template(text).substitute(values)
 
 
 @dataclasses.dataclass
