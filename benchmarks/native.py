@@ -1,4 +1,4 @@
-"""Exported models: `python -m benchmarks.native` prints their size, and the time of a step against `simulate`.
+"""Exported models: `python -m benchmarks.native` prints their size, and steps against `simulate`.
 
 For each model and target the C program `native_steps.c` makes 100,000 steps of 20 ms in turn with runs of
 `simulate` under the same controls (1,000 steps, medians of rounds). The longest step is that of this computer
@@ -50,7 +50,18 @@ def compiled(robot: Any, folder: Path, target: str) -> tuple[Any, Path]:
     exported = kc.export(robot, folder, DT, name="robot", target=target)
     listed = ", ".join(map(repr, [*amplitudes(robot).tolist(), 0.0]))
     (folder / "amplitudes.h").write_text(f"static const double robot_amplitudes[] = {{{listed}}};\n")
-    command = ["cc", "-O2", "-std=c11", "-include", "amplitudes.h", PROGRAM, "robot.c", "robot.o", "-I.", "-lm"]
+    command = [
+        "cc",
+        "-O2",
+        "-std=c11",
+        "-include",
+        "amplitudes.h",
+        PROGRAM,
+        "robot.c",
+        "robot.o",
+        "-I.",
+        "-lm",
+    ]
     subprocess.run([*command, "-o", "steps"], cwd=folder, check=True)
     return exported, folder / "steps"
 
@@ -76,11 +87,13 @@ def measure(name: str, target: str) -> dict[str, Any]:
         last = kc.simulate(robot, controls, DT).tip_position[-1]
         found = subprocess.run([program], capture_output=True, text=True, check=True).stdout.split()
         _, most, longest = map(float, found[:3])
+    code = exported.object_size - exported.data_size
     return {
-        "model": name, "target": target, "object_kB": round((exported.object_size - exported.data_size) / 1e3),
+        "model": name, "target": target, "object_kB": round(code / 1e3),
         "data_kB": round(exported.data_size / 1e3), "simulate_us": round(statistics.median(own), 1),
         "step_us": round(statistics.median(row[0] for row in rows), 1),
-        "ratio": round(statistics.median(ratios), 2), "p999_us": round(most, 1), "longest_us": round(longest, 1),
+        "ratio": round(statistics.median(ratios), 2),
+        "p999_us": round(most, 1), "longest_us": round(longest, 1),
         "difference_m": float(np.max(np.abs(np.array(rows[-1][3:]) - last))),
     }  # fmt: skip
 

@@ -275,7 +275,7 @@ class Passport:
         return numeric.concatenate(low, axis=-1), numeric.concatenate(high, axis=-1)
 
     def limits(self, part: str, layout: Layout) -> tuple[Float[Any, " n"], Float[Any, " n"]]:
-        """Return the numbers of a part below and above which a model extrapolates: `bounds` with a tolerance."""
+        """Return the numbers below and above which a model extrapolates: `bounds` with a tolerance."""
         low, high, slack = (it[..., 0, 0, :] for it in self._limits(part, layout))
         return low - slack, high + slack
 
