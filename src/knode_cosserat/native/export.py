@@ -164,7 +164,8 @@ class _NativeModel:
     @functools.cached_property
     def tables(self) -> dict[str, np.ndarray]:
         """Constants of the object file; memories before a run are numbers that are not zero, and where."""
-        steps, found = self.motions.steps, {}
+        steps = self.motions.steps
+        found: dict[str, np.ndarray] = {}
         memories = {"image": self.motions._memory, "tangent_image": self.code.tangents._empty_memory()}
         for name, memory in memories.items():
             words = memory.view(np.int64)

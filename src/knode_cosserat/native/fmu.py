@@ -247,7 +247,7 @@ class Description:
             flags["fixedInternalStepSize"] = values["dt_exact"]
         else:
             flags["canNotUseMemoryManagementFunctions"] = "true"
-        ElementTree.SubElement(root, "CoSimulation", modelIdentifier=self.exported.name, **flags)
+        ElementTree.SubElement(root, "CoSimulation", flags, modelIdentifier=self.exported.name)
         self._add_units(root)
         categories = ElementTree.SubElement(root, "LogCategories")
         ElementTree.SubElement(categories, "Category", name="logStatusError", description="errors")
@@ -267,7 +267,7 @@ class Description:
             }
             factor = {} if unit.factor == 1.0 else {"factor": repr(unit.factor)}
             ElementTree.SubElement(
-                ElementTree.SubElement(parent, "Unit", name=name), "BaseUnit", **exponents, **factor
+                ElementTree.SubElement(parent, "Unit", name=name), "BaseUnit", exponents | factor
             )
 
     def _add_arrays(self, root: ElementTree.Element) -> None:
@@ -306,7 +306,7 @@ class Description:
             parent = ElementTree.SubElement(structure, name)
             own = {"dependencies": ""} if name == "Outputs" else {}
             for output in outputs:
-                ElementTree.SubElement(parent, "Unknown", index=output, **own)
+                ElementTree.SubElement(parent, "Unknown", own, index=output)
 
 
 def _common(variable: Variable) -> dict[str, str]:
