@@ -6,11 +6,11 @@ import subprocess
 import jax
 import numpy as np
 import pytest
-from native import STRICT, Library, has
 
 import knode_cosserat as kc
 from knode_cosserat.rods.passport import Passport, with_passport
 from knode_cosserat.solvers.places import places_at, positions_at, quaternions_at
+from tests.native.library import STRICT, Library, has
 
 pytestmark = pytest.mark.skipif(not has("cc"), reason="no C compiler")
 DT = 0.02

@@ -3,20 +3,17 @@
 import dataclasses
 import os
 import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
-from native import STRICT, has
 
 import knode_cosserat as kc
 from knode_cosserat.learning.knode import KNODE
 from knode_cosserat.learning.structured.residual import CURVED, Load, Structured, expansion, loaded
 from knode_cosserat.rods.aspects import Observed
-
-sys.path.insert(0, str(Path(__file__).parents[1] / "engine"))
-from networks import with_network
+from tests.engine.networks import with_network
+from tests.native.library import STRICT, has
 
 pytestmark = [pytest.mark.slow, pytest.mark.skipif(not has("cc"), reason="no C compiler")]
 HERE, DT = Path(__file__).parent, 0.02
