@@ -123,11 +123,10 @@ class NativeCode:
 
     def object_file(self, tables: Mapping[str, np.ndarray]) -> bytes:
         """Return an object file with the functions and tables of numbers, double or int64."""
-        functions = (self.core, ("run", "settle")), (self.tangents, ("run",))
-        texts = [
-            self._renamed(code._functions, names, suffix)
-            for (code, names), suffix in zip(functions, ("", "_tangents"), strict=True)
-        ]
+        texts = (
+            self._renamed(self.core._functions, ("run", "settle"), ""),
+            self._renamed(self.tangents._functions, ("run",), "_tangents"),
+        )
         machine = self._machine(level_of_code())
         first, *others = map(llvm.parse_assembly, [*texts, _tables(self.name, tables)])
         for each in others:

@@ -295,7 +295,7 @@ class _NativeModel:
 
     def _learned(self) -> dict[str, Any]:
         """Limits of controls and strains within which the model was learned, and from what."""
-        system, passport, found = self.system, self.passport, {}
+        system, passport, found = self.system, self.passport, dict[str, Any]()
         layouts = {"controls": system.control_layout, "strains": system.z_layout}
         for part, layout in layouts.items():
             low, high = np.full((2, layout.size), np.inf) * [[-1.0], [1.0]]
