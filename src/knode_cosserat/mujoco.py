@@ -29,7 +29,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.ends import Clamped, Moving
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.schemes.space import SpaceScheme
-from knode_cosserat.solvers import Stepper, equilibrium
+from knode_cosserat.solvers import Result, SimulationError, Stepper, equilibrium
 from knode_cosserat.trajectory import Trajectory
 
 __all__ = ["CouplingError", "RodOnSite"]
@@ -42,8 +42,8 @@ PROBE = 1e-3
 HEAVIEST = 5.0
 
 
-class CouplingError(KnodeCosseratError, RuntimeError):
-    """A rod and a MuJoCo model cannot be coupled, or a step was not solved; the message is one line."""
+class CouplingError(KnodeCosseratError, ValueError):
+    """A rod and a MuJoCo model cannot be coupled; the message is one line."""
 
     code = "coupling"
 
@@ -92,15 +92,14 @@ class RodOnSite:
             tolerance: of the wrench, relative to its size.
 
         Raises:
-            CouplingError: MuJoCo is not installed, there is no such site, or the robot cannot be on it.
+            CouplingError: there is no such site, or the robot cannot be on it.
+            ImportError: MuJoCo is not installed.
         """
         check_arguments(RodOnSite.__init__, locals())
         try:
             self._mujoco = importlib.import_module("mujoco")
         except ImportError:
-            raise CouplingError(
-                "MuJoCo is not installed; allowed is pip install 'knode-cosserat[mujoco]'"
-            ) from None
+            raise ImportError("MuJoCo is not installed: pip install 'knode-cosserat[mujoco]'") from None
         if not isinstance(model, self._mujoco.MjModel) or not isinstance(data, self._mujoco.MjData):
             raise CouplingError(
                 f"model and data are {type(model).__name__} and {type(data).__name__}; allowed are a"
@@ -160,8 +159,8 @@ class RodOnSite:
         """Advance both by the rod's time step under its own control (k,), and return the rod's state.
 
         Raises:
-            CouplingError: the wrench was not found; model and rod are then in the state before.
-            SimulationError: a step of the rod was not solved.
+            CouplingError: a control of a wrong shape.
+            SimulationError: the step was not solved. Model and rod are then in the state before it.
         """
         own = np.asarray(control, dtype=float)
         if own.shape != (len(self._own),):
@@ -203,10 +202,9 @@ class RodOnSite:
                 slope += np.outer(missing - error - slope @ step, step) / (step @ step)
             missing, step = error, np.linalg.solve(slope, error)
             wrench = wrench + step
-        raise CouplingError(
-            f"the wrench was not found in {MOST} corrections at {self.data.time:.4g} s; allowed are shorter "
-            "time steps of the model"
-        )
+        cause = f"The wrench was not found in {MOST} corrections: take shorter time steps of the model."
+        time, missing = self._stepper.time + self.dt, float(np.max(np.abs(error) / self._size(found)))
+        raise SimulationError(round(time / self.dt), time, missing, Result.NO_CONVERGENCE, cause)
 
     # the model
 
