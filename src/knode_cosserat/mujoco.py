@@ -203,8 +203,8 @@ class RodOnSite:
             missing, step = error, np.linalg.solve(slope, error)
             wrench = wrench + step
         cause = f"The wrench was not found in {MOST} corrections: take shorter time steps of the model."
-        time, missing = self._stepper.time + self.dt, float(np.max(np.abs(error) / self._size(found)))
-        raise SimulationError(round(time / self.dt), time, missing, Result.NO_CONVERGENCE, cause)
+        time, residual = self._stepper.time + self.dt, float(np.max(np.abs(error) / self._size(found)))
+        raise SimulationError(round(time / self.dt), time, residual, Result.NO_CONVERGENCE, cause)
 
     # the model
 
