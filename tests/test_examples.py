@@ -297,3 +297,16 @@ def test_spinning_shaft(run):
     # spin parts the two ways of whirl
     assert np.all(np.abs(exact[0, :, 0]) == pytest.approx(exact[0, :, 1]))
     assert np.all(exact[1, :, 1] > 1.01 * np.abs(exact[1, :, 0]))
+
+
+@pytest.mark.slow
+def test_on_an_arm(run):
+    pytest.importorskip("mujoco")
+    wrench, tips = run("on_an_arm", seconds=0.2)
+    assert wrench.shape == (20, 6) and tips.shape == (20, 3)
+    # it hangs from the flange of an arm that is level, 0.9 m from the shoulder
+    np.testing.assert_allclose(tips[-1], [0.9, 0.0, 1.0 - 0.635], atol=0.03)
+    hanging = kc.robots.ends.Clamped(orientation=[0.0, 1.0, 0.0, 0.0])
+    robot = kc.load_robot("delrin-routed-tendon-robot").replace(base_end=hanging)
+    weight = kc.equilibrium(robot, np.zeros(4)).base_wrench[0, 2]
+    np.testing.assert_allclose(wrench[-1, 2], weight, rtol=0.1)

@@ -2,8 +2,8 @@
 
 The names that a first script needs are here; start with `load_robot`, `simulate` and `Trajectory`. All other
 public names are in the namespaces `robots`, `solvers`, `learning`, `recordings`, `statics`,
-`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `envs`, `sweeps` and
-`native`.
+`estimation`, `control`, `identification`, `metrics`, `figures`, `viewer`, `controls`, `envs`, `sweeps`,
+`native` and `mujoco`.
 Drivers of robots are a distribution of their own, `knode_cosserat_hardware`. Events are logged to the logger
 "knode_cosserat", which is quiet unless a handler is added.
 """
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
         identification,
         learning,
         metrics,
+        mujoco,
         native,
         recordings,
         robots,
@@ -75,6 +76,7 @@ __all__ = [
     "load_robot",
     "load_trajectory",
     "metrics",
+    "mujoco",
     "native",
     "recordings",
     "robots",

@@ -1,13 +1,13 @@
 """Co-simulation with MuJoCo: a rod on a site of a rigid robot, such as the flange of an arm.
 
-The rod's base follows the site, and the wrench of the rod acts on the site's body. Both are solved together in
-each step. With the mean wrench w on the body in the step, MuJoCo returns the velocity v(w) of the site after it,
-and the rod returns its mean wrench W(v). Newton's method solves
+The rod's base follows the site, and the wrench of the rod acts on the site's body. Both are solved together
+in each step. With the mean wrench w on the body in the step, MuJoCo returns the velocity v(w) of the site
+after it, and the rod returns its mean wrench W(v). Newton's method, with Broyden's updates, solves
 
     W(v(w)) = w,     (1 + B A) δw = W - w,     A = H J M⁻¹ Jᵀ,     B = -∂W/∂v
 
-with the step H, MuJoCo's mass matrix M, and the Jacobian J of the site. B is the rod's apparent inertia over H:
-where it is heavy against the flange, the wrench of the step before makes the motion diverge at any time step.
+with the step H, MuJoCo's mass matrix M, and the Jacobian J of the site. B is the rod's apparent inertia over
+H: where that is large against the flange's, motions by the wrench of the step before diverge at any step.
 
 MuJoCo's semi-implicit integrators have velocities half a time step before positions. The rod takes the site's
 pose of that time. The impulses on both are then equal, and momentum is kept to the tolerance.
@@ -17,6 +17,7 @@ from __future__ import annotations
 
 import importlib
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -28,7 +29,7 @@ from knode_cosserat.errors import KnodeCosseratError
 from knode_cosserat.rods.ends import Clamped, Moving
 from knode_cosserat.rods.rod import SlenderRod
 from knode_cosserat.schemes.space import SpaceScheme
-from knode_cosserat.solvers import Stepper, equilibrium
+from knode_cosserat.solvers import Result, SimulationError, Stepper, equilibrium
 from knode_cosserat.trajectory import Trajectory
 
 __all__ = ["CouplingError", "RodOnSite"]
@@ -37,13 +38,12 @@ __all__ = ["CouplingError", "RodOnSite"]
 MOST, MANY = 20, 4
 #: displacement of the site in a step, as part of the rod's length, by which the apparent inertia is measured
 PROBE = 1e-3
-#: largest apparent inertia of the rod against that of the site: from 8.5 on, free flanges of little inertia were
-#: unstable
+#: largest apparent inertia of the rod against that of the site: free flanges were unstable from 8.5 on
 HEAVIEST = 5.0
 
 
-class CouplingError(KnodeCosseratError, RuntimeError):
-    """A rod and a MuJoCo model cannot be coupled, or a step was not solved; the message is one line."""
+class CouplingError(KnodeCosseratError, ValueError):
+    """A rod and a MuJoCo model cannot be coupled; the message is one line."""
 
     code = "coupling"
 
@@ -92,15 +92,14 @@ class RodOnSite:
             tolerance: of the wrench, relative to its size.
 
         Raises:
-            CouplingError: MuJoCo is not installed, there is no such site, or the robot cannot be on it.
+            CouplingError: there is no such site, or the robot cannot be on it.
+            ImportError: MuJoCo is not installed.
         """
         check_arguments(RodOnSite.__init__, locals())
         try:
             self._mujoco = importlib.import_module("mujoco")
         except ImportError:
-            raise CouplingError(
-                "MuJoCo is not installed; allowed is pip install 'knode-cosserat[mujoco]'"
-            ) from None
+            raise ImportError("MuJoCo is not installed: pip install 'knode-cosserat[mujoco]'") from None
         if not isinstance(model, self._mujoco.MjModel) or not isinstance(data, self._mujoco.MjData):
             raise CouplingError(
                 f"model and data are {type(model).__name__} and {type(data).__name__}; allowed are a"
@@ -121,7 +120,8 @@ class RodOnSite:
         self.robot = robot.replace(gravity=np.array(model.opt.gravity))
         layout = self.robot.control_layout
         self._columns = [
-            layout.slice(f"base_{name}") for name in ("position", "orientation", "velocity", "angular_velocity")
+            layout.slice(f"base_{name}")
+            for name in ("position", "orientation", "velocity", "angular_velocity")
         ]
         self._own = np.setdiff1d(
             np.arange(layout.size), np.concatenate([np.arange(layout.size)[each] for each in self._columns])
@@ -130,15 +130,22 @@ class RodOnSite:
         #: time step of the rod (s)
         self.dt = float(model.opt.timestep) * substeps
         self._h = np.array([1.0, 0.0, 0.0, 0.0])
-        begun = self._control(np.zeros(len(self._own)), self._interface())
+        own, interface = np.zeros(len(self._own)), self._interface()
+        begun = self._control(own, interface)
         start = equilibrium(self.robot, begun, space=space)
         self._stepper = Stepper(self.robot, self.dt, space=space, initial=start, errors=False)
         #: wrench of the rod on the site in the last step: force (N) and moment (N·m) about it, global frame
         self.wrench = self._at_site(np.asarray(start.base_wrench[0]), start)
-        self._inertia: Any = None
-        self._warned = False
         #: corrections of the wrench in the last step
         self.corrections = 0
+        self._inertia = self._measured_inertia(own, interface)
+        largest = float(np.max(np.abs(np.linalg.eigvals(self._inertia @ self._mobility()))))
+        if largest > HEAVIEST:
+            warnings.warn(
+                f"the rod's inertia is {largest:.3g} times that of the site; motions are stable up to about "
+                f"{HEAVIEST:g}: give the body more mass or inertia, or the model shorter time steps",
+                stacklevel=2,
+            )
 
     def __repr__(self) -> str:
         return f"RodOnSite: {self._stepper!r}"
@@ -152,8 +159,8 @@ class RodOnSite:
         """Advance both by the rod's time step under its own control (k,), and return the rod's state.
 
         Raises:
-            CouplingError: the wrench was not found; model and rod are then in the state before.
-            SimulationError: a step of the rod was not solved.
+            CouplingError: a control of a wrong shape.
+            SimulationError: the step was not solved. Model and rod are then in the state before it.
         """
         own = np.asarray(control, dtype=float)
         if own.shape != (len(self._own),):
@@ -161,69 +168,62 @@ class RodOnSite:
         kind = self._mujoco.mjtState.mjSTATE_INTEGRATION
         before = np.empty(self._mujoco.mj_stateSize(self.model, kind))
         self._mujoco.mj_getState(self.model, self.data, before, kind)
-        h, wrench = self._h, self.wrench
-        try:
-            mobility = self._mobility()
-            slope = None
-            for k in range(MOST):
-                self._mujoco.mj_setState(self.model, self.data, before, kind)
-                self._h = h
-                after = self._advance(wrench)
-                row = self._stepper.preview(self._control(own, after))
-                found = self._at_site(row.mean_base_wrench[0], row)
-                error = found - wrench
-                if np.all(np.abs(error) <= self.tolerance * self._size(found)):
-                    break
-                if slope is None:
-                    if self._inertia is None or self.corrections >= MANY:
-                        self._inertia = self._measured_inertia(own, after, found)
-                        self._warn_if_heavy(self._inertia @ mobility)
-                    slope = np.eye(6) + self._inertia @ mobility
-                else:
-                    change = wrench - last
-                    slope += np.outer(error_before - error - slope @ change, change) / (change @ change)
-                last, error_before = wrench, error
-                wrench = wrench + np.linalg.solve(slope, error)
-            else:
-                raise CouplingError(
-                    f"the wrench was not found in {MOST} corrections at {self.data.time:.4g} s; allowed are "
-                    "shorter time steps of the model"
-                )
-        except Exception:
-            self._mujoco.mj_setState(self.model, self.data, before, kind)
-            self._h = h
-            raise
-        self.corrections, self.wrench = k, wrench
-        return self._stepper.step(self._control(own, after))
 
-    def _warn_if_heavy(self, ratios: Float[np.ndarray, "6 6"]) -> None:
-        """Warn once if the rod's apparent inertia is too large against the site's."""
-        largest = float(np.max(np.abs(np.linalg.eigvals(ratios))))
-        if largest > HEAVIEST and not self._warned:
-            self._warned = True
-            warnings.warn(
-                f"the rod's inertia is {largest:.3g} times that of the site; motions are stable up to about "
-                f"{HEAVIEST:g}: give the body more mass or inertia, or the model shorter time steps",
-                stacklevel=3,
-            )
+        def restore() -> None:
+            self._mujoco.mj_setState(self.model, self.data, before, kind)
+
+        try:
+            after, wrench, self.corrections = self._solve(own, restore)
+            state = self._stepper.step(self._control(own, after))
+        except Exception:
+            restore()
+            raise
+        self.wrench = wrench
+        return state
+
+    def _solve(
+        self, own: np.ndarray, restore: Callable[[], None]
+    ) -> tuple[_Interface, Float[np.ndarray, "6"], int]:
+        """Return the motion of the site after a step of the model, the wrench in it, and the corrections."""
+        if self.corrections >= MANY:
+            self._inertia = self._measured_inertia(own, self._interface())
+        slope, wrench = np.eye(6) + self._inertia @ self._mobility(), self.wrench
+        missing = step = np.zeros(6)
+        for k in range(MOST):
+            restore()
+            after = self._advance(wrench)
+            row = self._stepper.preview(self._control(own, after))
+            found = self._at_site(row.mean_base_wrench[0], row)
+            error = found - wrench
+            if np.all(np.abs(error) <= self.tolerance * self._size(found)):
+                return after, wrench, k
+            if k:
+                # Broyden's update
+                slope += np.outer(missing - error - slope @ step, step) / (step @ step)
+            missing, step = error, np.linalg.solve(slope, error)
+            wrench = wrench + step
+        cause = f"The wrench was not found in {MOST} corrections: take shorter time steps of the model."
+        time, residual = self._stepper.time + self.dt, float(np.max(np.abs(error) / self._size(found)))
+        raise SimulationError(round(time / self.dt), time, residual, Result.NO_CONVERGENCE, cause)
 
     # the model
 
     def _place(self, site: str) -> None:
         """Find the site, or the body, that carries the rod."""
         mujoco, kinds = self._mujoco, self._mujoco.mjtObj
-        for kind, name in ((kinds.mjOBJ_SITE, "site"), (kinds.mjOBJ_BODY, "body")):
-            index = mujoco.mj_name2id(self.model, kind, site)
-            if index >= 0:
-                break
-        else:
+        sites, bodies = (
+            mujoco.mj_name2id(self.model, kind, site) for kind in (kinds.mjOBJ_SITE, kinds.mjOBJ_BODY)
+        )
+        self._is_site = sites >= 0
+        index = sites if self._is_site else bodies
+        if index < 0:
             known = [self.model.site(k).name for k in range(self.model.nsite)]
             known += [self.model.body(k).name for k in range(1, self.model.nbody)]
             raise CouplingError(
                 f"the model has no site or body {site!r}; there are {', '.join(filter(None, known))}"
                 + did_you_mean(site, known)
             )
-        self._index, self._is_site = index, name == "site"
+        self._index = index
         self._kind = kinds.mjOBJ_SITE if self._is_site else kinds.mjOBJ_XBODY
         self._body = int(self.model.site_bodyid[index]) if self._is_site else index
         integrator = mujoco.mjtIntegrator(self.model.opt.integrator)
@@ -302,17 +302,19 @@ class RodOnSite:
     def _size(self, wrench: np.ndarray) -> np.ndarray:
         """Return the size of a wrench, for a relative tolerance: at least the rod's natural one."""
         force, moment = (np.max(np.abs(part)) for part in (wrench[:3], wrench[3:]))
-        return np.repeat([force, moment] + self._natural, 3)
+        return np.repeat(np.array([force, moment]) + self._natural, 3)
 
-    def _measured_inertia(
-        self, own: np.ndarray, interface: _Interface, wrench: np.ndarray
-    ) -> Float[np.ndarray, "6 6"]:
+    def _measured_inertia(self, own: np.ndarray, interface: _Interface) -> Float[np.ndarray, "6 6"]:
         """Return B, the rod's apparent inertia over the step."""
-        columns = []
+
+        def wrench(motion: _Interface) -> np.ndarray:
+            row = self._stepper.preview(self._control(own, motion))
+            return self._at_site(row.mean_base_wrench[0], row)
+
+        columns, still = [], wrench(interface)
         for k in range(6):
             probe = np.zeros(6)
             probe[k] = PROBE / self.dt * (float(self.robot.length) if k < 3 else 1.0)
             moved = self._moved(interface, 0.5 * self.dt * probe)
-            row = self._stepper.preview(self._control(own, moved._replace(twist=interface.twist + probe)))
-            columns.append((wrench - self._at_site(row.mean_base_wrench[0], row)) / probe[k])
+            columns.append((still - wrench(moved._replace(twist=interface.twist + probe))) / probe[k])
         return np.stack(columns, axis=1)

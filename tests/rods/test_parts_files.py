@@ -210,7 +210,7 @@ HEAD = (
         ("cross_section: {kind: elliptic, semi_axis_x: 5, semi_axis_y: 1}", ".*Did you mean 0.005 (5 mm)"),
         ("base_end: {kind: driven, axes: [[x]]}", "base_end.axes is [['x']]; allowed is a list of different"),
         ("base_end: clamped",
-         "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, pinned"),
+         "base_end is 'clamped'; allowed is a mapping with a kind: clamped, driven, free, moving, pinned"),
         ("base_end: {kind: driven, axes: [x, x]}",
          "base_end.axes is ['x', 'x']; allowed is a list of different ones of x, y"),
         ("base_end: {kind: driven, axes: [q]}",
