@@ -301,9 +301,11 @@ class Passport:
                 if not own.size or np.max(own) == -np.inf:
                     continue
                 at: Any = (*np.unravel_index(int(np.argmax(own)), own.shape), k)
-                numbers_there = (float(np.broadcast_to(it, over.shape)[at]) for it in (values, low, high))
+                value, least, most = (
+                    float(np.broadcast_to(it, over.shape)[at]) for it in (values, low, high)
+                )
                 relative = float(over[at]) / max(float(np.broadcast_to(slack, over.shape)[at]), 1e-300)
-                found.append((relative, Excess(word + label, f"{unit}{per}", *numbers_there, part)))
+                found.append((relative, Excess(word + label, f"{unit}{per}", value, least, most, part)))
         return tuple(excess for _, excess in sorted(found, key=lambda pair: -pair[0]))
 
     def _over(self, system: System, **numbers: Any) -> Iterator[tuple[Any, ...]]:
