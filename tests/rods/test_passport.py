@@ -63,7 +63,7 @@ def test_each_kind_of_robot_is_marked_just_outside_and_not_inside(kind, tmp_path
         assert known.passport.outside(known, **numbers).tolist() == [False, True]
         (excess,) = known.passport.excesses(known, **numbers)
         assert excess[:2] == (name, unit)
-        np.testing.assert_allclose(excess[2:], (rows[1, column], low[column], high[column]))
+        np.testing.assert_allclose(excess[2:5], (rows[1, column], low[column], high[column]))
         assert found.extrapolated[1] and str(excess) in found.extrapolation
         assert "EXTRAPOLATION: " in str(found)
         words.append(found.extrapolation)

@@ -33,8 +33,6 @@ MARGIN = 0.1
 ROUNDING = 1e-9
 #: ranges of a passport, the word for one of their numbers, and the end of its unit
 PARTS = {"controls": ("", ""), "strains": ("strain ", ""), "rates": ("rate of strain ", "/s")}
-#: numbers out of their range that a message names
-MOST_NAMED = 3
 
 COUNT = Rule(
     "a whole number from 0 on",
@@ -102,13 +100,14 @@ class LearnedRange:
 
 
 class Excess(NamedTuple):
-    """A number that leaves the learned range: its farthest value, and the range."""
+    """A number that leaves the learned range: its farthest value, the range, and the part of the passport."""
 
     name: str
     unit: str
     value: float
     low: float
     high: float
+    part: str
 
     def __str__(self) -> str:
         unit = "" if self.unit in ("", "1") else f" {self.unit}"
@@ -307,9 +306,11 @@ class Passport:
                 if not own.size or np.max(own) == -np.inf:
                     continue
                 at: Any = (*np.unravel_index(int(np.argmax(own)), own.shape), k)
-                numbers_there = (float(np.broadcast_to(it, over.shape)[at]) for it in (values, low, high))
+                value, least, most = (
+                    float(np.broadcast_to(it, over.shape)[at]) for it in (values, low, high)
+                )
                 relative = float(over[at]) / max(float(np.broadcast_to(slack, over.shape)[at]), 1e-300)
-                found.append((relative, Excess(word + label, f"{unit}{per}", *numbers_there)))
+                found.append((relative, Excess(word + label, f"{unit}{per}", value, least, most, part)))
         return tuple(excess for _, excess in sorted(found, key=lambda pair: -pair[0]))
 
     def _over(self, system: System, **numbers: Any) -> Iterator[tuple[Any, ...]]:
@@ -340,10 +341,11 @@ class Passport:
 
 
 def named(excesses: Iterable[Excess]) -> str:
-    """Return the farthest numbers out of their ranges in words; empty if there are none."""
-    texts = [str(excess) for excess in excesses]
-    more = f" and {len(texts) - MOST_NAMED} more" if len(texts) > MOST_NAMED else ""
-    return ", ".join(texts[:MOST_NAMED]) + more
+    """Return the farthest control, strain and rate out of their ranges in words; empty if there are none."""
+    every = list(excesses)
+    farthest = {excess.part: str(excess) for excess in reversed(every)}
+    more = f" and {len(every) - len(farthest)} more" if len(every) > len(farthest) else ""
+    return ", ".join(farthest[part] for part in PARTS if part in farthest) + more
 
 
 def compared_numbers(trajectory: Any) -> dict[str, Any]:
