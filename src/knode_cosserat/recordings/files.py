@@ -216,6 +216,7 @@ def _parts(
         _add_check(first, it, apart, config, findings)
         return [(begins[0], apart, 0.0)], stated.deviation
     parts, doubt = list[tuple[float, float, float]](), 0.0
+    drives = ", ".join(source.topic for source in config.measured)
     for begin, end in zip(begins, [*begins[1:], np.inf], strict=True):
         try:
             if config.static:
@@ -225,7 +226,7 @@ def _parts(
             if not parts:
                 raise RecordingError(
                     f"the offset of the clock of {it.name} against that of {first.name} is not known: "
-                    f"{error}. State it, in s: `files: [{{name: {it.name}, offset: …}}]`"
+                    f"{error} (controls are {drives or 'none'}). State it, in s: `files: [{{name: {it.name}, offset: …}}]`"
                 ) from None
             # a short part after a reset follows the one before it
             what = f"{it.name}: after its clock was set back, {error}; the rows are taken to follow"
