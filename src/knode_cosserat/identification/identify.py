@@ -145,7 +145,7 @@ def identify(
 
 
 def _require_zeros(robot: System, rows: Sequence[Measurements]) -> None:
-    """Raise `IdentificationError` if motors always hold all tendons far from their lengths on the straight rod.
+    """Raise `IdentificationError` if motors always hold all tendons far from their lengths at rest.
 
     No search finds such zeros, and a robot whose tendons are all taken in by much has no equilibrium.
     """

@@ -141,11 +141,12 @@ def _of_these(files: Sequence[File], config: RecordingConfig) -> RecordingConfig
     """
     found: dict[str, FileSource] = {it.name: it for it in config.files}
     for file in files:
-        alike = [it for it in config.files if it.name != file.name and fnmatch.fnmatchcase(file.name, it.name)]
+        alike = [it for it in config.files if fnmatch.fnmatchcase(file.name, it.name)]
         if file.name in found:
             continue
         if len(alike) > 1:
-            raise RecordingError(f"{file.name} matches {' and '.join(it.name for it in alike)}; allowed is one")
+            names = " and ".join(it.name for it in alike)
+            raise RecordingError(f"{file.name} matches {names}; allowed is one")
         found |= {file.name: alike[0].replace(name=file.name)} if alike else {}
     known = [file.name for file in files]
     if found and not set(found) & set(known):
@@ -226,7 +227,8 @@ def _parts(
             if not parts:
                 raise RecordingError(
                     f"the offset of the clock of {it.name} against that of {first.name} is not known: "
-                    f"{error} (controls are {drives or 'none'}). State it, in s: `files: [{{name: {it.name}, offset: …}}]`"
+                    f"{error} (controls are {drives or 'none'}). State it, in s: "
+                    f"`files: [{{name: {it.name}, offset: …}}]`"
                 ) from None
             # a short part after a reset follows the one before it
             what = f"{it.name}: after its clock was set back, {error}; the rows are taken to follow"

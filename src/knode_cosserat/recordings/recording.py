@@ -132,7 +132,8 @@ class Recording:
             RecordingError: there are no such controls or no such rows.
         """
         driver = self._driver(controls or self.config.controls)
-        time = self._own_rows(driver, start, end) if self.config.static else self._grid(driver, dt, start, end)
+        is_static = self.config.static
+        time = self._own_rows(driver, start, end) if is_static else self._grid(driver, dt, start, end)
         bridged = self.config.longest_gap
         latency = 0.0
         if driver is self.command and self.config.command is not None:
