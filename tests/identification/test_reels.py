@@ -1,5 +1,7 @@
 """Identification of robots with reels: nominal numbers change nothing, and equilibria tell the truth."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -67,6 +69,16 @@ def test_what_effects_do():
     assert np.asarray(robot.Kse) == pytest.approx(np.e * np.asarray(PAIR.Kse), rel=1e-12)
     r = 0.02 * np.exp(0.1)
     assert robot.routes_at(0.0)[0][0] == pytest.approx([r * np.cos(0.2), r * np.sin(0.2), 0.0], rel=1e-12)
+
+
+def test_motors_whose_zeros_are_elsewhere_are_refused_at_once():
+    turned = np.random.default_rng(2).uniform(-20.0, 20.0, (6, 3))
+    for zero, done in ((100.0, "taken in"), (-100.0, "let out")):
+        data = equilibria(CABLES, turned)
+        data = dataclasses.replace(data, control=turned + zero)
+        words = rf"all tendons are {done} by [67]\.?\d* % .* zero: \[{turned[0, 0] + zero:.4g}, "
+        with pytest.raises(kc.identification.IdentificationError, match=words):
+            kc.identify(CABLES, [data])
 
 
 def equilibria(robot, control, noise=5e-5):

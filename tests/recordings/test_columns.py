@@ -289,6 +289,7 @@ LOGS = {
     "actuator_force_{}": (-PULLS, "tension", -1.0),
     "ctrl[{}]": (PULLS, "command", None),
     "present_current_{}": (PULLS, "current", 1.0),
+    "dxl{}_position": (np.round(512.0 * PULLS), "angle", 360.0 / 4096.0),
     "[ID:00{}] Present Position": (np.round(512.0 * PULLS), "angle", 360.0 / 4096.0),
 }
 

@@ -220,7 +220,9 @@ def test_several_files_are_proposed_inspected_and_evaluated(tmp_path, motion):
     assert [(it.name, it.time) for it in config.files] == [("motors.csv", "t [s]"), ("mocap.csv", "stamp_ms")]
     text = succeeded("inspect", *paths)
     (tmp_path / "it.yaml").write_text(text.partition("--config:\n")[2])
-    assert RecordingConfig.load(tmp_path / "it.yaml").files[1].offset == pytest.approx(1.0, abs=0.02)
+    # other recordings have other offsets
+    assert RecordingConfig.load(tmp_path / "it.yaml").files == config.files
+    assert load_recording(paths, tmp_path / "it.yaml").config.files[1].offset == pytest.approx(1.0, abs=0.02)
     found = json.loads(succeeded("inspect", *paths, "--json"))
     assert found["columns"]["F2 [N]"] == "tension 2 [N]" and found["columns"]["stamp_ms"] == "time"
     named = f"{paths[0]}+{paths[1]}"
@@ -265,10 +267,43 @@ def test_files_that_are_not_those_of_the_configuration_say_so(tmp_path, motion):
     paths, _ = split(tmp_path, motion, 0.0)
     config = proposed_config(paths)
     renamed = tuple(it.replace(name=f"other_{it.name}", offset=0.0) for it in config.files)
-    with pytest.raises(RecordingError, match=r"required is time|files states the clock of other_motors\.csv"):
+    with pytest.raises(RecordingError, match=r"files states the clock of other_motors\.csv; .* A pattern"):
         load_recording(paths, config.replace(files=renamed))
     with pytest.raises(RecordingError, match=r"tip is in none of the files; they have motors.csv: t \[s\]"):
         load_recording(paths, config.replace(columns=None))
+
+
+def test_a_pattern_of_names_serves_several_recordings(tmp_path, motion):
+    paths, _ = split(tmp_path, motion, 0.3)
+    config = proposed_config(paths)
+    named = dict(zip(("*motors.csv", "*mocap.csv"), config.files, strict=True))
+    of_all = config.replace(files=tuple(it.replace(name=name) for name, it in named.items()))
+    for word in ("first", "second"):
+        moved = [path.rename(path.with_name(f"{word}_{path.name.rpartition('_')[2]}")) for path in paths]
+        recording = load_recording(moved, of_all)
+        assert [it.name for it in recording.config.files] == [f"{word}_motors.csv", f"{word}_mocap.csv"]
+        paths = moved
+    twice = (*of_all.files, of_all.files[0].replace(name="second_*"))
+    with pytest.raises(RecordingError, match=r"second_motors\.csv matches \*motors\.csv and second_\*"):
+        load_recording(paths, config.replace(files=twice))
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.02])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_robot_that_follows_its_controls_is_matched(seed, lag):
+    rng = np.random.default_rng(seed)
+    time = np.arange(0.0, 14.0, DT)
+    knots = scipy.signal.resample(rng.uniform(-1.0, 1.0, (21, 2)) * (np.arange(21)[:, None] > 2), len(time))
+    angles = knots @ np.array([[1.0, -0.5, -0.5], [0.0, 0.9, -0.9]])
+    keeps = np.exp(-DT / lag) if lag else 0.0
+    bent = scipy.signal.lfilter([1.0 - keeps], [1.0, -keeps], knots, axis=0)
+    # motor angles give the bending, and large bending is not linear
+    size = np.linalg.norm(bent, axis=1, keepdims=True)
+    place = 0.2 * np.concatenate([bent * (1.0 - size**2 / 8.0), 1.0 - size**2 / 6.0], axis=1)
+    place = place + 2e-4 * rng.normal(size=place.shape)
+    found = match_clocks(Signal(time[::20], angles[::20]), Signal(time[300::8] - 2.5, place[300::8]))
+    assert abs(found.offset - 2.5) < 2.0 * found.offset_error
+    assert abs(found.offset - 2.5) < lag + 0.01
 
 
 @pytest.mark.campaign

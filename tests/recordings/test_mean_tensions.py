@@ -49,6 +49,14 @@ def lines(recording, time):
     return np.stack([np.interp(time, known.time, known.values[:, k]) for k in range(2)], axis=1)
 
 
+def test_rows_begin_with_the_tensions(uneven):
+    late = TIMES > 0.61
+    recording = recorded(TIMES[late], uneven.control.values[late])
+    for mean in (False, True):
+        rows = recording.sampled(0.0125, mean=mean)
+        assert abs(rows.time[0] - 0.61) < 0.12 and np.isfinite(rows.control).all()
+
+
 def test_a_mean_is_that_of_the_lines_between_messages(uneven):
     given = uneven.sampled(0.05, start=0.2, mean=True)
     fine = np.linspace(0.025, 0.075, 20001)

@@ -338,10 +338,11 @@ def _tendons(values: dict[str, Any]) -> list[str]:
         f"  tendon_angles: {angles}  # rad, about the backbone",
     ]
     if values["drive"] == "motor":
-        motors, radii = [*range(1, len(angles) + 1)], [0.01] * len(angles)
+        motors, radii, zeros = [*range(1, len(angles) + 1)], [0.01] * len(angles), [0.0] * len(angles)
         lines += [
             "  drive: reel  # motors wind up the tendons: controls are their angles in rad",
-            f"  reels: {{kind: reels, motors: {motors}, radius: {radii}}}  # m, radius of each reel",
+            f"  reels: {{kind: reels, motors: {motors}, radius: {radii}, zero: {zeros}}}"
+            "  # m; rad, what the log reads of the straight arm: 2048 ticks are 3.1416",
         ]
     return [*lines, *_tip_mass(values)]
 

@@ -90,7 +90,8 @@ def _loaded(paths: list[Path], config: Path | None) -> tuple[Recording, str]:
     if len(paths) > 1:
         proposed = None if config else proposed_config(paths)
         loaded = load_recording(paths, config or proposed)
-        return loaded, loaded.config.to_yaml(brief=True) if proposed else ""
+        # other recordings have other offsets: each is found when it is read
+        return loaded, loaded.config.replace(files=proposed.files).to_yaml(brief=True) if proposed else ""
     (path,) = paths
     try:
         (loaded,) = load_recordings([path], config, proposals=False)

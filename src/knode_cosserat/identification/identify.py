@@ -38,6 +38,9 @@ from knode_cosserat.rods.system import System
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.trajectory import Trajectory
 
+#: least part of the length by which all tendons are taken in if the zeros of motors are wrong
+LARGEST_TAKEN = 0.05
+
 log = logging.getLogger(__name__)
 
 
@@ -110,6 +113,7 @@ def identify(
     measured = [it for it in rows if isinstance(it, Measurements)]
     plain += place_effects(measured, flat=named)
     if not named:
+        _require_zeros(robot, measured)
         # without priors, and without the effects that they lack, plain parameters would make up for delays
         plain += clock_effects(
             {name: it.clock_deviation for name, it in zip(names_of(measured), measured, strict=True)}
@@ -158,6 +162,26 @@ def _with_passport(found: Identified, rows: Sequence[Any], space: str | SpaceSch
             KNODE(with_passport(it.knowledge, passport), it.residual, it.about) for it in found.ensemble
         )
     return dataclasses.replace(found, robot=robot, ensemble=members)
+
+
+def _require_zeros(robot: System, rows: Sequence[Measurements]) -> None:
+    """Raise `IdentificationError` if motors always hold all tendons far from their lengths at rest.
+
+    No search finds such zeros, and a robot whose tendons are all taken in by much has no equilibrium.
+    """
+    if getattr(robot, "reels", None) is None:
+        return
+    taken_in: Any = robot.taken_in  # type: ignore[attr-defined]
+    for name, it in zip(names_of(rows), rows, strict=True):
+        known = it.control[np.isfinite(it.control).all(axis=1)]
+        shares = np.array([taken_in(row) for row in known[:: max(1, len(known) // 100)]]) / robot.length
+        if len(shares) and (shares.min() > LARGEST_TAKEN or shares.max() < -LARGEST_TAKEN):
+            first = ", ".join(f"{number:.4g}" for number in known[0])
+            raise IdentificationError(
+                f"{name}: all tendons are {'taken in' if shares.min() > 0.0 else 'let out'} by "
+                f"{100.0 * np.abs(shares).min():.2g} % of the length or more in every row; the motors of the "
+                f"straight robot are not at reels.zero. If it is straight in the first row: zero: [{first}]"
+            )
 
 
 def _best(nominal: System, journal: Journal, reason: str) -> Identified:

@@ -7,6 +7,10 @@ the drift: accelerations are linear in positions, velocities and the controls at
 deviations are those of a jackknife over parts of the recording, with the scatter over the widths of the
 filter that differentiates, and a tenth of the lag between the two models.
 
+A robot that reels hold follows its controls: the static model then says more than the dynamic one, whose
+positions already tell the controls, and which says as much for delays before and after the true one. The
+static model refines such a delay, with a doubt about the lag that remains in it.
+
 The latency of the robot itself cannot be told from an offset of clocks: dead time between a measured control
 and the motion is in the offset. The effect `latency` of `identify` takes what is left.
 """
@@ -45,6 +49,8 @@ RELATED, DECIDED, TWO_SIGMA = 25.0, 10.0, 4.0
 COMPONENTS, SMALLEST = 4, 1e-3
 #: doubt about the lag between the two models, as a part of it
 LAGGING = 0.1
+#: doubt about the lag of a robot that follows its controls (s)
+FOLLOWING = 0.03
 #: largest drift of a clock (1)
 LARGEST_DRIFT = 1e-3
 #: parts of the jackknife
@@ -92,12 +98,12 @@ def match_clocks(first: Signal, second: Signal, *, is_reversed: bool = False) ->
     dt = max(dt, (second.time[-1] - second.time[0]) / MOST_ROWS)
     motion = _Motion.of(second, dt)
     widths = max(WIDTH, 1.5 * dt) * np.array(WIDTHS)
-    delay, doubt, lag = _best_delay(first, motion, widths[1])
-    (tau, drift), errors = _over_widths(first, motion, widths, delay, has_drift=True)
+    delay, doubt, follows = _best_delay(first, motion, widths[1])
+    (tau, drift), errors = _over_widths(first, motion, widths, delay, follows, has_drift=True)
     # a drift that is not known from zero, or not that of a clock, would only add its error
     if abs(drift) < 3.0 * errors[1] or abs(drift) > LARGEST_DRIFT:
-        (tau, drift), (errors[0], _) = _over_widths(first, motion, widths, delay, has_drift=False)
-    errors[0] = math.hypot(errors[0], LAGGING * lag, doubt)
+        (tau, drift), (errors[0], _) = _over_widths(first, motion, widths, delay, follows, has_drift=False)
+    errors[0] = math.hypot(errors[0], doubt)
     if abs(tau - delay) > 3.0 * GRID + 3.0 * errors[0]:
         raise RecordingError("the motion follows no linear model that tells")
     middle = motion.middle
@@ -168,8 +174,8 @@ def _values_at(signal: Signal, at: np.ndarray) -> tuple[np.ndarray, Bool[np.ndar
 # candidates
 
 
-def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, float, float]:
-    """Return the delay (s) that explains the motion best, its standard deviation, and the lag (s).
+def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, float, bool]:
+    """Return the delay (s) that explains the motion best, its doubt (s), and if the static model says more.
 
     Raises:
         RecordingError: no delay explains the motion, or several do.
@@ -197,13 +203,18 @@ def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, fl
     if alike.any():
         apart = np.min(np.abs(grid - grid[best])[alike])
         raise RecordingError(f"offsets that differ by {apart:.2f} s explain the motion as well as each other")
-    # the dynamic model knows the delay without the lag
+    # the dynamic model knows the delay without the lag, unless the robot follows its controls
     around = (grid >= grid[best] - APART) & (grid <= grid[best] + 0.5 * APART)
-    at = int(np.argmax(np.where(around, dynamic, -math.inf)))
-    likely = grid[around & (dynamic > dynamic[at] - TWO_SIGMA)]
+    static, dynamic = (np.where(around, each, -math.inf) for each in (static, dynamic))
+    # a lag is not negative: a dynamic model that says as much beyond the static one's delay does not know it
+    beyond = dynamic[grid > grid[int(np.argmax(static))]].max(initial=-math.inf)
+    follows = bool(static.max() > dynamic.max() and dynamic.max() - beyond < DECIDED)
+    says = static if follows else dynamic
+    at = int(np.argmax(says))
+    likely = grid[says > says[at] - TWO_SIGMA]
     doubt = 0.25 * float(np.ptp(likely)) if len(likely) > 2 else 0.0
-    lag = float(grid[int(np.argmax(np.where(around, static, -math.inf)))] - grid[at])
-    return float(grid[at]), doubt, lag
+    lagging = FOLLOWING if follows else LAGGING * float(grid[int(np.argmax(static))] - grid[at])
+    return float(grid[at]), math.hypot(doubt, lagging), follows
 
 
 def _correlated(first: Signal, motion: _Motion, wanted: float) -> list[float]:
@@ -297,10 +308,10 @@ def _explaining(
 
 
 def _over_widths(
-    first: Signal, motion: _Motion, widths: np.ndarray, delay: float, *, has_drift: bool
+    first: Signal, motion: _Motion, widths: np.ndarray, delay: float, follows: bool, *, has_drift: bool
 ) -> tuple[tuple[float, float], list[float]]:
     """Return delay (s) and drift, and their standard deviations, over the widths of the filter."""
-    fits = [_refined(first, motion, width, delay, has_drift) for width in widths]
+    fits = [_refined(first, motion, width, delay, follows, has_drift) for width in widths]
     values, errors = (np.array([fit[k] for fit in fits]) for k in (0, 1))
     weights = 1.0 / np.maximum(errors[:, 0], 1e-9) ** 2
     weights /= weights.sum()
@@ -310,11 +321,11 @@ def _over_widths(
 
 
 def _refined(
-    first: Signal, motion: _Motion, width: float, delay: float, has_drift: bool
+    first: Signal, motion: _Motion, width: float, delay: float, follows: bool, has_drift: bool
 ) -> tuple[tuple[float, float], tuple[float, float]]:
     """Return delay (s) and drift, and their standard deviations, by Gauss-Newton and a jackknife."""
-    rows = [motion.filtered(width, order) for order in (2, 1, 0)]
-    own = np.concatenate([rows[1], rows[2], np.ones((len(motion.time), 1))], axis=1)
+    rows = [motion.filtered(width, order) for order in ((0,) if follows else (2, 1, 0))]
+    own = np.concatenate([*rows[1:], np.ones((len(motion.time), 1))], axis=1)
     apart = motion.time - motion.middle
     drift = 0.0
     steps: list[np.ndarray] = []

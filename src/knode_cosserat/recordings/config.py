@@ -447,7 +447,7 @@ class FileSource(_RecordingSettings):
     """File of a recording in several files, and its clock.
 
     Attributes:
-        name: name of the file, without its folder.
+        name: name of the file, without its folder, or a pattern, such as *_motors.csv.
         offset: seconds that are added to this file's times, at its first row, so that they are those of the
             first file's clock; None: estimated.
         drift: by how much this file's clock is faster than the first one's (ppm, 1e-6); None: estimated with

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import fnmatch
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -82,6 +83,7 @@ def streams_of_files(
     Raises:
         RecordingError: a topic is in no file or in several, or a clock is not known.
     """
+    config = _of_these(files, config)
     there = {file.name: file.content.topics_there(_of_file(config, file)) for file in files}
     _require_topics(files, config, there)
     clocked, streams = list[_Clocked](), dict[str, Stream]()
@@ -94,10 +96,6 @@ def streams_of_files(
             begins = [at - zero * 1e-9 for at in file.content.resets(meaning)]
             clocked.append(_Clocked(file.name, zero, rows, own, begins))
         streams |= read
-    known = [file.name for file in files]
-    unknown = next((it.name for it in config.files if it.name not in known), None)
-    if unknown is not None and not set(known) & {it.name for it in config.files}:
-        raise RecordingError(f"files states the clock of {unknown}; the files are {', '.join(known)}")
     if not clocked:
         raise RecordingError("no poses and no controls in these files")
     first = next((it for it in clocked if not it.resets), clocked[0])
@@ -133,6 +131,30 @@ def clock_deviation(files: Sequence[File], config: RecordingConfig) -> float:
     moving = doubts_of({it.topic for it in config.markers} | {it.topic for it in config.sensors})
     apart = [np.hypot(a, b) for one, a in driving.items() for other, b in moving.items() if one != other]
     return float(max(apart, default=0.0))
+
+
+def _of_these(files: Sequence[File], config: RecordingConfig) -> RecordingConfig:
+    """Return the configuration with names of files in place of patterns, such as *_motors.csv.
+
+    Raises:
+        RecordingError: the configuration is that of other files, or a file matches several patterns.
+    """
+    found: dict[str, FileSource] = {it.name: it for it in config.files}
+    for file in files:
+        alike = [it for it in config.files if fnmatch.fnmatchcase(file.name, it.name)]
+        if file.name in found:
+            continue
+        if len(alike) > 1:
+            names = " and ".join(it.name for it in alike)
+            raise RecordingError(f"{file.name} matches {names}; allowed is one")
+        found |= {file.name: alike[0].replace(name=file.name)} if alike else {}
+    known = [file.name for file in files]
+    if found and not set(found) & set(known):
+        raise RecordingError(
+            f"files states the clock of {next(iter(found))}; the files are {', '.join(known)}. "
+            "A pattern, such as '*_motors.csv', serves several recordings"
+        )
+    return config.replace(files=tuple(found.values()))
 
 
 def _of_file(config: RecordingConfig, file: File) -> RecordingConfig:
@@ -195,6 +217,7 @@ def _parts(
         _add_check(first, it, apart, config, findings)
         return [(begins[0], apart, 0.0)], stated.deviation
     parts, doubt = list[tuple[float, float, float]](), 0.0
+    drives = ", ".join(source.topic for source in config.measured)
     for begin, end in zip(begins, [*begins[1:], np.inf], strict=True):
         try:
             if config.static:
@@ -204,7 +227,8 @@ def _parts(
             if not parts:
                 raise RecordingError(
                     f"the offset of the clock of {it.name} against that of {first.name} is not known: "
-                    f"{error}. State it, in s: `files: [{{name: {it.name}, offset: …}}]`"
+                    f"{error} (controls are {drives or 'none'}). State it, in s: "
+                    f"`files: [{{name: {it.name}, offset: …}}]`"
                 ) from None
             # a short part after a reset follows the one before it
             what = f"{it.name}: after its clock was set back, {error}; the rows are taken to follow"

@@ -81,7 +81,10 @@ QUANTITIES: dict[str, Quantity] = {
             1e-4,
             1e3,
             (("rad", 7.0), ("deg", math.inf)),
-            _words(r"phi|encoder|angle|winkel|ángulo|angulo|angolo|theta|present.?position|^q$"),
+            _words(
+                r"phi|encoder|angle|winkel|ángulo|angulo|angolo|theta|present.?position|dxl.?pos(ition)?$|"
+                r"ticks?$|^q$"
+            ),
             _words(r"motor|moteur|servo|joint|gelenk"),
             ("motor", "angle", "rx", "ry", "rz"),
             "tendons",

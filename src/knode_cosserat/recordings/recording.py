@@ -134,7 +134,8 @@ class Recording:
             RecordingError: there are no such controls or no such rows.
         """
         driver = self._driver(controls or self.config.controls)
-        time = self._own_rows(driver, start, end) if self.config.static else self._grid(dt, start, end)
+        is_static = self.config.static
+        time = self._own_rows(driver, start, end) if is_static else self._grid(driver, dt, start, end)
         bridged = self.config.longest_gap
         latency = 0.0
         if driver is self.command and self.config.command is not None:
@@ -221,12 +222,15 @@ class Recording:
             raise RecordingError(f"{self.source}: no rows from {start} to {end} s")
         return time
 
-    def _grid(self, dt: float, start: float | None, end: float | None) -> Float[np.ndarray, " T"]:
+    def _grid(
+        self, driver: ControlRows, dt: float, start: float | None, end: float | None
+    ) -> Float[np.ndarray, " T"]:
         trim = self.config.trim
         start = start if start is not None else trim[0]
         if start is None:
             # a lost frame at the beginning does not delay the first row
-            first = max(known[0] for known in self._times) - self.config.longest_gap
+            known = [*self._times, *([driver.time] if driver is self.control else [])]
+            first = max(time[0] for time in known) - self.config.longest_gap
             start = max(0.0, math.ceil(first / dt - _SAME) * dt) if dt > 0 else 0.0
         last = min([self.end, *(limit for limit in (end, trim[1]) if limit is not None)])
         if not (dt > 0.0 and math.isfinite(dt)):
