@@ -9,7 +9,7 @@
 //
 // by one symmetric 4 x 4 system. J are the tangents of the tip. `kinematic` sums the tip at rest only: damped
 // least squares. `lq` sums the tips of the next ARM_HORIZON periods in motion: linear-quadratic, so that it knows
-// that the rod is late and swings.
+// that the rod is late and swings. Tensions come LAG after their commands: so much earlier is the reference.
 //
 // The wire has tensions only, so that the model's state is not corrected by the tip: it moves by itself, under the
 // tensions that were wanted. The board's tensions are led to them: their mean difference over some 0.5 s, from
@@ -277,14 +277,14 @@ int main(int count, char **words) {
             for (int k = 0; k < n; k++)
                 offset[k] = std::clamp(offset[k] + TELEMETRY / SLOWNESS * (measured[k] - lagged[k]), -LARGEST_OFFSET,
                                        LARGEST_OFFSET);
-        controller.decide(t);
+        controller.decide(t + LAG);
         Tensions sent;
         for (int k = 0; k < n; k++) {
             lagged[k] += ARM_DT / LAG * (controller.wanted[k] - lagged[k]);
             sent[k] = controller.wanted[k] - offset[k];
         }
         if (period % EACH == 0) board.command(sent);
-        const double distance = controller.move(t), ended = now();
+        const double distance = controller.move(t + LAG), ended = now();
         if (t >= GROWTH) squares += distance * distance, whole++;
         wake.push_back(began - due);
         compute.push_back(ended - began);
