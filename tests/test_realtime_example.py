@@ -1,12 +1,12 @@
-"""The example of real-time control: its C++ program is built without warnings and moves the emulated robot."""
+"""The example of real-time control: its C++ program has no warnings and moves the emulated robot."""
 
 import subprocess
 
 import numpy as np
 import pytest
-from knode_cosserat_hardware.emulation import missing
 
 from examples.realtime import run
+from knode_cosserat_hardware.emulation import missing
 
 pytestmark = pytest.mark.slow
 STRICT = ("-Wall", "-Wextra", "-pedantic", "-Werror")
