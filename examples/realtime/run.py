@@ -23,7 +23,7 @@ from benchmarks.control import HERE, measured_loops
 from benchmarks.run import machine
 from knode_cosserat_hardware import SerialBoard
 from knode_cosserat_hardware.driver import HardwareError
-from knode_cosserat_hardware.emulation import EmulatedRobot, PseudoTerminal
+from knode_cosserat_hardware.emulation import EmulatedPort, EmulatedRobot, PseudoTerminal
 from studies.report import markdown_table
 
 SOURCE = Path(__file__).with_name("controller.cpp")
@@ -58,9 +58,9 @@ def build(folder, *options):
     return program
 
 
-def prepare(port):
-    """Accept the settings of a new board, and take its load cells' zeros."""
-    with SerialBoard(port) as board:
+def prepare(robot):
+    """Accept the settings of a new board, and take its load cells' zeros; in lock-step."""
+    with SerialBoard(EmulatedPort(robot)) as board:
         board.reset()
         board.tare()
 
@@ -68,8 +68,8 @@ def prepare(port):
 def control(program, law, seconds, fifo=False):
     """Let the controller move the emulated robot; return what it printed, and errors of the true tip (mm)."""
     robot = EmulatedRobot(ROBOT)
+    prepare(robot)
     with PseudoTerminal(robot) as terminal:
-        prepare(terminal.path)
         command = [*(["chrt", "-f", "50"] if fifo else []), program, terminal.path, law, str(seconds)]
         worker = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         rest, rows, emulated = robot.tip()[:2], [], []
@@ -116,7 +116,9 @@ def main():
     """Build, run, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--seconds", type=float, default=20.0, help="of each law, from 4 on (default 20)")
-    parser.add_argument("--fifo", action="store_true", help="run the controller by chrt -f 50, as root")
+    parser.add_argument(
+        "--fifo", action="store_true", help="run the controller before other programs (chrt -f 50); as root"
+    )
     given = parser.parse_args()
     if given.seconds < 4.0:
         parser.error(f"--seconds is {given.seconds:g}; allowed is 4 or more")
