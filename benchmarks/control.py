@@ -24,6 +24,8 @@ from benchmarks.run import machine
 
 RESULTS = Path("benchmarks/control.json")
 ROUNDS = 200
+#: this checkout
+HERE = str(Path(__file__).resolve().parents[1])
 #: periods (s) of control, number of periods, and periods in a turn
 PERIODS, COUNT, TURN = (0.02, 0.01), 1000, 100
 #: predictive controllers: the default, which earlier versions have, and one whose size is chosen
@@ -139,41 +141,55 @@ def loops(source: str) -> None:
         print(json.dumps([rows, log.tip_rmse(), log.fallbacks]), flush=True)
 
 
+def measured_loops(
+    dt: float, sizes: Mapping[str, str], sources: Mapping[str, str], count: int = COUNT
+) -> dict[tuple[str, str], Any]:
+    """Close loops of controllers by checkouts, which take turns.
+
+    Returns, by the names of controller and checkout: times of feedback, of the whole cycle, and of the CPU in
+    each period (s), the error of the tip (m), and the number of fallbacks.
+    """
+    workers: dict[tuple[str, str], Any] = {}
+    answers: dict[tuple[str, str], Any] = {}
+    for name, controller in sizes.items():
+        for label, source in sources.items():
+            environment = os.environ | {"PYTHONPATH": f"{source}/src:{source}"}
+            worker = subprocess.Popen(
+                [sys.executable, __file__, "--loops", source],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+                env=environment,
+            )
+            ready, said = _asked(worker, json.dumps({"name": controller, "dt": dt}))
+            if ready:
+                workers[name, label] = worker
+            print(f"{1.0 / dt:g} Hz, {name}, {label}: {said}", flush=True)
+    for _ in range(count // TURN):
+        for key, worker in workers.items():
+            answers[key] = _asked(worker, "")
+    for worker in workers.values():
+        worker.stdin.close()
+        worker.wait()
+    return answers
+
+
 def periods(against: str | None) -> str:
     """Return a table of the times of periods, of this checkout and of another one."""
     import numpy as np
 
     from studies.report import markdown_table
 
-    sources = {"this one": str(Path(__file__).resolve().parents[1])} | ({against: against} if against else {})
+    sources = {"this one": HERE} | ({against: against} if against else {})
     rows = []
     for dt in PERIODS:
-        workers, answers = {}, dict[Any, Any]()
-        for name, controller in SIZES.items():
-            for label, source in sources.items():
-                environment = os.environ | {"PYTHONPATH": f"{source}/src:{source}"}
-                worker = subprocess.Popen(
-                    [sys.executable, __file__, "--loops", source],
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    text=True,
-                    env=environment,
-                )
-                ready, said = _asked(worker, json.dumps({"name": controller, "dt": dt}))
-                if ready:
-                    workers[name, label] = worker
-                print(f"{1.0 / dt:g} Hz, {name}, {label}: {said}", flush=True)
-        for _ in range(COUNT // TURN):
-            for key, worker in workers.items():
-                answers[key] = _asked(worker, "")
+        answers = measured_loops(dt, SIZES, sources)
         for (name, label), ((feedback, cycle, cpu), rmse, fallbacks) in answers.items():
             late = int(np.sum(np.array(cycle) > dt))
             quantiles = np.percentile([feedback, cycle, cpu], (50, 99), axis=1).T
             times = [f"{1e3 * quantile:.1f}" for quantile in quantiles.ravel()]
             own = [f"{1.0 / dt:g} Hz", name, label, *times, f"{late}", f"{fallbacks}", f"{1e3 * rmse:.4f}"]
             rows.append(own)
-            workers[name, label].stdin.close()
-            workers[name, label].wait()
     head = ["period", "prediction", "checkout", "feedback, ms", "p99", "cycle, ms", "p99", "CPU, ms", "p99"]
     return markdown_table([*head, "late", "fallbacks", "tip RMSE, mm"], rows)
 
