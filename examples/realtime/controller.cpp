@@ -76,6 +76,8 @@ class Board {
         cfmakeraw(&settings);
         cfsetspeed(&settings, B115200);
         tcsetattr(port_, TCSANOW, &settings);
+        // lines from before a board was reset by this opening
+        tcflush(port_, TCIOFLUSH);
     }
     ~Board() { close(port_); }
     Board(const Board &) = delete;
