@@ -13,7 +13,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from jaxtyping import Float
 
-from knode_cosserat.cli.arguments import load_system, parse_limits
+from knode_cosserat.cli.arguments import load_system, parse_numbers
 from knode_cosserat.control.plants import Plant, Readings, Sensor
 from knode_cosserat.estimation.outputs import BodyPoses, BodyPositions
 from knode_cosserat.recordings.measurements import Measurements
@@ -194,6 +194,6 @@ def parsed_plant(text: str, dt: float, sensor: Sensor) -> ElasticaPlant:
         key, _, value = word.partition("=")
         if key not in known:
             raise ValueError(f"--plant has {word!r}; allowed is NAME=NUMBER with {', '.join(known)}")
-        changes[key] = parse_limits(f"--plant {key}", value, 1)
+        changes[key] = parse_numbers(f"--plant {key}", value, 1, "0.1")[0]
     robot: Any = load_system(name)
     return ElasticaPlant.like(robot, dt, sensor, Imperfections(**changes))

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 import typer
 
 from knode_cosserat._numbers import numbers_in
+from knode_cosserat._reprs import count_of
 from knode_cosserat._units import UnitError, numbers_with_units
 from knode_cosserat.recordings.formats import read_suffixes
 from knode_cosserat.rods.parameters import parameter_at
@@ -164,7 +165,7 @@ def parse_numbers(
     except UnitError as error:
         raise ValueError(f"{option} is {text!r}: {error}") from None
     if numbers is None or (count is not None and len(numbers) != count):
-        allowed = "numbers" if count is None else f"{count} numbers"
+        allowed = "numbers" if count is None else count_of(count, "number")
         raise ValueError(f"{option} must be {allowed}, such as {example} (got {text!r})")
     return numbers
 
