@@ -171,6 +171,12 @@ def test_what_cannot_be_exported_says_why(robot, tmp_path):
         kc.export(jax.tree.map(lambda leaf: np.stack([leaf, leaf]), robot), tmp_path, DT)
     with pytest.raises(kc.native.ExportError, match="name is '1arm'"):
         kc.export(robot, tmp_path, DT, name="1arm")
+    for name in ("example", "fmu", "m", "math"):
+        with pytest.raises(kc.native.ExportError, match=f"{name}_robot"):
+            kc.export(robot, tmp_path / name, DT)
+    (tmp_path / "arm").write_text("no folder")
+    with pytest.raises(kc.native.ExportError, match="is a file"):
+        kc.export(robot, tmp_path / "arm", DT)
     with pytest.raises(kc.KnodeCosseratError, match="target is 'arm'; allowed is native"):
         kc.export(robot, tmp_path, DT, target="arm")
 

@@ -43,6 +43,14 @@ from knode_cosserat.solvers.simulate import checked_dt
 #: files of an export, by their templates
 FILES = {"robot.h": "{name}.h", "robot.c": "{name}.c", "CMakeLists.txt": "CMakeLists.txt"}
 EXAMPLES = {"example.c": "example.c", "example.cpp": "example.cpp"}
+#: names of other files, of targets of CMake, and of headers of C
+TAKEN = {
+    "example", "example_c", "example_cpp", "fmi2", "fmi3", "fmu", "m", "all", "clean", "edit_cache", "help",
+    "install", "preinstall", "rebuild_cache", "alloca", "assert", "complex", "ctype", "endian", "errno",
+    "features", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math", "memory", "setjmp",
+    "signal", "stdalign", "stdarg", "stdatomic", "stdbool", "stddef", "stdint", "stdio", "stdlib",
+    "stdnoreturn", "string", "strings", "tgmath", "threads", "time", "uchar", "wchar", "wctype",
+}  # fmt: skip
 #: tangents side by side in the engine
 COLUMNS = 8
 
@@ -81,8 +89,8 @@ def export(
         fmi: version of FMI of an FMU: "3.0", the default, or "2.0".
 
     Raises:
-        ExportError: a batch, a model without positions, a name that C does not allow; for an FMU, no C
-            compiler.
+        ExportError: a batch, a model without positions, a name that C does not allow, a file; for an FMU, no
+            C compiler.
         EngineError: the engine does not cover the model.
         SimulationError: the equilibrium in which it starts was not found.
         TargetError: an unknown target.
@@ -104,6 +112,8 @@ def export(
                 errors=errors, horizon=horizon,
             )  # fmt: skip
             return packer.write(exported, model)
+    if folder.exists() and not folder.is_dir():
+        raise ExportError(f"export: {folder} is a file; allowed is a folder, or a path that ends in .fmu")
     if fmi is not None:
         raise ExportError(f"export: fmi is for a path that ends in .fmu. Did you mean {folder}.fmu?")
     name = _checked_name(name, folder)
@@ -114,7 +124,7 @@ def export(
     written = []
     for source, pattern in (FILES | EXAMPLES).items():
         written.append(pattern.format(name=name))
-        (folder / written[-1]).write_text(filled(source, values))
+        (folder / written[-1]).write_text(filled(source, values), encoding="utf-8")
     written.append(f"{name}.o")
     (folder / written[-1]).write_bytes(content)
     data = sum(each.nbytes for each in native.tables.values())
@@ -124,8 +134,13 @@ def export(
 def _checked_name(name: str | None, folder: Path) -> str:
     given = name
     name = re.sub(r"\W", "_", folder.resolve().name) if name is None else name
+    origin = "the last part of the path" if given is None else "name"
+    if name in TAKEN:
+        raise ExportError(
+            f"export: {origin} is {name!r}, which another file or target has; give it another name, such as "
+            f"{name}_robot"
+        )
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or keyword.iskeyword(name):
-        origin = "the last part of the path" if given is None else "name"
         raise ExportError(f"export: {origin} is {name!r}; allowed are letters, digits and _, a letter first")
     return name
 

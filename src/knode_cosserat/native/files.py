@@ -45,5 +45,5 @@ class Exported:
 
 def filled(source: str, values: Mapping[str, Any]) -> str:
     """Return a template, with its names replaced by values."""
-    text = importlib.resources.files(__package__).joinpath("templates", source).read_text()
+    text = importlib.resources.files(__package__).joinpath("templates", source).read_text(encoding="utf-8")
     return string.Template(text).substitute(values)

@@ -104,7 +104,7 @@ class Packer:
         values = {**exported.values, **description.code()}
         source, library = description.source, f"{exported.name}.so"
         for template in ("fmu.c", source):
-            (exported.folder / template).write_text(filled(template, values))
+            (exported.folder / template).write_text(filled(template, values), encoding="utf-8")
         self._compile(exported.folder, source, f"{exported.name}.o", "-lm", "-o", library)
         is_common = self.fmi == "2.0" and self.processor == "x86_64"
         binaries = "linux64" if is_common else f"{self.processor}-linux"

@@ -63,7 +63,7 @@ typedef struct {
 } prediction_numbers;
 typedef char numbers_fit[sizeof(prediction_numbers) <= sizeof(((${name}_prediction *)0)->numbers) ? 1 : -1];
 
-static void put_image(double *memory, size_t size, const int64_t *at, const int64_t *image, int count) {
+static void unpack(double *memory, size_t size, const int64_t *at, const int64_t *image, int count) {
     for (size_t k = 0; k < size; k++) memory[k] = 0.0;
     for (int k = 0; k < count; k++) memcpy(memory + at[k], image + k, sizeof *image);
 }
@@ -102,7 +102,7 @@ void ${name}_start(${name}_robot *robot) {
     robot->result = $start_result;
     robot->position_error = robot->time_error = NAN;
     memcpy(robot->motion, ${name}_motion, sizeof robot->motion);
-    put_image(robot->memory, sizeof robot->memory / sizeof(double), ${name}_image_at, ${name}_image, IMAGE);
+    unpack(robot->memory, sizeof robot->memory / sizeof(double), ${name}_image_at, ${name}_image, IMAGE);
 }
 
 /* Return the result of the last solution in `results`. */
@@ -311,8 +311,8 @@ int ${name}_extrapolates(const ${name}_robot *robot) {
 
 /* Prepare the memory of tangents at the robot's state. */
 static void begin_tangents(const ${name}_robot *robot, ${name}_prediction *memory) {
-    put_image(memory->memory, sizeof memory->memory / sizeof(double), ${name}_tangent_image_at,
-              ${name}_tangent_image, TANGENT_IMAGE);
+    unpack(memory->memory, sizeof memory->memory / sizeof(double), ${name}_tangent_image_at, ${name}_tangent_image,
+           TANGENT_IMAGE);
     memcpy(memory->memory + TANGENT_PARAMETERS_AT, robot->parameters, PARAMETERS * sizeof(double));
     for (int k = 0; k < RECORDS; k++)
         for (int i = 0; i < RECORD_ROWS; i++)
