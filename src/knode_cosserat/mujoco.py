@@ -77,7 +77,7 @@ class RodOnSite:
         site: str,
         *,
         substeps: int = 1,
-        space: str | SpaceScheme = "lobatto2",
+        space: str | SpaceScheme = "lobatto4",
         tolerance: float = 1e-7,
     ):
         """Couple them at the present state of `data`, the rod in equilibrium with the motion of the site.
