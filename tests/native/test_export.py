@@ -249,7 +249,7 @@ def test_a_robot_without_controls_is_exported_without_warnings(tmp_path):
     library.start()
     tips = library.move(np.zeros((10, 0)))
     np.testing.assert_allclose(tips, wanted[1:], rtol=0, atol=1e-12)
-    # time goes on in an equilibrium: after two steps gravity has another direction, after five it is as before
+    # time goes on in an equilibrium: after two steps gravity has another direction, after five the same
     library.start()
     library.equilibrium([])
     first, moved = library.tip(), library.move(np.zeros((5, 0)))
