@@ -192,7 +192,13 @@ def test_a_learned_model_says_where_it_extrapolates(robot, tmp_path):
         library.step(control)
         assert library.call("extrapolates") == 0
         np.testing.assert_allclose(library.tip(), row, rtol=0, atol=1e-12)
-    # controls just beyond the range and its tolerance, then strains alone
+    # a state in which no control acts yet, then controls just beyond the range, then strains alone
+    saved = np.zeros(8192)
+    library.start()
+    library.call("save", saved)
+    library.step(controls[-1])
+    library.call("load", saved)
+    assert library.call("extrapolates") == 0
     low, high = passport.limits("controls", robot.control_layout)
     library.step(np.where(np.arange(4) == 1, high + 1e-3, controls[-1]))
     assert library.call("extrapolates") == 1
@@ -201,3 +207,57 @@ def test_a_learned_model_says_where_it_extrapolates(robot, tmp_path):
     assert library.call("extrapolates") == 0
     library.equilibrium(np.where(np.arange(4) < 2, high, low))
     assert library.call("extrapolates") == 1 and np.all(low < high)
+
+
+def test_changed_parameters_are_those_of_a_robot_with_them(robot, arm):
+    controls = np.tile(CONTROL, (5, 1))
+    at = int(np.frombuffer(arm.robot[40:48], np.uint64)[0])
+    count = int(arm.exported.values["parameters"])
+    known = np.ctypeslib.as_array((ctypes.c_double * count).from_address(at))
+    names = [
+        jax.tree_util.keystr(path).lstrip(".") for path, _ in jax.tree_util.tree_flatten_with_path(robot)[0]
+    ]
+    for name, factor in (("length", 0.8), ("youngs_modulus", 0.7)):
+        place = names.index(name)  # parameters before these are scalars
+        changed = known.copy()
+        changed[place] *= factor
+        other = kc.simulate(robot.replace(**{name: factor * float(getattr(robot, name))}), controls, DT)
+        arm.start()
+        arm.robot[40:48].view(np.uint64)[0] = changed.ctypes.data
+        assert arm.equilibrium(np.zeros(4)) == 0
+        np.testing.assert_allclose(arm.move(controls), other.tip_position[1:], rtol=0, atol=1e-9)
+        wanted = positions_at(
+            other.system, other.y[-1:], places_at(np.array([0.37]), robot.nodes), other.z[-1:]
+        )
+        np.testing.assert_allclose(arm.pose_at(0, 0.37)[1], np.asarray(wanted)[0, 0], rtol=0, atol=1e-9)
+
+
+def test_a_robot_without_controls_is_exported_without_warnings(tmp_path):
+    spinning = kc.robots.SpinningFrame(rate=20 * np.pi, axis=(1.0, 0.0, 0.0))
+    robot = kc.robots.SlenderRod(
+        length=0.2,
+        radius=0.002,
+        density=1100.0,
+        youngs_modulus=5e6,
+        bending_damping=1e-5,
+        gravity=(0.0, 0.0, 9.81),
+        nodes=5,
+        effects=(spinning,),
+    )
+    library = Library(robot, tmp_path, DT)
+    wanted = kc.simulate(robot, np.zeros((10, 0)), DT).tip_position
+    library.start()
+    tips = library.move(np.zeros((10, 0)))
+    np.testing.assert_allclose(tips, wanted[1:], rtol=0, atol=1e-12)
+    # time goes on in an equilibrium: after two steps gravity has another direction, after five the same
+    library.start()
+    library.equilibrium([])
+    first, moved = library.tip(), library.move(np.zeros((5, 0)))
+    library.start()
+    library.move(np.zeros((2, 0)))
+    library.equilibrium([])
+    assert np.abs(library.tip() - first).max() > 1e-4
+    library.move(np.zeros((3, 0)))
+    library.equilibrium([])
+    np.testing.assert_allclose(library.tip(), first, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(library.move(np.zeros((5, 0))), moved, rtol=0, atol=1e-9)

@@ -227,7 +227,7 @@ class _NativeModel:
             "image": len(tables["image"]), "tangent_image": len(tables["tangent_image"]),
             "tangent_memory": tangents._size, "tangent_states": blocks * tangents.state_size,
             "tangent_numbers": most * of_solution, "columns": columns,
-            "parameters": max(1, len(tables["parameters"])), "saved": 7 + e.nc + motion,
+            "parameters": max(1, len(tables["parameters"])), "saved": 8 + e.nc + motion,
         }  # fmt: skip
 
     def _places(self) -> dict[str, Any]:
@@ -247,7 +247,7 @@ class _NativeModel:
             "records": len(records), "record_rows": e.numbers, "used": counts["used"],
             "history_at": core.H.offset, "history_size": core.H.size * core.H.component,
             "time_at": time[0].offset, "memory_time_at": core.t0.offset, "points": _listed(points),
-            "order": _listed(order), "tip_rod": rod, "position": at,
+            "order": _listed(order), "tip_rod": rod, "position": at, "length_at": _length_at(self.system),
             "orientation": _first(strand.y_layout, "h"), "force": _first(strand.y_layout, "n"),
             "moment": _first(strand.y_layout, "m"), "stretch": _stretch(strand),
             "records_at": _listed(each.offset for each in own),
@@ -350,6 +350,17 @@ def _stretch(strand: System) -> int:
     """Return the first number of the strains v in a record; -1 if there is none."""
     own = _first(strand.z_layout, "v")
     return -1 if own < 0 else strand.y_layout.size + own
+
+
+def _length_at(system: System) -> int:
+    """Return the place of the length in the parameters; -1 if none is that of the whole system."""
+    at = 0
+    for path, leaf in jax.tree_util.tree_flatten_with_path(system)[0]:
+        name = jax.tree_util.keystr(path).rpartition(".")[2]
+        if name == "length" and np.size(leaf) == 1 and float(leaf) == float(system.length):
+            return at
+        at += np.size(leaf)
+    return -1
 
 
 def _parameter_lines(system: System) -> Iterator[str]:

@@ -28,6 +28,7 @@ int main() {
     auto robot = std::make_unique<${name}_robot>();
     auto memory = std::make_unique<${name}_prediction>();
     double control[n + 1] = {}, J[3 * n + 1], still[3], start[3], tip[3];
+    for (int k = 0; k < n; k++) control[k] = std::clamp(0.0, ${name}_low[k], ${name}_high[k]);
     ${name}_start(robot.get());
     ${name}_tip(robot.get(), start);
     const double radius = 0.05 * $length, turn = 2.0 * std::acos(-1.0) / 200.0;

@@ -35,6 +35,7 @@ enum {
     RECORDS = $records, RECORD_ROWS = $record_rows, RECORD_USED = $used,
     HISTORY = $history_at, HISTORY_SIZE = $history_size, /* history terms in memory: an equilibrium has none */
     TIME = $time_at,                    /* time of row 0 in a motion */
+    LENGTH = $length_at,                /* the length in the parameters; -1: none */
     POSITION = $position, ORIENTATION = $orientation, STRETCH = $stretch,
     FORCE = $force, MOMENT = $moment,   /* numbers of y; -1: none */
     COLUMNS = $columns,                 /* of tangents, in whole vectors */
@@ -129,7 +130,7 @@ static int result_of(${name}_robot *robot, int stages) {
 }
 
 int ${name}_step(${name}_robot *robot, const double *control, double dt) {
-    double acting[STAGES * (CONTROLS + 1)], table[STAGES * WIDTH];
+    double acting[STAGES * (CONTROLS + 1)] = {0.0}, table[STAGES * WIDTH];
     if (!is_started(robot)) return ${NAME}_BAD_STATE;
     if (!are_allowed(control)) return ${NAME}_BAD_CONTROL;
     if (!(fabs(dt - ${NAME}_DT) <= 1e-9 * ${NAME}_DT)) return ${NAME}_BAD_STEP;
@@ -262,7 +263,7 @@ int ${name}_pose_at(const ${name}_robot *robot, int rod, double place, double *p
     }
     for (int i = 0; position && i < 3; i++) {
         double p = y_of(robot, rod, node, POSITION + i), chord = y_of(robot, rod, node + 1, POSITION + i) - p;
-        double bend = 0.0, step = length / (NODES - 1);
+        double bend = 0.0, step = (LENGTH < 0 ? length : robot->parameters[LENGTH]) / (NODES - 1);
         if (ORIENTATION >= 0) bend = (1.0 - part) * (step * left[i] - chord) - part * (step * right[i] - chord);
         position[i] = p + part * chord + part * (1.0 - part) * bend;
     }
@@ -373,11 +374,12 @@ int ${name}_predict(const ${name}_robot *robot, ${name}_prediction *memory, int 
 }
 
 /* order of the numbers of a saved state: version (as bits), steps, result, time of the start, residual, errors,
- * controls, motion */
-enum { OF_CONTROL = 7, OF_MOTION = OF_CONTROL + CONTROLS };
+ * whether controls act, controls, motion */
+enum { OF_CONTROL = 8, OF_MOTION = OF_CONTROL + CONTROLS };
 
 int ${name}_save(const ${name}_robot *robot, double *saved) {
     if (!is_started(robot)) return ${NAME}_BAD_STATE;
+    if (!saved) return ${NAME}_BAD_ARGUMENT;
     memcpy(saved, &robot->version, sizeof robot->version);
     saved[1] = (double)robot->steps;
     saved[2] = (double)robot->result;
@@ -385,6 +387,7 @@ int ${name}_save(const ${name}_robot *robot, double *saved) {
     saved[4] = robot->residual;
     saved[5] = robot->position_error;
     saved[6] = robot->time_error;
+    saved[7] = (double)robot->acts;
     memcpy(saved + OF_CONTROL, robot->control, CONTROLS * sizeof *saved);
     memcpy(saved + OF_MOTION, robot->motion, sizeof robot->motion);
     return (int)robot->result;
@@ -397,6 +400,7 @@ int ${name}_load(${name}_robot *robot, const double *saved) {
     if (version != ${NAME}_VERSION) return ${NAME}_BAD_STATE;
     /* estimated errors may be unknown, NaN; the state may not */
     if (!(saved[1] >= 0.0 && saved[1] < 9e15) || !(saved[2] == 0.0 || saved[2] == 1.0)) return ${NAME}_BAD_STATE;
+    if (!(saved[7] == 0.0 || saved[7] == 1.0)) return ${NAME}_BAD_STATE;
     if (!(fabs(saved[3]) <= DBL_MAX) || !are_allowed(saved + OF_CONTROL)) return ${NAME}_BAD_STATE;
     for (int k = 0; k < TIME; k++)
         if (!(fabs(saved[OF_MOTION + k]) <= DBL_MAX)) return ${NAME}_BAD_STATE;
@@ -407,7 +411,7 @@ int ${name}_load(${name}_robot *robot, const double *saved) {
     robot->position_error = saved[5];
     robot->time_error = saved[6];
     robot->continues = 0;
-    robot->acts = 1;
+    robot->acts = (int64_t)saved[7];
     memcpy(robot->control, saved + OF_CONTROL, CONTROLS * sizeof *saved);
     memcpy(robot->motion, saved + OF_MOTION, sizeof robot->motion);
     robot->motion[TIME] = robot->start_time;
