@@ -40,7 +40,8 @@ extern "C" {
 /* Doubles of a saved state. */
 #define ${NAME}_SAVED $saved
 
-/* Results: zero and above, solved; below zero, the robot is as it was before the call. */
+/* Results: zero and above, solved; below zero, the robot is as it was before the call. From a COARSE step on,
+ * all steps are: the motion may have left the exact one. */
 enum ${name}_result {
     ${NAME}_CONVERGED = 0,      /* solved to tolerance */
     ${NAME}_COARSE = 1,         /* solved, but the grid is too coarse: errors above 2 % of the length */
@@ -57,7 +58,8 @@ $control_table
 extern const double ${name}_low[${NAME}_CONTROLS + 1], ${name}_high[${NAME}_CONTROLS + 1];
 
 /* Parameters: a value that is zero in this file stays zero in the code. To change others, let
- * robot->parameters point to a copy of ${name}_parameters that you have changed, then call ${name}_equilibrium.
+ * robot->parameters point to a copy of ${name}_parameters that you have changed, then call ${name}_equilibrium. A program
+ * that loads this code as a shared library finds them at robot->parameters after the start.
 $parameter_table
  */
 extern const double ${name}_parameters[$parameters];
@@ -115,7 +117,7 @@ int ${name}_pose_at(const ${name}_robot *robot, int rod, double place, double *p
 int ${name}_tip(const ${name}_robot *robot, double *position);
 
 /* Force (N) and moment (N m) of a rod on its base, about the base's point, global frame. The pull of routed
- * tendons at the base is part of it. */
+ * tendons at the base is part of it. Not known for assemblies (BAD_ARGUMENT). */
 int ${name}_base_wrench(const ${name}_robot *robot, int rod, double *force, double *moment);
 
 /* 1 if the controls of the last step, or strains of the robot, are outside of the range from which the model
