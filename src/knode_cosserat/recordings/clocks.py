@@ -205,9 +205,11 @@ def _best_delay(first: Signal, motion: _Motion, width: float) -> tuple[float, fl
         raise RecordingError(f"offsets that differ by {apart:.2f} s explain the motion as well as each other")
     # the dynamic model knows the delay without the lag, unless the robot follows its controls
     around = (grid >= grid[best] - APART) & (grid <= grid[best] + 0.5 * APART)
+    every = dynamic
     static, dynamic = (np.where(around, each, -math.inf) for each in (static, dynamic))
     # a lag is not negative: a dynamic model that says as much beyond the static one's delay does not know it
-    beyond = dynamic[grid > grid[int(np.argmax(static))]].max(initial=-math.inf)
+    late = grid - grid[int(np.argmax(static))]
+    beyond = every[(late > 0.0) & (late <= APART)].max(initial=-math.inf)
     follows = bool(static.max() > dynamic.max() and dynamic.max() - beyond < DECIDED)
     says = static if follows else dynamic
     at = int(np.argmax(says))
