@@ -109,7 +109,7 @@ def bad_inputs():
         (("fit", "broken.model", "broken.nc", "--out", "m"), "broken.model"),
         (("fit", ROBOT, "broken.nc", "--out", "broken.nc", "--seeds", "1,2"), "this is a file"),
         (("info", "broken.model"), "broken.model"),
-        (("info", "."), "this is a folder"),
+        (("info", "."), "no ensemble here"),
         (("evaluate", ".", "broken.nc"), "no ensemble here"),
         (("study", "simulation", "--out", "o"), "part of the repository: git clone"),
         (("evaluate", "nowhere.nc", "nowhere.nc"), "nowhere.nc: no such file"),
