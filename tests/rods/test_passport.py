@@ -170,3 +170,12 @@ def test_a_batch_has_a_range_for_each_robot_and_none_if_one_is_unknown():
     assert both.extrapolated[:, 1:].tolist() == [[True, True], [False, False]]
     assert "tension_1 is 5 N (learned 0 to 2)" in both.extrapolation
     assert kc.simulate([narrow, TENDONS], controls, 0.05).extrapolated is None
+
+
+def test_a_robot_without_controls_has_a_range_of_strains():
+    rod = kc.robots.SlenderRod(
+        length=0.3, radius=0.002, density=1000.0, youngs_modulus=1e8, bending_damping=1e-4, nodes=5
+    )
+    motion = kc.simulate(rod, np.zeros((3, 0)), 0.01, initial="unstressed")
+    passport = Passport.of("identify", [], rod, [motion])
+    assert not passport.controls and set(passport.strains) == {"v", "u"}

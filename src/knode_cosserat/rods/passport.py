@@ -173,8 +173,8 @@ class Passport:
             numbers = compared_numbers(motion)
             numbers["z"] = np.where(solved[:, None, None], numbers["z"], np.nan)
             for part, _, values in _values(system, **numbers):
-                known = np.where(solved[:, None, None], values, np.nan).reshape(-1, np.shape(values)[-1])
-                rows[part].append(known[np.all(np.isfinite(known), axis=1)])
+                known = np.where(solved[:, None, None], values, np.nan)
+                rows[part].append(known[np.all(np.isfinite(known), axis=2)])
         versions = {
             "knode-cosserat": package_version(),
             "jax": jax.__version__,
