@@ -101,9 +101,9 @@ def test_other_targets_of_this_computer_give_the_same_numbers(target, tmp_path):
 
 
 @pytest.mark.skipif(not has("qemu-aarch64", "aarch64-linux-gnu-gcc"), reason="no emulator of ARM")
-@pytest.mark.parametrize("name", ["delrin-tendon-robot", "three-tube-robot"])
+@pytest.mark.parametrize("name", [*CATALOG[:4], *OTHERS])
 def test_arm_gives_the_same_numbers(name, tmp_path):
-    robot = kc.load_robot(name)
+    robot = OTHERS[name]() if name in OTHERS else kc.load_robot(name)
     controls = smooth_controls(robot, 200)
     wanted = kc.simulate(robot, controls, DT)
     _, rows = run_in_c(

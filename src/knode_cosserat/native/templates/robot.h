@@ -6,7 +6,8 @@
  * Units are SI: m, s, N, N m, Pa, rad. Positions and orientations are in the frame of the robot's file, in
  * which the base stands and the rod leaves it along z. Orientations are unit quaternions, scalar first.
  *
- * No function allocates memory, or calls anything beyond the mathematical functions of C (log, sin, cos, ...).
+ * No function allocates memory, or calls anything beyond the mathematical functions of C (log, sin, cos, ...),
+ * memcpy and memset.
  * All state is in one structure: as many robots as wanted may be used side by side, each by one thread at a
  * time. A structure is copied by assignment. It is aligned to 64 bytes: make it static, or with
  * aligned_alloc(64, sizeof *robot), or in C++17 with new.
