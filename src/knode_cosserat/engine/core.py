@@ -113,9 +113,6 @@ class Core(EliminationCode):
         #: extrapolations to each stage and to the one after it
         self._guesses = np.ascontiguousarray(np.stack([guesses, np.roll(guesses, -1, axis=0)], axis=1))
 
-    def _compiled(self) -> Any:
-        return self.module.compile()
-
     @functools.cached_property
     def states(self) -> tuple[_Packed, _Packed]:
         """Size of the state of a motion and of an equilibrium, and its arrays one after the other."""

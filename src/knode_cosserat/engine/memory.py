@@ -69,6 +69,10 @@ class Memory:
             {name: k for k, name in enumerate(room.numbers)},
         )
 
+    def _compiled(self) -> Any:
+        """Return the functions of this computer; other computers take the text of the module."""
+        return self.module.compile()
+
     def _room(self, count: int | str) -> tuple[int, str]:
         """Return the largest number of places, and the name of that of a grid, if it has one."""
         return (self.room[count], count) if isinstance(count, str) else (count, "")

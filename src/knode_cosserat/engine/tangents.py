@@ -60,9 +60,6 @@ class _TangentCode(StepMap):
         self._write()
         self._functions = self._compiled()
 
-    def _compiled(self) -> Any:
-        return self.module.compile()
-
     def _reserve_products(self) -> None:
         """Reserve arrays of the products of derivatives by the system."""
 

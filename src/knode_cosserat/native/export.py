@@ -7,7 +7,6 @@ import datetime
 import functools
 import hashlib
 import importlib.metadata
-import keyword
 import re
 import tempfile
 from collections.abc import Iterable, Iterator
@@ -35,7 +34,7 @@ from knode_cosserat.schemes.result import Result
 from knode_cosserat.schemes.settings import Errors, NewtonOptions, Settings
 from knode_cosserat.schemes.space import SpaceScheme
 from knode_cosserat.schemes.time import TimeScheme
-from knode_cosserat.solvers.guess import _turning
+from knode_cosserat.solvers.guess import LARGEST_TURN, turning_ends
 from knode_cosserat.solvers.initial import start_of
 from knode_cosserat.solvers.run import InitialState
 from knode_cosserat.solvers.simulate import checked_dt
@@ -140,7 +139,7 @@ def _checked_name(name: str | None, folder: Path) -> str:
             f"export: {origin} is {name!r}, which another file or target has; give it another name, such as "
             f"{name}_robot"
         )
-    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name) or keyword.iskeyword(name):
+    if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ExportError(f"export: {origin} is {name!r}; allowed are letters, digits and _, a letter first")
     return name
 
@@ -281,9 +280,10 @@ class _NativeModel:
             f" * {k}: {label} ({field.unit}){_range_text(field)}: {field.meaning}"
             for k, (label, field) in enumerate(zip(layout.labels, fields, strict=True))
         ]
-        turning = _turning(self.system)
+        turning = turning_ends(self.system)
         return {
-            "control_table": "/*\n" + "\n".join(lines or [" * none"]) + "\n */",
+            "control_table": "\n".join(lines or [" * none"]),
+            "largest_turn": LARGEST_TURN,
             "low": _listed([*(_limit(field.low) for field in fields), "0.0"]),
             "high": _listed([*(_limit(field.high) for field in fields), "0.0"]),
             "moves": _listed([*map(int, layout.moving), 0]),

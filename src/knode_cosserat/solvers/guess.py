@@ -95,11 +95,11 @@ def largest_turns(system: System, changes: Any) -> Any:
     It is zero for one rod with an end that cannot hold its turns, such as a free tip.
     """
     numeric = array_module(changes)
-    angles = [numeric.sum(changes[..., columns] ** 2, axis=-1) ** 0.5 for columns in _turning(system)]
+    angles = [numeric.sum(changes[..., columns] ** 2, axis=-1) ** 0.5 for columns in turning_ends(system)]
     return functools.reduce(numeric.maximum, angles, np.zeros(np.shape(changes)[:-1]))
 
 
-def _turning(system: System) -> list[list[int]]:
+def turning_ends(system: System) -> list[list[int]]:
     """Return the indices in a control of each driven end's rotations, if rods between ends hold turns."""
     layout, rod, found = system.control_layout, nominal_model(system), dict[str, list[int]]()
     held = isinstance(rod, SlenderRod) and (

@@ -93,25 +93,7 @@ UNUSED(SetString, "strings", const string *values)
 UNUSED(SetRealInputDerivatives, "derivatives of inputs by time", const int *orders, const double *values)
 UNUSED(GetRealOutputDerivatives, "derivatives of outputs by time", const int *orders, double *values)
 
-FUNCTION(GetFMUstate, void **state) { return each ? get_state(each, state) : ERROR; }
-
-FUNCTION(SetFMUstate, void *state) { return each ? set_state(each, state) : ERROR; }
-
-FUNCTION(FreeFMUstate, void **state) { return each ? free_state(state) : ERROR; }
-
-FUNCTION(SerializedFMUstateSize, void *state, size_t *size) {
-    (void)state;
-    *size = sizeof(saved_state);
-    return each ? OK : ERROR;
-}
-
-FUNCTION(SerializeFMUstate, void *state, uint8_t *bytes, size_t size) {
-    return each ? serialize(each, state, bytes, size) : ERROR;
-}
-
-FUNCTION(DeSerializeFMUstate, const uint8_t *bytes, size_t size, void **state) {
-    return each ? deserialize(each, bytes, size, state) : ERROR;
-}
+STATE_FUNCTIONS(FMUstate, DeSerialize)
 
 FUNCTION(GetDirectionalDerivative, const uint32_t *unknowns, size_t outputs, const uint32_t *knowns, size_t inputs,
          const double *seed, double *found) {

@@ -145,25 +145,7 @@ NO_MODE(GetVariableDependencies, "dependencies of elements", uint32_t reference,
 NO_MODE(GetAdjointDerivative, "adjoint derivatives", const uint32_t *unknowns, size_t outputs, const uint32_t *knowns,
         size_t inputs, const double *seed, size_t seeds, double *found, size_t size)
 
-FUNCTION(GetFMUState, void **state) { return each ? get_state(each, state) : ERROR; }
-
-FUNCTION(SetFMUState, void *state) { return each ? set_state(each, state) : ERROR; }
-
-FUNCTION(FreeFMUState, void **state) { return each ? free_state(state) : ERROR; }
-
-FUNCTION(SerializedFMUStateSize, void *state, size_t *size) {
-    (void)state;
-    *size = sizeof(saved_state);
-    return each ? OK : ERROR;
-}
-
-FUNCTION(SerializeFMUState, void *state, uint8_t *bytes, size_t size) {
-    return each ? serialize(each, state, bytes, size) : ERROR;
-}
-
-FUNCTION(DeserializeFMUState, const uint8_t *bytes, size_t size, void **state) {
-    return each ? deserialize(each, bytes, size, state) : ERROR;
-}
+STATE_FUNCTIONS(FMUState, Deserialize)
 
 FUNCTION(GetDirectionalDerivative, const uint32_t *unknowns, size_t outputs, const uint32_t *knowns, size_t inputs,
          const double *seed, size_t seeds, double *found, size_t size) {

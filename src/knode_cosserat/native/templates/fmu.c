@@ -334,3 +334,20 @@ static int refuse(instance *each, const char *what) {
 }
 
 #define EXPORTED __attribute__((visibility("default")))
+
+/* functions of states, of which the standards spell the names in their own way */
+#define STATE_FUNCTIONS(state, read)                                                             \
+    FUNCTION(Get##state, void **found) { return each ? get_state(each, found) : ERROR; }         \
+    FUNCTION(Set##state, void *given) { return each ? set_state(each, given) : ERROR; }          \
+    FUNCTION(Free##state, void **given) { return each ? free_state(given) : ERROR; }             \
+    FUNCTION(Serialized##state##Size, void *given, size_t *size) {                               \
+        (void)given;                                                                             \
+        *size = sizeof(saved_state);                                                             \
+        return each ? OK : ERROR;                                                                \
+    }                                                                                            \
+    FUNCTION(Serialize##state, void *given, uint8_t *bytes, size_t size) {                       \
+        return each ? serialize(each, given, bytes, size) : ERROR;                               \
+    }                                                                                            \
+    FUNCTION(read##state, const uint8_t *bytes, size_t size, void **found) {                     \
+        return each ? deserialize(each, bytes, size, found) : ERROR;                             \
+    }

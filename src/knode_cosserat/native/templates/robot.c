@@ -87,7 +87,7 @@ static int turns_far(const double *before, const double *control) {
             double change = turning[k][i] < 0 ? 0.0 : control[turning[k][i]] - before[turning[k][i]];
             square += change * change;
         }
-        if (square > 1.0) return 1;
+        if (square > $largest_turn * $largest_turn) return 1;
     }
     return 0;
 }
@@ -426,7 +426,7 @@ const char *${name}_text(int result) {
     case ${NAME}_BAD_CONTROL: return "a control is not finite, or beyond its limits";
     case ${NAME}_BAD_STEP: return "the time step is not that of the exported model";
     case ${NAME}_BAD_STATE: return "the robot was not started, or the state is that of another model";
-    case ${NAME}_FAR_TURN: return "an end turns by more than 1 rad in one step";
+    case ${NAME}_FAR_TURN: return "an end turns by more than $largest_turn rad in one step";
     case ${NAME}_BAD_ARGUMENT: return "there is no such node, rod or number of steps";
     default: return "unknown result";
     }

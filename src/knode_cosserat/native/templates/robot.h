@@ -50,12 +50,13 @@ enum ${name}_result {
     ${NAME}_BAD_CONTROL = -10,  /* a control is not finite, or beyond its limits */
     ${NAME}_BAD_STEP = -11,     /* the time step is not ${NAME}_DT */
     ${NAME}_BAD_STATE = -12,    /* not started, or a state of another model, or numbers that are not finite */
-    ${NAME}_FAR_TURN = -13,     /* an end turns by more than 1 rad in one step */
+    ${NAME}_FAR_TURN = -13,     /* an end turns by more than $largest_turn rad in one step */
     ${NAME}_BAD_ARGUMENT = -14  /* a node, rod or number of steps that does not exist */
 };
 
-/* Controls: name, unit, least and largest value. */
+/* Controls: name, unit, least and largest value.
 $control_table
+ */
 extern const double ${name}_low[${NAME}_CONTROLS + 1], ${name}_high[${NAME}_CONTROLS + 1];
 
 /* Parameters: a value that is zero in this file stays zero in the code. To change others, let
